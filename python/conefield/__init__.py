@@ -5,7 +5,7 @@ are ``[x, y, z]``, projections ``[view, row, column]``, rows are v and columns u
 axis is z; the source at angle a is at ``dso·(cos a, sin a, 0)``, columns run along ``(-sin a, cos a, 0)`` and rows
 towards -z. Arrays may be anything that NumPy can read, or that exports DLPack from the CPU.
 
-Work runs without Python's lock. Ctrl-C ends it with KeyboardInterrupt. Errors are :class:`Error`. Log messages go to
+Work runs without the GIL. Ctrl-C ends it with KeyboardInterrupt. Errors are :class:`Error`. Log messages go to
 ``logging.getLogger("conefield")``. ``RAYON_NUM_THREADS`` sets the number of threads [default: one per core]. Threads do not
 survive a fork: use multiprocessing with the start method ``spawn``.
 """

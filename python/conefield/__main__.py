@@ -10,7 +10,7 @@ def main() -> None:
     # The command handles Ctrl-C. Python's own handler would run after it, too.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # What Python has printed comes before what the command prints.
+    # Python's buffered output must precede the command's output.
     sys.stdout.flush()
     sys.exit(_native.command(["conefield", *sys.argv[1:]], [sys.executable, "-m", "conefield"]))
 

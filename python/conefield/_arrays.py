@@ -1,4 +1,4 @@
-"""What counts as an array: NumPy's, whatever NumPy can make one of, and whatever exports DLPack from the CPU."""
+"""Conversion of arguments to arrays: NumPy arrays, anything that NumPy converts, and DLPack exports from the CPU."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ __all__ = ["as_array", "as_floats"]
 
 
 def as_array(values: Any, name: str) -> np.ndarray:
-    """``values`` as a NumPy array, without a copy where that is possible."""
+    """``values`` as a NumPy array, without a copy if possible."""
     if not isinstance(values, np.ndarray) and hasattr(values, "__dlpack__"):
         try:
             return np.from_dlpack(values)
         except (BufferError, RuntimeError, TypeError, ValueError) as error:
-            # Another device, a gradient, a type that NumPy does not have.
+            # On another device, with a gradient, or of a type that NumPy lacks.
             raise invalid("arguments", name, f"an array that NumPy cannot take ({error})", "one on the CPU, detached") from error
     return np.asarray(values)
 
 
 def as_floats(values: Any, name: str, axes: int, dtype: Any = np.float32) -> np.ndarray:
-    """``values`` as real numbers with so many axes."""
+    """``values`` as an array of real numbers with ``axes`` axes."""
     array = as_array(values, name)
     if array.dtype.kind not in "fiub":
         raise invalid("arguments", name, f"an array of {array.dtype}", "an array of real numbers")

@@ -11,7 +11,7 @@ from ._spec import encoded
 
 
 class Calibration:
-    """The result of a calibration; ``str`` of it is a line for each parameter.
+    """The result of a calibration; ``str`` gives one line per parameter.
 
     Attributes
     ----------
@@ -22,7 +22,7 @@ class Calibration:
         ``change`` and ``uncertainty`` (one standard deviation) in ``unit``, both in ``pixels``, and ``curve``, the error for
         changes around the best one.
     held_out
-        The error of predicted views ``before`` and ``after``, relative to the largest line integral, and how many ``views``.
+        The error of predicted views ``before`` and ``after``, relative to the largest line integral, and their number ``views``.
     direction
         The errors with the ``given`` direction of rotation and with the ``reversed`` one; None if the sources are not on a circle.
         A much smaller second one is also logged as a warning.
@@ -82,7 +82,7 @@ def calibrate(
     jitter
         Also estimate a shift of the detector in each view, after the other parameters.
     callback, every, progress
-        As of :func:`reconstruct`.
+        As in :func:`reconstruct`.
     """
     names = [parameters] if isinstance(parameters, str) else list(parameters)
     wanted = encoded({"parameters": names, "pixels": int(pixels), "jitter": bool(jitter), "backend": backend})

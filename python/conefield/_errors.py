@@ -1,4 +1,4 @@
-"""The exceptions. Their words are those of the command ``conefield``."""
+"""The exceptions. Their messages are those of the command ``conefield``."""
 
 
 class Error(Exception):
@@ -23,11 +23,11 @@ class FileError(Error, OSError):
 
 
 class MissingFileError(FileError, FileNotFoundError):
-    """There is no such file."""
+    """A file does not exist."""
 
 
 class UnsupportedError(Error, NotImplementedError):
-    """Something that this build or this spec cannot do, or that does not fit into memory."""
+    """A request that this build or spec does not support, or that does not fit into memory."""
 
 
 class DeviceError(Error, RuntimeError):
@@ -43,7 +43,7 @@ class InternalError(Error, RuntimeError):
 
 
 def invalid(place, field, found, expected):
-    """An :class:`InvalidError` in its usual words."""
+    """An :class:`InvalidError` with the standard message."""
     error = InvalidError(f"{place}: {field}: found {found}, expected {expected}")
     error.place, error.field, error.found, error.expected = place, field, str(found), expected
     return error

@@ -1,4 +1,4 @@
-"""Geometries: where source, detector and voxels stand."""
+"""Geometries: positions of source, detector and voxels."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def circular(
         Shift of the detector along v and u, mm.
     tilt
         Rotations of the detector about its centre, radians, right-handed: about u, about v, and in its plane (about u × v,
-        away from the source). The last is applied first, each about the original axis.
+        away from the source). The last rotation is applied first; each is about the original axis.
     """
     if isinstance(angles, (int, np.integer)):
         angles = np.arange(int(angles)) * (2 * np.pi / max(int(angles), 1))
@@ -67,10 +67,10 @@ def circular(
 
 
 def from_vectors(vectors: Any, *, detector: Any, volume: Any, spacing: Any = 1.0, center: Any = 0.0) -> Geometry:
-    """Views by their vectors, for any orbit.
+    """Views given by vectors, for any orbit.
 
     ``vectors`` is ``[view, 12]``, in mm: the source, the centre of the detector, the step from a pixel to the next column
-    (u) and to the next row (v). It is the order of ASTRA's ``cone_vec``.
+    (u) and to the next row (v), in the order of ASTRA's ``cone_vec``.
     """
     array = as_floats(vectors, "vectors", 2, np.float64)
     return Geometry.from_vectors(array, counts(detector, "detector", 2), _voxels(volume, spacing, center))

@@ -1,4 +1,4 @@
-"""The native half. What users need of it is in ``conefield``."""
+"""The native module. Its public interface is ``conefield``."""
 
 from os import PathLike
 from typing import Any, Callable
@@ -37,9 +37,9 @@ class Geometry:
     ) -> Geometry:
         """The same views with another volume."""
     def select(self, views: list[int]) -> Geometry:
-        """Some of the views, by index."""
+        """The views with these indices."""
     def orbit(self) -> tuple[float, float, list[float], list[float], list[float]] | None:
-        """The circular orbit that the views lie on, if they do: dso, dsd, pixel, offset, angles."""
+        """The circular orbit of the views, if they lie on one: dso, dsd, pixel, offset, angles."""
     @property
     def vectors(self) -> NDArray[np.float64]:
         """``[view, 12]``: source, detector centre, u, v."""

@@ -15,7 +15,7 @@ from ._volume import Volume, as_volume
 
 
 def _real(values: Any, name: str) -> np.ndarray:
-    """Real numbers, in double precision if they are so already."""
+    """Real numbers; double precision is kept."""
     array = as_array(values, name)
     return as_floats(array, name, 3, np.float64 if array.dtype == np.float64 else np.float32)
 
@@ -28,11 +28,11 @@ def project(volume: Any, like: _native.Geometry | Scan, *, projector: Any = "jos
     volume
         Attenuation ``[x, y, z]``.
     like
-        A geometry: values are in 1/mm, and the array has its voxels. ``float64`` is computed in double precision. Or a
-        scan, whose views are predicted as by ``conefield project``: values are in 1/unit of it, and a :class:`Volume` of
-        another shape keeps its voxels and is placed at the same centre.
+        A geometry or a scan. With a geometry, values are in 1/mm on its voxels; ``float64`` is computed in double
+        precision. With a scan, its views are predicted as by ``conefield project``: values are in 1/unit of the scan, and
+        a :class:`Volume` of another shape keeps its voxels and is placed at the same centre.
     projector
-        ``"joseph"``, ``"siddon"``, ``"trilinear"``, or a dict with one's settings.
+        ``"joseph"``, ``"siddon"``, ``"trilinear"``, or a dict with its type and settings.
     residual
         For a scan: return measured minus predicted line integrals.
     """
@@ -47,13 +47,13 @@ def project(volume: Any, like: _native.Geometry | Scan, *, projector: Any = "jos
 def backproject(projections: Any, geometry: _native.Geometry, *, projector: Any = "joseph") -> np.ndarray:
     """The exact adjoint of :func:`project` in a geometry: ``[view, row, column]`` to ``[x, y, z]``.
 
-    It is not filtered; for that use the spec ``fdk``. ``float64`` is computed in double precision.
+    It is unfiltered; for filtered back-projection use the spec ``fdk``. ``float64`` is computed in double precision.
     """
     return _native.backproject(geometry, encoded(projector), _real(projections, "projections"))
 
 
 class Operator:
-    """The system matrix A of a geometry. An entry is the length in mm of a ray in a voxel.
+    """The system matrix A of a geometry. An entry is the weight in mm of a voxel for a ray.
 
     ``A @ x`` takes a volume ``[x, y, z]`` to projections ``[view, row, column]``, ``A.T @ y`` is the exact adjoint. Both also
     take flat vectors to flat vectors, as SciPy's solvers need (``scipy.sparse.linalg.lsqr(A, b)``).
@@ -63,12 +63,12 @@ class Operator:
     geometry
         The geometry.
     projector
-        ``"joseph"``, ``"siddon"``, ``"trilinear"``, or a dict with one's settings.
+        ``"joseph"``, ``"siddon"``, ``"trilinear"``, or a dict with its type and settings.
     dtype
         ``float32``, which is faster, or ``float64``.
     """
 
-    #: NumPy leaves ``array @ A`` to this class, which has no such product.
+    #: Makes NumPy defer ``array @ A`` to this class, which does not define it.
     __array_ufunc__ = None
 
     def __init__(self, geometry: _native.Geometry, *, projector: Any = "joseph", dtype: Any = np.float32) -> None:
@@ -131,7 +131,7 @@ class Operator:
         return self.T @ y
 
     def as_linear_operator(self) -> Any:
-        """This as ``scipy.sparse.linalg.LinearOperator``."""
+        """The operator as ``scipy.sparse.linalg.LinearOperator``."""
         from scipy.sparse.linalg import LinearOperator
 
         return LinearOperator(self.shape, matvec=self.matvec, rmatvec=self.rmatvec, dtype=self.dtype)

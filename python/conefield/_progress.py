@@ -17,11 +17,11 @@ class Progress:
     step: int
     #: Finished share, 0 to 1.
     share: float
-    #: Seconds left, by the method's own estimate; infinite where it has none.
+    #: Seconds left, as estimated by the method; infinite if unknown.
     seconds_left: float
     #: The records since the last call, with the keys of ``metrics.jsonl``: step, seconds, loss, psnr, held_out, …
     records: list[dict[str, Any]] = field(default_factory=list)
-    #: The middle slices ``[y, z]``, ``[x, z]`` and ``[x, y]`` of a field while it trains, in 1/unit of the scan.
+    #: The middle slices ``[y, z]``, ``[x, z]`` and ``[x, y]`` of a training field, in 1/unit of the scan.
     slices: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
@@ -29,7 +29,7 @@ Callback = Callable[[Progress], Any]
 
 
 class Bar:
-    """A bar of tqdm."""
+    """A tqdm progress bar."""
 
     def __init__(self, what: str) -> None:
         from tqdm.auto import tqdm

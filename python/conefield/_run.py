@@ -1,4 +1,4 @@
-"""Runs: planned, reconstructed, pre-trained, scored."""
+"""Runs: planning, reconstruction, pre-training, scoring."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ._volume import Volume, as_volume
 
 
 class Plan:
-    """What a spec builds; ``str`` of it is what ``conefield explain`` prints.
+    """Description of what a spec builds; ``str`` gives the text of ``conefield explain``.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Reconstruction:
 
 
 def _scores(scores: dict[str, Any] | None) -> dict[str, Any] | None:
-    """JSON has no number for the PSNR of equal volumes."""
+    """Restores the infinite PSNR of equal volumes, which JSON cannot represent."""
     if scores is not None and scores.get("psnr", 0.0) is None:
         scores["psnr"] = math.inf
     return scores
@@ -140,9 +140,9 @@ def plan(
     sets: Mapping[str, Any] | None = None,
     **overrides: Any,
 ) -> Plan:
-    """What a spec builds: stages, widths, parameters, memory, work. As ``conefield explain``.
+    """Describes what a spec builds: stages, widths, parameters, memory, work. As ``conefield explain``.
 
-    With a scan also the memory for it and what a run finds out about it first. With a ``budget`` (seconds, or a string such as
+    With a scan, includes the memory for it and the results of its analysis before a run. With a ``budget`` (seconds, or a string such as
     ``"5m"``) the machine is measured for one to three seconds, and ``schedule`` has the plan; without a spec the best method that
     fits is chosen.
     """
@@ -153,7 +153,7 @@ def plan(
 
 
 def explain(spec: Any, scan: Any = None, **arguments: Any) -> str:
-    """What ``conefield explain`` prints. As :func:`plan`."""
+    """The text of ``conefield explain``. Arguments as for :func:`plan`."""
     return str(plan(spec, scan, **arguments))
 
 
@@ -202,7 +202,7 @@ def reconstruct(
         When training ends: a number of steps, a time that learning-rate schedules aim for, and a time limit that they
         ignore.
     seed
-        Of all random numbers. The same spec, seed, input and build give the same bits on the CPU.
+        Seed of all random numbers. The same spec, seed, input and build give the same bits on the CPU.
     backend
         ``"auto"``, ``"cpu"``, ``"wgpu"`` or ``"wgpu:N"``.
     callback
@@ -281,8 +281,8 @@ def pretrain(
 def evaluate(volume: Any, reference: Any, *, peak: float | None = None, labels: bool = False) -> dict[str, Any]:
     """Scores a volume against a reference. As ``conefield evaluate --json``.
 
-    ``psnr`` (dB), ``rmse``, ``ssim_2d``, ``ssim_3d`` and ``ssim_skimage``, the slices of largest error, and ``peak``, the data
-    range that they refer to. With ``labels`` both are label maps of whole numbers, and the result is ``dice``.
+    ``psnr`` (dB), ``rmse``, ``ssim_2d``, ``ssim_3d`` and ``ssim_skimage``, the slices with the largest error, and ``peak``, the data
+    range. With ``labels`` both are label maps of whole numbers, and the result is ``dice``.
     """
     found = _native.evaluate(as_volume(volume, "volume"), as_volume(reference, "reference"), peak, labels)
     return _scores(found) or {}

@@ -1,4 +1,4 @@
-"""Scans: read, written, made of arrays, simulated."""
+"""Scans: reading, writing, construction from arrays, simulation."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ def simulate(
     downsample: int = 1,
     seed: int | None = None,
 ) -> Scan:
-    """A scan of a known volume, which the scan keeps as its truth.
+    """Simulates a scan of a known volume; the scan keeps the volume as its truth.
 
-    Line integrals are those of the volume's trilinear interpolation. As ``conefield simulate``.
+    Projections are line integrals of the trilinearly interpolated volume. As ``conefield simulate``.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def simulate(
     downsample
         Average blocks with this many voxels per side first.
     seed
-        Of the noise.
+        Seed of the noise.
     """
     beside = [name for name, value in [("views", views), ("detector", detector), ("offset", offset), ("angles", angles)] if value is not None]
     if geometry is not None and (beside or protocol != "r2"):

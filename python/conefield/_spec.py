@@ -1,4 +1,4 @@
-"""Specs: by name, file or dict, with single settings on top."""
+"""Specs: by name, file or dict, with overridden settings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ._errors import invalid
 
 
 def _plain(value: Any) -> Any:
-    """NumPy's numbers and paths as JSON has them."""
+    """Converts NumPy numbers and paths to JSON values."""
     if isinstance(value, (np.generic, np.ndarray)):
         return value.tolist()
     if isinstance(value, os.PathLike):
@@ -30,7 +30,7 @@ def encoded(value: Any) -> str:
 
 
 def argument(spec: Any, sets: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """A spec, as the native half takes it."""
+    """A spec as argument of the native module."""
     paths = dict(sets or {})
     for key, value in overrides.items():
         path = key.replace("__", ".")
@@ -45,12 +45,12 @@ def argument(spec: Any, sets: Mapping[str, Any] | None, overrides: Mapping[str, 
 
 
 def spec_names() -> list[str]:
-    """All names of specs: shipped ones, and methods that need no setting."""
+    """All names of specs: shipped ones, and methods that need no settings."""
     return _native.spec_names()
 
 
 def spec_text(spec: Any, sets: Mapping[str, Any] | None = None, **overrides: Any) -> str:
-    """The spec as TOML with every default written, as a run would use it."""
+    """The spec as TOML with all defaults written out, as a run would use it."""
     return _native.spec_text(encoded(argument(spec, sets, overrides)))
 
 

@@ -1,4 +1,4 @@
-"""Stages that are written in Python."""
+"""Stages written in Python."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def encoder(name: str) -> Callable[[C], C]:
     checked); results must keep that precision. A class may also have ``resolutions``, the cells per side of the unit cube
     that each channel resolves, and ``coarse_to_fine``.
 
-    Python's lock is taken for each batch, and one batch runs at a time: this is for trying out ideas. An exception ends the
+    The GIL is acquired for each batch, and one batch runs at a time: this is for prototyping. An exception ends the
     run. Registering a name again replaces the class.
     """
     return lambda cls: _register("encoder", ("forward", "backward"), name, cls)
@@ -80,7 +80,7 @@ class Check:
 
     #: Whether every property that applies holds.
     passed: bool
-    #: Of each property: its name, "passed", "failed" or "skipped", and how that was seen.
+    #: For each property: its name, "passed", "failed" or "skipped", and the evidence.
     properties: list[tuple[str, str, str]]
     report: str
 

@@ -1,4 +1,4 @@
-"""Voxels with their place in the world."""
+"""Voxels with their position in the world."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ._errors import invalid
 
 
 class Volume:
-    """Voxels of attenuation (or another quantity) with their place in the world.
+    """Voxels of attenuation (or another quantity) with their position in the world.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Volume:
         return self.data.shape  # type: ignore[return-value]
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Writes ``.nii``, ``.nii.gz``, ``.mha`` or ``.npy``, by the name. No partial file is left."""
+        """Writes ``.nii``, ``.nii.gz``, ``.mha`` or ``.npy``, chosen by the extension. No partial file is left."""
         _native.write_volume(os.fspath(path), self)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
@@ -75,7 +75,7 @@ class Volume:
 def as_volume(value: Any, name: str, like: Any = None) -> Volume:
     """``value`` as a volume: itself, a file, ``phantom:KIND[:SIZE]``, or an array.
 
-    An array has the voxels of the geometry ``like``, if that is given and of its shape, else voxels of 1 mm.
+    An array gets the voxels of the geometry ``like`` if its shape matches, else voxels of 1 mm.
     """
     if isinstance(value, Volume):
         return value

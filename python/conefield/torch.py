@@ -1,6 +1,6 @@
-"""Projection and its adjoint for PyTorch's automatic differentiation. Importing it needs PyTorch; nothing else here does.
+"""Projection and its adjoint for PyTorch's automatic differentiation. Only this module needs PyTorch.
 
-Tensors are taken to the CPU, where the work is done, and results go back to where the input was.
+Tensors are copied to the CPU for the work, and results to the device of the input.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from ._operator import Operator
 
 
 class Projection(torch.autograd.Function):
-    """``operator @ x`` with ``operator.T @ dy`` as its gradient: linear, so that it may be differentiated any number of times."""
+    """``operator @ x`` with ``operator.T @ dy`` as its gradient. It is linear, so it can be differentiated any number of times."""
 
     @staticmethod
     def forward(ctx, x: torch.Tensor, operator: Operator) -> torch.Tensor:
@@ -24,5 +24,5 @@ class Projection(torch.autograd.Function):
 
 
 def project(x: torch.Tensor, operator: Operator) -> torch.Tensor:
-    """The projections of a volume, or with ``operator.T`` the back-projection of views; gradients go through."""
+    """Projections of a volume, or with ``operator.T`` the back-projection of views. Differentiable."""
     return Projection.apply(x, operator)

@@ -1,4 +1,4 @@
-"""What the tests share."""
+"""Fixtures shared by the tests."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ def scan():
 
 @pytest.fixture(scope="session")
 def geometry():
-    """Few views of few voxels of unequal sides; some of the detectors are tilted."""
+    """A few views of a small volume with unequal sides; some detectors are tilted."""
     parts = [
         conefield.circular(
             dso=120, dsd=190, angles=np.array(angles), detector=(9, 11), pixel=(2.1, 1.7), volume=(7, 8, 6),
@@ -39,7 +39,7 @@ def geometry():
 
 @pytest.fixture(scope="session")
 def command():
-    """The command, built beside the package; where it is absent its tests are skipped."""
+    """The command, built beside the package; its tests are skipped if it is missing."""
     named = os.environ.get("CONEFIELD_COMMAND")
     known = [named] if named else [str(ROOT / "target" / kind / "conefield") for kind in ("debug", "release")]
     program = next((p for p in known if shutil.which(p)), None)

@@ -1,4 +1,4 @@
-"""What goes in and comes out."""
+"""Input and output arrays."""
 
 import multiprocessing
 import pickle
@@ -26,7 +26,7 @@ def test_volumes_keep_their_place(tmp_path):
 
 def test_arrays_of_other_libraries_are_taken():
     class Other:
-        """Of another library: nothing but DLPack."""
+        """An array of another library that only exports DLPack."""
 
         def __init__(self, array):
             self.array = array
@@ -101,7 +101,7 @@ def test_simulation_in_any_geometry(geometry):
     scan = conefield.simulate(truth, fine)
     assert scan.truth.shape == shape and scan.geometry == fine
     predicted = conefield.project(truth, fine, projector="siddon")
-    # Voxels with sharp edges against their interpolation.
+    # Voxels with sharp edges, compared with their interpolation.
     assert (predicted - scan.projections).std() < 0.05 * scan.projections.max()
     noisy = conefield.simulate(truth, fine, noise="poisson:1e5", seed=1).projections
     assert 0 < np.abs(noisy - scan.projections).max() < 0.1

@@ -1,4 +1,4 @@
-"""Calibration: a detector that is not where the scan says."""
+"""Calibration of a scan with a wrong detector position."""
 
 import json
 

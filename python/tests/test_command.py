@@ -1,4 +1,4 @@
-"""The package gives what the command gives, to the bit."""
+"""The package and the command give bit-identical results."""
 
 import json
 
@@ -51,7 +51,7 @@ def test_explain_prints_the_same(command, folder):
 def test_project_predicts_the_same_views(command, folder, scan, tmp_path):
     truth = folder / "truth.nii.gz"
     command("project", truth, "--like", folder, "-o", tmp_path / "p", "--residual", tmp_path / "r")
-    # The file's voxel sizes are single precision; the scan's voxels are taken where the shapes agree.
+    # The file's voxel sizes are single precision; the scan's voxels are used if the shapes match.
     volume = conefield.read_volume(truth)
     for name, residual in [("p", False), ("r", True)]:
         theirs = conefield.read_scan(tmp_path / name).projections

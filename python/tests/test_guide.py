@@ -1,4 +1,4 @@
-"""The guide's Python code, run as the pages show it."""
+"""Runs the guide's Python code as shown on its pages."""
 
 import re
 
@@ -20,5 +20,5 @@ def test_the_code_of_a_page_runs(page, scan, tmp_path, monkeypatch):
     blocks = [b for b in BLOCK.finditer((GUIDE / f"{page}.md").read_text()) if not (b["mark"] or "").startswith("not run")]
     assert blocks
     for block in blocks:
-        code = block["code"].replace("60s", "4s")  # a budget is short here
+        code = block["code"].replace("60s", "4s")  # a short budget
         exec(compile(code, f"docs/guide/{page}.md", "exec"), names)

@@ -1,4 +1,4 @@
-"""What napari reads of a volume written as OME-Zarr. Skipped where its reader is not installed (pip install napari-ome-zarr)."""
+"""Reads a volume written as OME-Zarr with napari's reader. Skipped if it is not installed (pip install napari-ome-zarr)."""
 
 import numpy as np
 import pytest

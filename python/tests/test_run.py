@@ -76,7 +76,7 @@ def test_a_result_describes_itself(scan):
     assert [r["step"] for r in result.record["records"]] == [1, 2]
     assert result.field is None and np.asarray(result) is result.volume.data
     assert "dB" in repr(result)
-    # The truth in the place of the result.
+    # The truth scored against itself.
     same = conefield.evaluate(scan.truth, scan.truth)
     assert same["psnr"] == math.inf and same["rmse"] == 0
     labels = np.zeros((4, 4, 4))
@@ -139,7 +139,7 @@ def test_a_callback_sees_the_run(scan):
     assert records == result.record["records"]
     x, y, z = next(p.slices for p in reversed(seen) if p.slices is not None)
     assert x.shape == y.shape == z.shape == (24, 24) and np.isfinite(x).all() and x.std() > 0
-    # Looking changes nothing.
+    # Callbacks and progress do not change the result.
     quiet = conefield.reconstruct(scan, "fast", steps=30, progress=True, **SMALL)
     np.testing.assert_array_equal(quiet.volume.data, result.volume.data)
 
@@ -193,14 +193,14 @@ def test_ctrl_c_ends_a_run_cleanly():
     program = textwrap.dedent(
         """
         import conefield, signal, time
-        # A shell may have started the tests in the background, with this signal ignored.
+        # The tests may run in the background of a shell, which ignores this signal.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         scan = conefield.simulate("phantom:head:24", views=16, detector=(24, 24))
         try:
             conefield.reconstruct(scan, "fast", seconds="5m", callback=lambda p: print("step", p.step, flush=True), every=0.1)
         except KeyboardInterrupt:
             print("interrupted", flush=True)
-        # The process is as good as before.
+        # The process still works.
         print("volume", conefield.reconstruct(scan, "fdk").volume.data.std() > 0, flush=True)
         """
     )

@@ -1,17 +1,17 @@
-"""Stages that are written in Python."""
+"""Stages written in Python."""
 
 import numpy as np
 import pytest
 
 import conefield
 
-# The kit also hands over infinities, which must stay in their rows.
+# The kit also tests infinities, which must stay in their rows.
 pytestmark = pytest.mark.filterwarnings("ignore:invalid value")
 
 
 @conefield.encoder("test-waves")
 class Waves:
-    """Sines of every coordinate, with a gain that is trained."""
+    """Sines of every coordinate, with a trained gain."""
 
     def __init__(self, bands=3, fault=""):
         if bands < 1:
@@ -93,7 +93,7 @@ def test_what_it_raises_comes_out(scan):
     for settings, words in [({"bands": 0}, "bands below 1"), ({"band": 2}, "band"), ({"bands": []}, "test-waves")]:
         with pytest.raises(conefield.InvalidError, match=words):
             conefield.plan({"extends": "fast", "encoder": {"type": "test-waves", **settings}})
-    # Nothing of that is left.
+    # No state of the failure remains.
     assert conefield.reconstruct(scan, "fdk").volume.data.std() > 0
 
 
@@ -133,7 +133,7 @@ def test_a_denoiser_is_a_prior(scan):
     noisy = conefield.simulate("phantom:head:24", views=20, detector=(36, 36), noise="poisson:200", seed=1)
     without, result = [conefield.reconstruct(noisy, spec, reference="truth") for spec in (plain, prior)]
     assert result.scores["psnr"] > without.scores["psnr"] + 3, (result, without)
-    # Voxels in which no object can be are empty to it.
+    # The denoiser sees voxels outside the support as empty.
     carved = conefield.reconstruct(noisy, {**prior, "scene": {"support": "carve"}})
     assert np.isfinite(carved.volume.data).all() and carved.volume.data.max() < 2
     assert "a denoiser written in Python" in str(conefield.plan(prior))
@@ -172,7 +172,7 @@ def test_what_is_no_stage_is_refused():
 
     @conefield.encoder("test-flat")
     class Flat(Waves):
-        """Forgets the channels."""
+        """Returns an array without the channel axis."""
 
         def forward(self, x):
             return x[:, 0]

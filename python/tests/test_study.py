@@ -1,4 +1,4 @@
-"""The command that the package installs, and studies, which it carries out."""
+"""The installed command, and studies, which it runs."""
 
 import json
 import subprocess

@@ -7,12 +7,12 @@
 #include <stdint.h>
 
 /*
- Major version of this contract. A plugin of another one is refused.
+ Major version of this contract. Plugins with another one are refused.
  */
 #define CONEFIELD_ABI_MAJOR 2
 
 /*
- Minor version: the number of times that tables have grown.
+ Minor version: increases whenever tables grow.
  */
 #define CONEFIELD_ABI_MINOR 2
 
@@ -37,7 +37,7 @@
 #define CONEFIELD_PROJECTOR 3
 
 /*
- Fills weights.
+ Initializes weights.
  */
 #define CONEFIELD_INITIALIZER 4
 
@@ -47,7 +47,7 @@
 #define CONEFIELD_LOSS 5
 
 /*
- Judges a field by small blocks of neighbouring points.
+ Penalizes the values of a field on small blocks of neighbouring points.
  */
 #define CONEFIELD_PRIOR 6
 
@@ -57,7 +57,7 @@
 #define CONEFIELD_REGULARIZER 7
 
 /*
- How far line integrals are from the measured ones, for iterative methods. Since 2.2.
+ Distance between computed and measured line integrals, for iterative methods. Since 2.2.
  */
 #define CONEFIELD_DATA_TERM 8
 
@@ -67,17 +67,17 @@
 #define CONEFIELD_BASIS 9
 
 /*
- A field that brings line integrals of its own. Since 2.2.
+ A field with line integrals of its own. Since 2.2.
  */
 #define CONEFIELD_LINE_FIELD 10
 
 /*
- A row looks at itself alone.
+ A row depends on itself only.
  */
 #define CONEFIELD_SCOPE_ROW 0
 
 /*
- A row looks at the rows of its ray: tiles hold one whole ray, or a single row off any ray.
+ A row depends on the rows of its ray: tiles hold one whole ray, or a single row off any ray.
  */
 #define CONEFIELD_SCOPE_RAY 1
 
@@ -87,12 +87,12 @@
 #define CONEFIELD_GRADS_NONE 0
 
 /*
- Few parameters, all touched by every row: each worker sums a copy.
+ Few parameters, each affected by every row: each worker sums its own copy.
  */
 #define CONEFIELD_GRADS_DENSE 1
 
 /*
- Many parameters, few touched by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
+ Many parameters, few affected by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
  */
 #define CONEFIELD_GRADS_SCATTER 2
 
@@ -107,22 +107,22 @@
 #define CONEFIELD_BF16 1
 
 /*
- `reduce` leaves out channels that come out.
+ `reduce` removes output channels.
  */
 #define CONEFIELD_OUTPUTS 0
 
 /*
- `reduce` leaves out channels that go in.
+ `reduce` removes input channels.
  */
 #define CONEFIELD_INPUTS 1
 
 /*
- What a function returns.
+ Return value of a function.
  */
 typedef int32_t ConefieldStatus;
 
 /*
- UTF-8 text, not ended by a zero.
+ UTF-8 text, not zero-terminated.
  */
 typedef struct ConefieldStr {
   /*
@@ -130,39 +130,39 @@ typedef struct ConefieldStr {
    */
   const uint8_t *data;
   /*
-   Bytes.
+   Length in bytes.
    */
   size_t length;
 } ConefieldStr;
 
 /*
- Room for text that a plugin writes, as UTF-8.
+ Buffer for text that a plugin writes, as UTF-8.
  */
 typedef struct ConefieldText {
   /*
-   Where to.
+   The buffer.
    */
   uint8_t *data;
   /*
-   Bytes that fit.
+   Size of the buffer in bytes.
    */
   size_t capacity;
   /*
-   Bytes of the whole text, set by the plugin; what is beyond `capacity` is not written, and the host may ask again.
+   Bytes of the whole text, set by the plugin. The part beyond `capacity` is not written; the host may call again.
    */
   size_t length;
 } ConefieldText;
 
 /*
- Widths, counts and cost of an encoder, a normalizer or a field.
+ Widths, counts and cost of an encoder, normalizer or field.
  */
 typedef struct ConefieldInfo {
   /*
-   Channels in.
+   Input channels.
    */
   size_t input;
   /*
-   Channels out.
+   Output channels.
    */
   size_t output;
   /*
@@ -170,19 +170,19 @@ typedef struct ConefieldInfo {
    */
   size_t params;
   /*
-   Blocks of parameters, each with a name.
+   Number of named blocks of parameters.
    */
   size_t blocks;
   /*
-   Ranges that `partition` gives; 0 or 1 without it.
+   Number of ranges of `partition`; 0 or 1 without it.
    */
   size_t partitions;
   /*
-   Numbers a row that forward leaves for backward.
+   Numbers per row that forward stores for backward.
    */
   size_t tape;
   /*
-   Multiply-adds a row, forward.
+   Multiply-adds of forward per row.
    */
   size_t macs;
   /*
@@ -194,25 +194,25 @@ typedef struct ConefieldInfo {
    */
   uint32_t grads;
   /*
-   1 if output equals input: hosts leave the stage out.
+   1 if output equals input: hosts skip the stage.
    */
   uint32_t identity;
   /*
-   1 if an encoder's channels stand in order from coarse to fine.
+   1 if an encoder's channels are ordered from coarse to fine.
    */
   uint32_t coarse_to_fine;
   /*
-   1 if it has kernels in double precision.
+   1 if it has double-precision kernels.
    */
   uint32_t double_precision;
   /*
-   1 if it has kernels that read parameters in halves.
+   1 if it has kernels for half-precision parameters.
    */
   uint32_t halves;
 } ConefieldInfo;
 
 /*
- One named block of parameters. Blocks stand one after the other and cover all parameters.
+ One named block of parameters. Blocks are consecutive and cover all parameters.
  */
 typedef struct ConefieldParameter {
   /*
@@ -230,7 +230,7 @@ typedef struct ConefieldParameter {
 } ConefieldParameter;
 
 /*
- Channels of rows, to be read.
+ Channels of rows, read-only.
  */
 typedef struct ConefieldTile {
   /*
@@ -246,17 +246,17 @@ typedef struct ConefieldTile {
    */
   size_t rows;
   /*
-   Floats from a channel to the next, at least `rows`.
+   Floats between the starts of two channels, at least `rows`.
    */
   size_t stride;
 } ConefieldTile;
 
 /*
- Channels of rows, to be written.
+ Channels of rows, writable.
  */
 typedef struct ConefieldTileMut {
   /*
-   Row 0 of channel 0; NULL where the host does not want it.
+   Row 0 of channel 0; NULL if the host does not need it.
    */
   float *data;
   /*
@@ -268,17 +268,17 @@ typedef struct ConefieldTileMut {
    */
   size_t rows;
   /*
-   Floats from a channel to the next, at least `rows`.
+   Floats between the starts of two channels, at least `rows`.
    */
   size_t stride;
 } ConefieldTileMut;
 
 /*
- Gradients of the parameters `start..start + length` of a stage, to be added to.
+ Gradients of the parameters `start..start + length` of a stage. Calls add to them.
  */
 typedef struct ConefieldGrads {
   /*
-   That of parameter `start`.
+   Gradient of parameter `start`.
    */
   float *data;
   /*
@@ -286,7 +286,7 @@ typedef struct ConefieldGrads {
    */
   size_t start;
   /*
-   Parameters; the stage leaves all others alone.
+   Number of parameters; the stage ignores all others.
    */
   size_t length;
 } ConefieldGrads;
@@ -308,7 +308,7 @@ typedef struct ConefieldTile64 {
    */
   size_t rows;
   /*
-   Doubles from a channel to the next, at least `rows`.
+   Doubles between the starts of two channels, at least `rows`.
    */
   size_t stride;
 } ConefieldTile64;
@@ -318,7 +318,7 @@ typedef struct ConefieldTile64 {
  */
 typedef struct ConefieldTileMut64 {
   /*
-   Row 0 of channel 0; NULL where the host does not want it.
+   Row 0 of channel 0; NULL if the host does not need it.
    */
   double *data;
   /*
@@ -330,7 +330,7 @@ typedef struct ConefieldTileMut64 {
    */
   size_t rows;
   /*
-   Doubles from a channel to the next, at least `rows`.
+   Doubles between the starts of two channels, at least `rows`.
    */
   size_t stride;
 } ConefieldTileMut64;
@@ -340,7 +340,7 @@ typedef struct ConefieldTileMut64 {
  */
 typedef struct ConefieldGrads64 {
   /*
-   That of parameter `start`.
+   Gradient of parameter `start`.
    */
   double *data;
   /*
@@ -348,13 +348,13 @@ typedef struct ConefieldGrads64 {
    */
   size_t start;
   /*
-   Parameters; the stage leaves all others alone.
+   Number of parameters; the stage ignores all others.
    */
   size_t length;
 } ConefieldGrads64;
 
 /*
- Parameters or channels `start..end`.
+ A range `start..end` of parameters or channels.
  */
 typedef struct ConefieldRange {
   /*
@@ -372,11 +372,11 @@ typedef struct ConefieldRange {
  */
 typedef struct ConefieldReduced {
   /*
-   The smaller stage, a new one.
+   The smaller stage, newly created.
    */
   void *stage;
   /*
-   Which of the old parameters it keeps, in its order; valid as long as it lives.
+   The original parameters that it keeps, in its order; valid as long as it lives.
    */
   const struct ConefieldRange *params;
   /*
@@ -384,7 +384,7 @@ typedef struct ConefieldReduced {
    */
   size_t params_count;
   /*
-   Which channels remain on the other side of the stage; valid as long as it lives.
+   The channels that remain on the other side of the stage; valid as long as it lives.
    */
   const size_t *channels;
   /*
@@ -406,7 +406,7 @@ typedef struct ConefieldRay {
    */
   float direction[3];
   /*
-   Entry into and exit from the reconstruction box; equal where the ray misses it.
+   Entry into and exit from the reconstruction box; equal if the ray misses it.
    */
   float inside[2];
   /*
@@ -414,13 +414,13 @@ typedef struct ConefieldRay {
    */
   float published[2];
   /*
-   Cube sides a millimetre.
+   Cube sides per millimetre.
    */
   float per_mm;
 } ConefieldRay;
 
 /*
- Functions of an encoder, a normalizer, a field or a line field. `stage` is what `create` made.
+ Functions of an encoder, normalizer, field or line field. `stage` is the result of `create`.
  */
 typedef struct ConefieldMap {
   /*
@@ -428,7 +428,7 @@ typedef struct ConefieldMap {
    */
   size_t size;
   /*
-   Widths and counts; always the same for one stage.
+   Widths and counts; constant for a stage.
    */
   ConefieldStatus (*info)(const void *stage, struct ConefieldInfo *info);
   /*
@@ -436,7 +436,7 @@ typedef struct ConefieldMap {
    */
   ConefieldStatus (*parameter)(const void *stage, size_t index, struct ConefieldParameter *parameter);
   /*
-   Fills all parameters, repeatable by `seed`. NULL if there are none.
+   Initializes all parameters, reproducible by `seed`. NULL if there are none.
    */
   ConefieldStatus (*init)(const void *stage,
                           uint64_t seed,
@@ -444,7 +444,7 @@ typedef struct ConefieldMap {
                           size_t length,
                           struct ConefieldText *error);
   /*
-   Overwrites `y` with f(x; params), and `tape` with what backward needs.
+   Overwrites `y` with f(x; params), and `tape` with the data for backward.
    */
   ConefieldStatus (*forward)(const void *stage,
                              const float *params,
@@ -453,9 +453,9 @@ typedef struct ConefieldMap {
                              struct ConefieldTileMut tape,
                              struct ConefieldText *error);
   /*
-   Given `dy` = ∂L/∂y, adds ∂L/∂params to `grads` and, unless its data is NULL, overwrites `dx` with ∂L/∂x. `tape` is
-   as forward left it and may be used as scratch; of a stage with scattered gradients it has no channels. The order
-   in which one parameter's gradient is summed must not depend on the range in `grads`.
+   Given `dy` = ∂L/∂y, adds ∂L/∂params to `grads` and, unless its data is NULL, overwrites `dx` with ∂L/∂x. `tape`
+   holds the values of forward and may be used as scratch; it has no channels for a stage with scattered gradients.
+   The summation order of a parameter's gradient must not depend on the range in `grads`.
    */
   ConefieldStatus (*backward)(const void *stage,
                               const float *params,
@@ -466,7 +466,7 @@ typedef struct ConefieldMap {
                               struct ConefieldTileMut dx,
                               struct ConefieldText *error);
   /*
-   `forward` in double precision, by which gradients are checked; NULL if there is none.
+   `forward` in double precision, for checking gradients; NULL if there is none.
    */
   ConefieldStatus (*forward_f64)(const void *stage,
                                  const double *params,
@@ -486,12 +486,14 @@ typedef struct ConefieldMap {
                                   struct ConefieldTileMut64 dx,
                                   struct ConefieldText *error);
   /*
-   Range `index` of the parameters that a worker may own; ranges are disjoint, ascending and cover all. NULL: one range.
+   Range `index` of the parameters that a worker may own; ranges are disjoint, ascending and cover all parameters.
+   NULL: one range.
    */
   ConefieldStatus (*partition)(const void *stage, size_t index, struct ConefieldRange *range);
   /*
-   Makes of an encoder the one that computes only the outputs `keep` (`side` is [`CONEFIELD_OUTPUTS`]), of a normalizer or
-   a field the one without the inputs that are not in `keep` ([`CONEFIELD_INPUTS`]); `keep` ascends. NULL: it cannot, and masks that need it are refused.
+   Creates a smaller stage. With `side` [`CONEFIELD_OUTPUTS`], an encoder that computes only the outputs `keep`;
+   with [`CONEFIELD_INPUTS`], a normalizer or field with only the inputs `keep`. `keep` is ascending. NULL: not
+   supported; masks that need it are refused.
    */
   ConefieldStatus (*reduce)(const void *stage,
                             uint32_t side,
@@ -500,18 +502,18 @@ typedef struct ConefieldMap {
                             struct ConefieldReduced *reduced,
                             struct ConefieldText *error);
   /*
-   WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/guide/writing-stages.md says. NULL:
-   it runs on the CPU alone.
+   WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row; see
+   docs/guide/writing-stages.md. NULL: CPU only.
    */
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
   /*
-   How many passes `forward` goes in, each over a table of its own; always the same for one stage. A host with many
-   tiles sends all of them through one pass before the next, while its table is in the cache. NULL: one.
+   Number of passes of `forward`, each over a table of its own; constant for a stage. A host with many tiles runs
+   one pass for all of them before the next, while its table is in the cache. NULL: one pass.
    */
   size_t (*passes)(const void *stage);
   /*
-   Pass `pass` of `forward`, counted from 0; all in order leave the same bits as `forward`. What other passes write
-   stays. NULL where `passes` is.
+   Pass `pass` of `forward`, from 0; all passes in order give the same bits as `forward`. A pass keeps the output
+   of the other passes. NULL if `passes` is NULL.
    */
   ConefieldStatus (*forward_pass)(const void *stage,
                                   size_t pass,
@@ -521,8 +523,8 @@ typedef struct ConefieldMap {
                                   struct ConefieldTileMut tape,
                                   struct ConefieldText *error);
   /*
-   `forward` on parameters of 16 bits in `format`, one of [`CONEFIELD_F16`] and [`CONEFIELD_BF16`]: what `forward` makes
-   of the same values. A host asks for it where a spec has tables in halves. NULL if there is none.
+   `forward` with 16-bit parameters in `format`, [`CONEFIELD_F16`] or [`CONEFIELD_BF16`]: the result of `forward`
+   for the same values. Used if a spec sets half-precision tables. NULL if there is none.
    */
   ConefieldStatus (*forward_halves)(const void *stage,
                                     uint32_t format,
@@ -532,7 +534,7 @@ typedef struct ConefieldMap {
                                     struct ConefieldTileMut tape,
                                     struct ConefieldText *error);
   /*
-   `forward_pass` on parameters of 16 bits, as `forward_halves`. NULL where `forward_pass` or `forward_halves` is.
+   `forward_pass` with 16-bit parameters, as `forward_halves`. NULL if `forward_pass` or `forward_halves` is NULL.
    */
   ConefieldStatus (*forward_pass_halves)(const void *stage,
                                          uint32_t format,
@@ -543,7 +545,7 @@ typedef struct ConefieldMap {
                                          struct ConefieldTileMut tape,
                                          struct ConefieldText *error);
   /*
-   `backward` on parameters of 16 bits, as `forward_halves`. Gradients are floats. NULL where `forward_halves` is.
+   `backward` with 16-bit parameters, as `forward_halves`. Gradients are floats. NULL if `forward_halves` is NULL.
    */
   ConefieldStatus (*backward_halves)(const void *stage,
                                      uint32_t format,
@@ -555,17 +557,17 @@ typedef struct ConefieldMap {
                                      struct ConefieldTileMut dx,
                                      struct ConefieldText *error);
   /*
-   Of an encoder: writes for each of its `count` channels how many cells along the unit cube's side the channel
-   resolves, a finite number above 0. Projectors count in the finest cell, and channels finer than the data can be left
-   out. Returns [`CONEFIELD_UNSUPPORTED`] where that is not known. NULL: it is not known.
+   For an encoder: writes the resolution of each of its `count` channels in cells along the unit cube's side,
+   finite numbers above 0. Projectors may count in the finest cell, and channels finer than the data can be left
+   out. Returns [`CONEFIELD_UNSUPPORTED`] if unknown. NULL: unknown.
    */
   ConefieldStatus (*resolutions)(const void *stage,
                                  double *cells,
                                  size_t count,
                                  struct ConefieldText *error);
   /*
-   Of a line field, since 2.2: overwrites `out` with the line integrals of `count` rays, in cube sides. A ray that is not
-   inside has 0. NULL elsewhere.
+   For a line field, since 2.2: overwrites `out` with the line integrals of `count` rays, in cube sides; 0 for a
+   ray that misses the box. NULL otherwise.
    */
   ConefieldStatus (*project)(const void *stage,
                              const float *params,
@@ -574,8 +576,8 @@ typedef struct ConefieldMap {
                              float *out,
                              struct ConefieldText *error);
   /*
-   The adjoint of `project`: given `dlines` = ∂L/∂out, adds ∂L/∂params to `grads`. The order in which one parameter's
-   gradient is summed must not depend on the range in `grads`. NULL where `project` is.
+   The adjoint of `project`: given `dlines` = ∂L/∂out, adds ∂L/∂params to `grads`. The summation order of a
+   parameter's gradient must not depend on the range in `grads`. NULL if `project` is NULL.
    */
   ConefieldStatus (*backproject)(const void *stage,
                                  const float *params,
@@ -585,7 +587,7 @@ typedef struct ConefieldMap {
                                  struct ConefieldGrads grads,
                                  struct ConefieldText *error);
   /*
-   `project` in double precision, by which gradients are checked. Needed of a line field.
+   `project` in double precision, for checking gradients. Required for a line field.
    */
   ConefieldStatus (*project_f64)(const void *stage,
                                  const double *params,
@@ -594,7 +596,7 @@ typedef struct ConefieldMap {
                                  double *out,
                                  struct ConefieldText *error);
   /*
-   `backproject` in double precision. Needed of a line field.
+   `backproject` in double precision. Required for a line field.
    */
   ConefieldStatus (*backproject_f64)(const void *stage,
                                      const double *params,
@@ -606,7 +608,7 @@ typedef struct ConefieldMap {
 } ConefieldMap;
 
 /*
- Lengths of a scene that a projector's settings may count in.
+ Lengths of a scene that projector settings may be relative to.
  */
 typedef struct ConefieldLengths {
   /*
@@ -614,7 +616,7 @@ typedef struct ConefieldLengths {
    */
   double voxel_mm;
   /*
-   The side of the encoder's finest cell, mm; 0 where the encoder does not say how fine it is.
+   The side of the encoder's finest cell, mm; 0 if the encoder does not report its resolution.
    */
   double cell_mm;
 } ConefieldLengths;
@@ -628,13 +630,13 @@ typedef struct ConefieldProjector {
    */
   size_t size;
   /*
-   Samples that `sample` writes at most for `ray`; 0 where it sees nothing of the scene.
+   Maximum number of samples that `sample` writes for `ray`; 0 if it misses the scene.
    */
   size_t (*max_samples)(const void *stage, const struct ConefieldRay *ray);
   /*
-   Writes the samples of `ray`: `x, y, z` in the unit cube to `points`, the length that each stands for, in cube sides,
-   to `weights`, and how many they are (at most `capacity`) to `count`. `seed` decides random positions; NULL
-   (rendering) means that none are random.
+   Writes the samples of `ray`: positions `x, y, z` in the unit cube to `points`, the length of each in cube sides
+   to `weights`, and their number (at most `capacity`) to `count`. `seed` determines random positions; with NULL
+   (rendering) none are random.
    */
   ConefieldStatus (*sample)(const void *stage,
                             const struct ConefieldRay *ray,
@@ -645,24 +647,25 @@ typedef struct ConefieldProjector {
                             size_t *count,
                             struct ConefieldText *error);
   /*
-   The line integral of `count` attenuations. NULL: their sum, each times its weight.
+   The line integral of `count` attenuations. NULL: their sum, weighted by the lengths.
    */
   double (*integrate)(const void *stage, const float *weights, const double *mu, size_t count);
   /*
-   The exact adjoint of `integrate`: overwrites `dmu` with its derivatives times `dline`. NULL as `integrate`.
+   The exact adjoint of `integrate`: overwrites `dmu` with its derivatives times `dline`. NULL if `integrate` is
+   NULL.
    */
   void (*adjoint)(const void *stage, const float *weights, double dline, double *dmu, size_t count);
   /*
-   Makes the projector for a scene with these lengths, a new one, and sets `fitted` to it. A projector whose settings do
-   not count in them leaves `fitted` as it is. NULL: its settings do not.
+   Creates the projector for a scene with these lengths and sets `fitted` to it. A projector whose settings do not
+   depend on them leaves `fitted` unchanged. NULL: the settings never depend on them.
    */
   ConefieldStatus (*fitted)(const void *stage,
                             const struct ConefieldLengths *lengths,
                             void **fitted,
                             struct ConefieldText *error);
   /*
-   WGSL of `sample`, of a projector that integrates as one without `integrate` does: a function `stage_sample`, as
-   docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
+   WGSL of `sample`, for a projector that integrates like one without `integrate`: a function `stage_sample`; see
+   docs/guide/writing-stages.md. NULL: CPU only.
    */
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
 } ConefieldProjector;
@@ -714,13 +717,13 @@ typedef struct ConefieldTensor {
    */
   const float *values;
   /*
-   How many these are.
+   Number of values.
    */
   size_t length;
 } ConefieldTensor;
 
 /*
- Functions of an initializer. What is optional may be NULL.
+ Functions of an initializer. Optional functions may be NULL.
  */
 typedef struct ConefieldInitializer {
   /*
@@ -728,8 +731,8 @@ typedef struct ConefieldInitializer {
    */
   size_t size;
   /*
-   Fills what it fills of `params`, which every stage's own scheme has filled before, and sets the entry of `filled` to
-   1 for every block that it filled.
+   Initializes some of `params`, after every stage's own initialization, and sets the entry of each initialized
+   block in `filled` to 1.
    */
   ConefieldStatus (*apply)(const void *stage,
                            const struct ConefieldBlock *blocks,
@@ -739,19 +742,20 @@ typedef struct ConefieldInitializer {
                            uint8_t *filled,
                            struct ConefieldText *error);
   /*
-   Optional, since 2.1. Refuses parameters that it does not fit, before a run begins.
+   Optional, since 2.1. Refuses parameters that do not fit, before a run begins.
    */
   ConefieldStatus (*check)(const void *stage,
                            const struct ConefieldBlock *blocks,
                            size_t block_count,
                            struct ConefieldText *error);
   /*
-   Optional, since 2.1. The weights file that the settings name; [`CONEFIELD_UNSUPPORTED`] where they name none. The host
-   reads it and goes on with the stage that `with_weights` makes of it.
+   Optional, since 2.1. The weights file named by the settings; [`CONEFIELD_UNSUPPORTED`] if there is none. The
+   host reads the file and continues with the stage that `with_weights` creates.
    */
   ConefieldStatus (*weights)(const void *stage, struct ConefieldStr *path);
   /*
-   Since 2.1, needed beside `weights`. Makes a stage that has these weights. They live for the time of the call.
+   Since 2.1, required together with `weights`. Creates a stage with these weights, which are valid during the
+   call.
    */
   ConefieldStatus (*with_weights)(const void *stage,
                                   const struct ConefieldTensor *tensors,
@@ -759,30 +763,30 @@ typedef struct ConefieldInitializer {
                                   void **out,
                                   struct ConefieldText *error);
   /*
-   Optional, since 2.1. The file of a known volume that the field learns in `steps` steps once weights are filled;
-   [`CONEFIELD_UNSUPPORTED`] where there is none.
+   Optional, since 2.1. The file of a known volume that the field learns in `steps` steps after weights are
+   initialized; [`CONEFIELD_UNSUPPORTED`] if there is none.
    */
   ConefieldStatus (*volume)(const void *stage, struct ConefieldStr *path, uint64_t *steps);
 } ConefieldInitializer;
 
 /*
- The noise of a scan, in the scale that stages see: a line integral `p` has the variance `sigma² · exp(growth · p)`.
+ The noise of a scan, in the scale of the stages: a line integral `p` has the variance `sigma² · exp(growth · p)`.
  */
 typedef struct ConefieldNoise {
   /*
-   Standard deviation where nothing is in the way.
+   Standard deviation for an unattenuated ray.
    */
   double sigma;
   /*
-   How the variance grows with the line integral, 0 or more.
+   Growth of the variance with the line integral, 0 or more.
    */
   double growth;
   /*
-   Measured line integrals, drawn as training draws them.
+   Measured line integrals, sampled as in training.
    */
   const double *measured;
   /*
-   How many.
+   Number of line integrals.
    */
   size_t count;
 } ConefieldNoise;
@@ -796,8 +800,9 @@ typedef struct ConefieldLoss {
    */
   size_t size;
   /*
-   Compares `count` predicted values with the measured ones: the loss of each pair to `loss`, its derivative by the
-   predicted value to `slope`. A loss is 0 where both agree, never negative, and NaN where a value is NaN.
+   Compares `count` predicted values with measured ones: writes the loss of each pair to `loss`, and its derivative
+   with respect to the predicted value to `slope`. A loss is 0 if both values agree, never negative, and NaN if a
+   value is NaN.
    */
   ConefieldStatus (*at)(const void *stage,
                         const double *predicted,
@@ -807,25 +812,25 @@ typedef struct ConefieldLoss {
                         double *slope,
                         struct ConefieldText *error);
   /*
-   1 if it learns from the scan: training then uses what `fitted` makes. NULL: it does not.
+   1 if the loss is fitted to the scan: training then uses the result of `fitted`. NULL: it is not.
    */
   uint32_t (*needs_scan)(const void *stage);
   /*
-   Makes the loss for a scan with this noise, a new one, and sets `fitted` to it; one that learns nothing leaves `fitted`
-   as it is. NULL where `needs_scan` is.
+   Creates the loss for a scan with this noise and sets `fitted` to it; a loss that does not depend on the noise
+   leaves `fitted` unchanged. NULL if `needs_scan` is NULL.
    */
   ConefieldStatus (*fitted)(const void *stage,
                             const struct ConefieldNoise *noise,
                             void **fitted,
                             struct ConefieldText *error);
   /*
-   WGSL of `at`: a function `stage_at`, as docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
+   WGSL of `at`: a function `stage_at`; see docs/guide/writing-stages.md. NULL: CPU only.
    */
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
 } ConefieldLoss;
 
 /*
- Where a prior looks, and how much it counts.
+ Blocks and weight of a prior.
  */
 typedef struct ConefieldBlocks {
   /*
@@ -833,15 +838,15 @@ typedef struct ConefieldBlocks {
    */
   size_t edge;
   /*
-   Blocks a step.
+   Blocks per step.
    */
   size_t count;
   /*
-   Distance of neighbouring points in voxels.
+   Distance between neighbouring points in voxels.
    */
   double spacing;
   /*
-   Weight of the mean over all points against the mean loss of a ray.
+   Weight of the mean over all points relative to the mean loss of a ray.
    */
   double weight;
 } ConefieldBlocks;
@@ -855,12 +860,13 @@ typedef struct ConefieldPrior {
    */
   size_t size;
   /*
-   Its blocks; always the same for one stage.
+   Its blocks; constant for a stage.
    */
   ConefieldStatus (*blocks)(const void *stage, struct ConefieldBlocks *blocks);
   /*
-   The penalty of one block, not negative, to `penalty`. `values` are those of its `count = edge³` points, z fastest.
-   Adds `scale` times the derivative by each of them to `gradient`. A penalty is NaN where a value is NaN.
+   Writes the non-negative penalty of one block to `penalty`. `values` are those of its `count = edge³` points, z
+   fastest. Adds `scale` times the derivative with respect to each of them to `gradient`. The penalty is NaN if a
+   value is NaN.
    */
   ConefieldStatus (*block)(const void *stage,
                            const double *values,
@@ -870,31 +876,31 @@ typedef struct ConefieldPrior {
                            double *penalty,
                            struct ConefieldText *error);
   /*
-   WGSL of `block`: a function `stage_at`, as docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
+   WGSL of `block`: a function `stage_at`; see docs/guide/writing-stages.md. NULL: CPU only.
    */
   ConefieldStatus (*wgsl)(const void *stage, struct ConefieldText *source);
 } ConefieldPrior;
 
 /*
- A grid of voxels or of coefficients. Numbers on it stand x by x, then y by y, z fastest.
+ A grid of voxels or of coefficients. Arrays on it are row-major, z fastest.
  */
 typedef struct ConefieldGrid {
   /*
-   How many along x, y and z.
+   Number of points along x, y and z.
    */
   size_t shape[3];
   /*
-   Distances of neighbours, mm.
+   Distance between neighbours, mm.
    */
   double spacing[3];
   /*
-   The middle of the grid, mm.
+   Centre of the grid, mm.
    */
   double center[3];
 } ConefieldGrid;
 
 /*
- Named numbers that a penalty keeps from call to call.
+ Named state of a penalty, kept between calls.
  */
 typedef struct ConefieldState {
   /*
@@ -902,18 +908,18 @@ typedef struct ConefieldState {
    */
   struct ConefieldStr name;
   /*
-   The first of them.
+   The first number.
    */
   float *data;
   /*
-   How many.
+   Count of numbers.
    */
   size_t length;
 } ConefieldState;
 
 /*
- Functions of a regularizer: a convex penalty R of coefficients, for any grid. What `on` makes is a stage of its own, which
- `destroy` frees; `value`, `prox` and `state` get it.
+ Functions of a regularizer: a convex penalty R of coefficients, for any grid. The result of `on` is a stage of its
+ own, which `destroy` frees; it is the argument of `value`, `prox`, `adapt` and `state`.
  */
 typedef struct ConefieldRegularizer {
   /*
@@ -921,19 +927,19 @@ typedef struct ConefieldRegularizer {
    */
   size_t size;
   /*
-   Bytes that the penalty on `grid` holds. NULL: next to none.
+   Bytes held by the penalty on `grid`. NULL: negligible.
    */
   uint64_t (*bytes)(const void *stage, const struct ConefieldGrid *grid);
   /*
-   Makes the penalty on `grid`.
+   Creates the penalty on `grid`.
    */
   ConefieldStatus (*on)(const void *stage,
                         const struct ConefieldGrid *grid,
                         void **penalty,
                         struct ConefieldText *error);
   /*
-   The weight λ, 0 or more, for attenuation in 1/mm and lengths in mm. `noise(context, k)` measures k times what the scan's
-   noise comes to in the gradient of the data term; it takes a back-projection.
+   The weight λ, 0 or more, for attenuation in 1/mm and lengths in mm. `noise(context, k)` returns k times the root
+   mean square of the scan's noise in the gradient of the data term; it takes a back-projection.
    */
   ConefieldStatus (*weight)(const void *stage,
                             const struct ConefieldGrid *grid,
@@ -950,8 +956,8 @@ typedef struct ConefieldRegularizer {
                            double *value,
                            struct ConefieldText *error);
   /*
-   Overwrites `u` with the coefficients ≥ 0 that have the least `½‖u − v‖² + tau·R(u)`, or comes nearer to them with each
-   call for the same `v`.
+   Overwrites `u` with the coefficients ≥ 0 that minimize `½‖u − v‖² + tau·R(u)`, or approaches them with each call
+   for the same `v`.
    */
   ConefieldStatus (*prox)(void *penalty,
                           const float *v,
@@ -960,13 +966,14 @@ typedef struct ConefieldRegularizer {
                           float *u,
                           struct ConefieldText *error);
   /*
-   Entry `index` of what the next `prox` starts from, which goes into checkpoints; [`CONEFIELD_UNSUPPORTED`] past the last.
-   NULL: every call starts afresh.
+   Entry `index` of the state from which the next `prox` starts, for checkpoints; [`CONEFIELD_UNSUPPORTED`] past
+   the last. NULL: no state.
    */
   ConefieldStatus (*state)(void *penalty, size_t index, struct ConefieldState *state);
   /*
-   Fits the penalty to the coefficients `x`, before each pass over the scan. What it leaves follows from `x` alone, and is no
-   part of `state`. Writes the new R(x); returns [`CONEFIELD_UNSUPPORTED`] where the penalty stays as it is. NULL: it always does.
+   Adapts the penalty to the coefficients `x`, before each pass over the scan. The result depends on `x` only and
+   is not part of `state`. Writes the new R(x); returns [`CONEFIELD_UNSUPPORTED`] if the penalty does not change.
+   NULL: it never changes.
    */
   ConefieldStatus (*adapt)(void *penalty,
                            const float *x,
@@ -976,9 +983,9 @@ typedef struct ConefieldRegularizer {
 } ConefieldRegularizer;
 
 /*
- Functions of a data term `Σ φ(r)` of residuals `r = measured − predicted`. What `of` makes of a scan is a stage of its own,
- which `destroy` frees; all but `bytes` and `of` get it. They are asked for an image at a time: `count` pixels of the view
- `view`, whose line integrals `measured` were found, row by row.
+ Functions of a data term `Σ φ(r)` of residuals `r = measured − predicted`. The result of `of` is a stage of its own,
+ which `destroy` frees; it is the argument of all functions except `bytes` and `of`. Each call is for one image:
+ `count` pixels of view `view`, with its line integrals `measured`, row by row.
  */
 typedef struct ConefieldDataTerm {
   /*
@@ -986,12 +993,11 @@ typedef struct ConefieldDataTerm {
    */
   size_t size;
   /*
-   Bytes that it holds for a scan of `shape`: views, rows, columns; and those that `of` takes for a moment. NULL: next to
-   none.
+   Bytes held for a scan of `shape` (views, rows, columns), and temporary bytes of `of`. NULL: negligible.
    */
   void (*bytes)(const void *stage, const size_t *shape, uint64_t *held, uint64_t *brief);
   /*
-   Makes the data term of the line integrals `measured`, which are only looked at.
+   Creates the data term for the line integrals `measured`, which it does not keep.
    */
   ConefieldStatus (*of)(const void *stage,
                         const float *measured,
@@ -1022,7 +1028,7 @@ typedef struct ConefieldDataTerm {
                            float *values,
                            struct ConefieldText *error);
   /*
-   Multiplies each value by the standard deviation that noise gives φ', in units of `noise`.
+   Multiplies each value by the standard deviation of φ' under noise, in units of `noise`.
    */
   ConefieldStatus (*spread)(const void *misfit,
                             size_t view,
@@ -1037,26 +1043,26 @@ typedef struct ConefieldDataTerm {
  */
 typedef struct ConefieldExpansion {
   /*
-   Where the coefficients stand.
+   Positions of the coefficients.
    */
   struct ConefieldGrid coefficients;
   /*
-   Bytes that either direction takes while it works.
+   Working memory of either direction, in bytes.
    */
   uint64_t scratch;
   /*
-   1 if coefficients are the volume's values where they stand, on a grid that fills the same box.
+   1 if coefficients are samples of the volume, on a grid that fills the same box.
    */
   uint32_t samples;
   /*
-   1 if it works in double precision too.
+   1 if it also works in double precision.
    */
   uint32_t double_precision;
 } ConefieldExpansion;
 
 /*
- Functions of a basis: a matrix B from coefficients to voxels. Its entries are not negative, unless coefficients are samples.
- What `on` makes is a stage of its own, which `destroy` frees; all others get it.
+ Functions of a basis: a matrix B from coefficients to voxels. Its entries are non-negative, unless coefficients are
+ samples. The result of `on` is a stage of its own, which `destroy` frees; it is the argument of all other functions.
  */
 typedef struct ConefieldBasis {
   /*
@@ -1064,14 +1070,14 @@ typedef struct ConefieldBasis {
    */
   size_t size;
   /*
-   Makes the basis for the voxels of a grid. The number of coefficients follows from the grid's shape alone.
+   Creates the basis for the voxels of a grid. The number of coefficients depends on the grid's shape only.
    */
   ConefieldStatus (*on)(const void *stage,
                         const struct ConefieldGrid *voxels,
                         void **expansion,
                         struct ConefieldText *error);
   /*
-   What it is like there; always the same.
+   Its properties on this grid; constant.
    */
   ConefieldStatus (*info)(const void *expansion, struct ConefieldExpansion *info);
   /*
@@ -1089,14 +1095,14 @@ typedef struct ConefieldBasis {
                              float *coefficients,
                              struct ConefieldText *error);
   /*
-   `expand` in double precision, by which it is checked. NULL: there is none.
+   `expand` in double precision, for checks. NULL: there is none.
    */
   ConefieldStatus (*expand_f64)(const void *expansion,
                                 const double *coefficients,
                                 double *voxels,
                                 struct ConefieldText *error);
   /*
-   `adjoint` in double precision. NULL where `expand_f64` is.
+   `adjoint` in double precision. NULL if `expand_f64` is NULL.
    */
   ConefieldStatus (*adjoint_f64)(const void *expansion,
                                  const double *voxels,
@@ -1105,7 +1111,7 @@ typedef struct ConefieldBasis {
 } ConefieldBasis;
 
 /*
- A stage type that a plugin brings.
+ A stage type of a plugin.
  */
 typedef struct ConefieldStage {
   /*
@@ -1117,22 +1123,22 @@ typedef struct ConefieldStage {
    */
   struct ConefieldStr name;
   /*
-   One line for people.
+   A one-line description.
    */
   struct ConefieldStr doc;
   /*
-   JSON Schema of its settings: an object whose `properties` have a `default` each, or are `required`. Its `examples`,
-   if any, are settings that `conefield plugins check` tries.
+   JSON Schema of its settings: an object whose `properties` each have a `default` or are `required`. Its
+   `examples`, if any, are settings that `conefield plugins check` tries.
    */
   struct ConefieldStr schema;
   /*
-   Handed to `create`.
+   Argument of `create`.
    */
   const void *context;
   /*
-   Makes a stage from `settings`: one JSON object that fits the schema, with every default written. `width` is the
-   number of channels that go in; 3 for an encoder, 0 where there are none. Returns [`CONEFIELD_INVALID`] and a text
-   such as `bands: found 0, expected at least 1` for settings that make no stage.
+   Creates a stage from `settings`: one JSON object that fits the schema, with all defaults written out. `width` is
+   the number of input channels; 3 for an encoder, 0 if there are none. Returns [`CONEFIELD_INVALID`] and a text
+   such as `bands: found 0, expected at least 1` for invalid settings.
    */
   ConefieldStatus (*create)(const void *context,
                             struct ConefieldStr settings,
@@ -1140,49 +1146,50 @@ typedef struct ConefieldStage {
                             void **stage,
                             struct ConefieldText *error);
   /*
-   Frees what `create` or another function of the stage made: every stage that was handed over, once.
+   Frees the result of `create` or of another function of the stage. Called once for every stage passed to the
+   host.
    */
   void (*destroy)(void *stage);
   /*
-   One line on a stage, such as `10 levels x 2`.
+   A one-line description of a stage, such as `10 levels x 2`.
    */
   ConefieldStatus (*describe)(const void *stage, struct ConefieldText *text);
   /*
-   Of an encoder, a normalizer, a field or a line field; otherwise NULL.
+   Functions of an encoder, normalizer, field or line field; otherwise NULL.
    */
   const struct ConefieldMap *map;
   /*
-   Of a projector; otherwise NULL.
+   Functions of a projector; otherwise NULL.
    */
   const struct ConefieldProjector *projector;
   /*
-   Of an initializer; otherwise NULL.
+   Functions of an initializer; otherwise NULL.
    */
   const struct ConefieldInitializer *initializer;
   /*
-   Of a loss; otherwise NULL.
+   Functions of a loss; otherwise NULL.
    */
   const struct ConefieldLoss *loss;
   /*
-   Of a prior; otherwise NULL.
+   Functions of a prior; otherwise NULL.
    */
   const struct ConefieldPrior *prior;
   /*
-   Of a regularizer; otherwise NULL. Since 2.2, as the rest.
+   Functions of a regularizer; otherwise NULL. Since 2.2, like the remaining fields.
    */
   const struct ConefieldRegularizer *regularizer;
   /*
-   Of a data term; otherwise NULL.
+   Functions of a data term; otherwise NULL.
    */
   const struct ConefieldDataTerm *data_term;
   /*
-   Of a basis; otherwise NULL.
+   Functions of a basis; otherwise NULL.
    */
   const struct ConefieldBasis *basis;
 } ConefieldStage;
 
 /*
- What a plugin is and brings.
+ Description and contents of a plugin.
  */
 typedef struct ConefieldPlugin {
   /*
@@ -1190,11 +1197,11 @@ typedef struct ConefieldPlugin {
    */
   size_t size;
   /*
-   [`CONEFIELD_ABI_MAJOR`] as the plugin was built with.
+   [`CONEFIELD_ABI_MAJOR`] of the build.
    */
   uint32_t abi_major;
   /*
-   [`CONEFIELD_ABI_MINOR`] as the plugin was built with.
+   [`CONEFIELD_ABI_MINOR`] of the build.
    */
   uint32_t abi_minor;
   /*
@@ -1210,36 +1217,36 @@ typedef struct ConefieldPlugin {
    */
   struct ConefieldStr licence;
   /*
-   Its stage types, one after the other.
+   Its stage types, consecutive.
    */
   const struct ConefieldStage *stages;
   /*
-   How many.
+   Number of stage types.
    */
   size_t stage_count;
   /*
-   Bytes from one to the next.
+   Bytes between the starts of two entries.
    */
   size_t stage_size;
 } ConefieldPlugin;
 
 /*
- All is well.
+ Success.
  */
 #define CONEFIELD_OK 0
 
 /*
- What was handed over, such as settings, cannot be used; the error text says why.
+ The input, such as settings, is invalid; the error text gives the reason.
  */
 #define CONEFIELD_INVALID 1
 
 /*
- It could be asked for, but this stage cannot do it.
+ The request is valid, but this stage does not support it.
  */
 #define CONEFIELD_UNSUPPORTED 2
 
 /*
- It went wrong.
+ The call failed.
  */
 #define CONEFIELD_FAILED 3
 

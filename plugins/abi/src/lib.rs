@@ -1,38 +1,40 @@
-//! The contract between conefield and a plugin, as C sees it. `include/conefield_plugin.h` is made from this file.
+//! The contract between conefield and a plugin, in C. `include/conefield_plugin.h` is generated from this file.
 //!
-//! A plugin is a shared library that exports [`conefield_plugin`](ConefieldEntry) and returns a table of what it
-//! brings. Rules that types cannot say:
+//! A plugin is a shared library that exports [`conefield_plugin`](ConefieldEntry), which returns a table of its
+//! contents. Rules beyond the types:
 //!
-//! - **Versions.** `abi_major` must be the host's. Within a major version tables only grow at their end. Each
-//!   table says its own `size`: a table shorter than that of the first minor version is refused, a later function that a
-//!   table does not reach counts as NULL, and what a table has beyond is not read. Everything else here keeps its layout.
-//! - **Memory.** Nothing is handed over: the host frees what it made, the plugin frees what it made (`destroy`). What a
-//!   plugin points to in its tables lives as long as the library, which is never unloaded; what a stage points to lives
-//!   as long as the stage.
-//! - **Tiles** are channel-major: channel `c` of row `i` is `data[c * stride + i]`. A pointer may be NULL where there is
-//!   nothing (no channels, no parameters). Floats are aligned to their own size and no more.
-//! - **Threads.** A stage is called from many threads at once, and every function that takes it as `const` must allow that.
-//!   Only `create`, `destroy`, `reduce`, `fitted`, `weights`, `with_weights`, `check`, `volume`, `on`, `of`, `prox`, `adapt` and `state`
-//!   of one stage are not called at the same time as anything else of that stage, though from any thread.
+//! - **Versions.** `abi_major` must equal the host's. Within a major version tables only grow at their end. Each table
+//!   states its own `size`: a table shorter than in the first minor version is refused, later functions that a table
+//!   does not reach count as NULL, and anything beyond the host's table is not read. Everything else here keeps its
+//!   layout.
+//! - **Memory.** Ownership never changes: the host frees what it allocated, the plugin frees what it allocated
+//!   (`destroy`). Data that a plugin's tables point to lives as long as the library, which is never unloaded; data that
+//!   a stage points to lives as long as the stage.
+//! - **Tiles** are channel-major: channel `c` of row `i` is `data[c * stride + i]`. A pointer may be NULL if there is
+//!   no data (no channels, no parameters). Floats are aligned to their own size only.
+//! - **Threads.** A stage is called from many threads at once; every function that takes it as `const` must allow that.
+//!   Only `create`, `destroy`, `reduce`, `fitted`, `weights`, `with_weights`, `check`, `volume`, `on`, `of`, `prox`,
+//!   `adapt` and `state` of a stage never run at the same time as another call of that stage, but may run on any
+//!   thread.
 //! - **Unwinding** must not leave the library: catch panics and exceptions, return [`CONEFIELD_PANICKED`].
-//! - **Same bits.** The result must not depend on threads, on time, or on how rows are dealt to tiles.
+//! - **Determinism.** Results must not depend on threads, on time, or on how rows are divided into tiles.
 
 use std::ffi::c_void;
 
-/// Major version of this contract. A plugin of another one is refused.
+/// Major version of this contract. Plugins with another one are refused.
 pub const CONEFIELD_ABI_MAJOR: u32 = 2;
-/// Minor version: the number of times that tables have grown.
+/// Minor version: increases whenever tables grow.
 pub const CONEFIELD_ABI_MINOR: u32 = 2;
 
-/// What a function returns.
+/// Return value of a function.
 pub type ConefieldStatus = i32;
-/// All is well.
+/// Success.
 pub const CONEFIELD_OK: ConefieldStatus = 0;
-/// What was handed over, such as settings, cannot be used; the error text says why.
+/// The input, such as settings, is invalid; the error text gives the reason.
 pub const CONEFIELD_INVALID: ConefieldStatus = 1;
-/// It could be asked for, but this stage cannot do it.
+/// The request is valid, but this stage does not support it.
 pub const CONEFIELD_UNSUPPORTED: ConefieldStatus = 2;
-/// It went wrong.
+/// The call failed.
 pub const CONEFIELD_FAILED: ConefieldStatus = 3;
 /// A panic or an exception was caught.
 pub const CONEFIELD_PANICKED: ConefieldStatus = 4;
@@ -45,31 +47,31 @@ pub const CONEFIELD_NORMALIZER: u32 = 1;
 pub const CONEFIELD_FIELD: u32 = 2;
 /// Rays to samples.
 pub const CONEFIELD_PROJECTOR: u32 = 3;
-/// Fills weights.
+/// Initializes weights.
 pub const CONEFIELD_INITIALIZER: u32 = 4;
 /// Compares predicted with measured values.
 pub const CONEFIELD_LOSS: u32 = 5;
-/// Judges a field by small blocks of neighbouring points.
+/// Penalizes the values of a field on small blocks of neighbouring points.
 pub const CONEFIELD_PRIOR: u32 = 6;
 /// Penalty of coefficients with its proximal map, for iterative methods. Since 2.2.
 pub const CONEFIELD_REGULARIZER: u32 = 7;
-/// How far line integrals are from the measured ones, for iterative methods. Since 2.2.
+/// Distance between computed and measured line integrals, for iterative methods. Since 2.2.
 pub const CONEFIELD_DATA_TERM: u32 = 8;
 /// Coefficients to voxels, for iterative methods. Since 2.2.
 pub const CONEFIELD_BASIS: u32 = 9;
-/// A field that brings line integrals of its own. Since 2.2.
+/// A field with line integrals of its own. Since 2.2.
 pub const CONEFIELD_LINE_FIELD: u32 = 10;
 
-/// A row looks at itself alone.
+/// A row depends on itself only.
 pub const CONEFIELD_SCOPE_ROW: u32 = 0;
-/// A row looks at the rows of its ray: tiles hold one whole ray, or a single row off any ray.
+/// A row depends on the rows of its ray: tiles hold one whole ray, or a single row off any ray.
 pub const CONEFIELD_SCOPE_RAY: u32 = 1;
 
 /// No parameters.
 pub const CONEFIELD_GRADS_NONE: u32 = 0;
-/// Few parameters, all touched by every row: each worker sums a copy.
+/// Few parameters, each affected by every row: each worker sums its own copy.
 pub const CONEFIELD_GRADS_DENSE: u32 = 1;
-/// Many parameters, few touched by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
+/// Many parameters, few affected by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
 pub const CONEFIELD_GRADS_SCATTER: u32 = 2;
 
 /// Parameters are IEEE 754 `binary16`.
@@ -77,34 +79,34 @@ pub const CONEFIELD_F16: u32 = 0;
 /// Parameters are `bfloat16`: the upper halves of floats.
 pub const CONEFIELD_BF16: u32 = 1;
 
-/// `reduce` leaves out channels that come out.
+/// `reduce` removes output channels.
 pub const CONEFIELD_OUTPUTS: u32 = 0;
-/// `reduce` leaves out channels that go in.
+/// `reduce` removes input channels.
 pub const CONEFIELD_INPUTS: u32 = 1;
 
-/// UTF-8 text, not ended by a zero.
+/// UTF-8 text, not zero-terminated.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldStr {
     /// First byte; may be NULL if `length` is 0.
     pub data: *const u8,
-    /// Bytes.
+    /// Length in bytes.
     pub length: usize,
 }
 
-/// Room for text that a plugin writes, as UTF-8.
+/// Buffer for text that a plugin writes, as UTF-8.
 #[repr(C)]
 #[derive(Debug)]
 pub struct ConefieldText {
-    /// Where to.
+    /// The buffer.
     pub data: *mut u8,
-    /// Bytes that fit.
+    /// Size of the buffer in bytes.
     pub capacity: usize,
-    /// Bytes of the whole text, set by the plugin; what is beyond `capacity` is not written, and the host may ask again.
+    /// Bytes of the whole text, set by the plugin. The part beyond `capacity` is not written; the host may call again.
     pub length: usize,
 }
 
-/// Channels of rows, to be read.
+/// Channels of rows, read-only.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldTile {
@@ -114,33 +116,33 @@ pub struct ConefieldTile {
     pub channels: usize,
     /// Rows, at least 1.
     pub rows: usize,
-    /// Floats from a channel to the next, at least `rows`.
+    /// Floats between the starts of two channels, at least `rows`.
     pub stride: usize,
 }
 
-/// Channels of rows, to be written.
+/// Channels of rows, writable.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldTileMut {
-    /// Row 0 of channel 0; NULL where the host does not want it.
+    /// Row 0 of channel 0; NULL if the host does not need it.
     pub data: *mut f32,
     /// Channels.
     pub channels: usize,
     /// Rows, at least 1.
     pub rows: usize,
-    /// Floats from a channel to the next, at least `rows`.
+    /// Floats between the starts of two channels, at least `rows`.
     pub stride: usize,
 }
 
-/// Gradients of the parameters `start..start + length` of a stage, to be added to.
+/// Gradients of the parameters `start..start + length` of a stage. Calls add to them.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldGrads {
-    /// That of parameter `start`.
+    /// Gradient of parameter `start`.
     pub data: *mut f32,
     /// The first parameter.
     pub start: usize,
-    /// Parameters; the stage leaves all others alone.
+    /// Number of parameters; the stage ignores all others.
     pub length: usize,
 }
 
@@ -154,7 +156,7 @@ pub struct ConefieldTile64 {
     pub channels: usize,
     /// Rows, at least 1.
     pub rows: usize,
-    /// Doubles from a channel to the next, at least `rows`.
+    /// Doubles between the starts of two channels, at least `rows`.
     pub stride: usize,
 }
 
@@ -162,13 +164,13 @@ pub struct ConefieldTile64 {
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldTileMut64 {
-    /// Row 0 of channel 0; NULL where the host does not want it.
+    /// Row 0 of channel 0; NULL if the host does not need it.
     pub data: *mut f64,
     /// Channels.
     pub channels: usize,
     /// Rows, at least 1.
     pub rows: usize,
-    /// Doubles from a channel to the next, at least `rows`.
+    /// Doubles between the starts of two channels, at least `rows`.
     pub stride: usize,
 }
 
@@ -176,47 +178,47 @@ pub struct ConefieldTileMut64 {
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldGrads64 {
-    /// That of parameter `start`.
+    /// Gradient of parameter `start`.
     pub data: *mut f64,
     /// The first parameter.
     pub start: usize,
-    /// Parameters; the stage leaves all others alone.
+    /// Number of parameters; the stage ignores all others.
     pub length: usize,
 }
 
-/// Widths, counts and cost of an encoder, a normalizer or a field.
+/// Widths, counts and cost of an encoder, normalizer or field.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldInfo {
-    /// Channels in.
+    /// Input channels.
     pub input: usize,
-    /// Channels out.
+    /// Output channels.
     pub output: usize,
     /// Parameters.
     pub params: usize,
-    /// Blocks of parameters, each with a name.
+    /// Number of named blocks of parameters.
     pub blocks: usize,
-    /// Ranges that `partition` gives; 0 or 1 without it.
+    /// Number of ranges of `partition`; 0 or 1 without it.
     pub partitions: usize,
-    /// Numbers a row that forward leaves for backward.
+    /// Numbers per row that forward stores for backward.
     pub tape: usize,
-    /// Multiply-adds a row, forward.
+    /// Multiply-adds of forward per row.
     pub macs: usize,
     /// `CONEFIELD_SCOPE_…`
     pub scope: u32,
     /// `CONEFIELD_GRADS_…`
     pub grads: u32,
-    /// 1 if output equals input: hosts leave the stage out.
+    /// 1 if output equals input: hosts skip the stage.
     pub identity: u32,
-    /// 1 if an encoder's channels stand in order from coarse to fine.
+    /// 1 if an encoder's channels are ordered from coarse to fine.
     pub coarse_to_fine: u32,
-    /// 1 if it has kernels in double precision.
+    /// 1 if it has double-precision kernels.
     pub double_precision: u32,
-    /// 1 if it has kernels that read parameters in halves.
+    /// 1 if it has kernels for half-precision parameters.
     pub halves: u32,
 }
 
-/// One named block of parameters. Blocks stand one after the other and cover all parameters.
+/// One named block of parameters. Blocks are consecutive and cover all parameters.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldParameter {
@@ -228,7 +230,7 @@ pub struct ConefieldParameter {
     pub dimensions: usize,
 }
 
-/// Parameters or channels `start..end`.
+/// A range `start..end` of parameters or channels.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldRange {
@@ -242,31 +244,31 @@ pub struct ConefieldRange {
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldReduced {
-    /// The smaller stage, a new one.
+    /// The smaller stage, newly created.
     pub stage: *mut c_void,
-    /// Which of the old parameters it keeps, in its order; valid as long as it lives.
+    /// The original parameters that it keeps, in its order; valid as long as it lives.
     pub params: *const ConefieldRange,
     /// Ranges in `params`.
     pub params_count: usize,
-    /// Which channels remain on the other side of the stage; valid as long as it lives.
+    /// The channels that remain on the other side of the stage; valid as long as it lives.
     pub channels: *const usize,
     /// Channels in `channels`.
     pub channels_count: usize,
 }
 
-/// Functions of an encoder, a normalizer, a field or a line field. `stage` is what `create` made.
+/// Functions of an encoder, normalizer, field or line field. `stage` is the result of `create`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldMap {
     /// Bytes of this table.
     pub size: usize,
-    /// Widths and counts; always the same for one stage.
+    /// Widths and counts; constant for a stage.
     pub info: Option<unsafe extern "C" fn(stage: *const c_void, info: *mut ConefieldInfo) -> ConefieldStatus>,
     /// Block `index` of the parameters. NULL if there are none.
     pub parameter: Option<
         unsafe extern "C" fn(stage: *const c_void, index: usize, parameter: *mut ConefieldParameter) -> ConefieldStatus,
     >,
-    /// Fills all parameters, repeatable by `seed`. NULL if there are none.
+    /// Initializes all parameters, reproducible by `seed`. NULL if there are none.
     pub init: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -276,7 +278,7 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Overwrites `y` with f(x; params), and `tape` with what backward needs.
+    /// Overwrites `y` with f(x; params), and `tape` with the data for backward.
     pub forward: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -287,9 +289,9 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Given `dy` = ∂L/∂y, adds ∂L/∂params to `grads` and, unless its data is NULL, overwrites `dx` with ∂L/∂x. `tape` is
-    /// as forward left it and may be used as scratch; of a stage with scattered gradients it has no channels. The order
-    /// in which one parameter's gradient is summed must not depend on the range in `grads`.
+    /// Given `dy` = ∂L/∂y, adds ∂L/∂params to `grads` and, unless its data is NULL, overwrites `dx` with ∂L/∂x. `tape`
+    /// holds the values of forward and may be used as scratch; it has no channels for a stage with scattered gradients.
+    /// The summation order of a parameter's gradient must not depend on the range in `grads`.
     pub backward: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -302,7 +304,7 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// `forward` in double precision, by which gradients are checked; NULL if there is none.
+    /// `forward` in double precision, for checking gradients; NULL if there is none.
     pub forward_f64: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -326,11 +328,13 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Range `index` of the parameters that a worker may own; ranges are disjoint, ascending and cover all. NULL: one range.
+    /// Range `index` of the parameters that a worker may own; ranges are disjoint, ascending and cover all parameters.
+    /// NULL: one range.
     pub partition:
         Option<unsafe extern "C" fn(stage: *const c_void, index: usize, range: *mut ConefieldRange) -> ConefieldStatus>,
-    /// Makes of an encoder the one that computes only the outputs `keep` (`side` is [`CONEFIELD_OUTPUTS`]), of a normalizer or
-    /// a field the one without the inputs that are not in `keep` ([`CONEFIELD_INPUTS`]); `keep` ascends. NULL: it cannot, and masks that need it are refused.
+    /// Creates a smaller stage. With `side` [`CONEFIELD_OUTPUTS`], an encoder that computes only the outputs `keep`;
+    /// with [`CONEFIELD_INPUTS`], a normalizer or field with only the inputs `keep`. `keep` is ascending. NULL: not
+    /// supported; masks that need it are refused.
     pub reduce: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -341,14 +345,14 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row, as docs/guide/writing-stages.md says. NULL:
-    /// it runs on the CPU alone.
+    /// WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row; see
+    /// docs/guide/writing-stages.md. NULL: CPU only.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
-    /// How many passes `forward` goes in, each over a table of its own; always the same for one stage. A host with many
-    /// tiles sends all of them through one pass before the next, while its table is in the cache. NULL: one.
+    /// Number of passes of `forward`, each over a table of its own; constant for a stage. A host with many tiles runs
+    /// one pass for all of them before the next, while its table is in the cache. NULL: one pass.
     pub passes: Option<unsafe extern "C" fn(stage: *const c_void) -> usize>,
-    /// Pass `pass` of `forward`, counted from 0; all in order leave the same bits as `forward`. What other passes write
-    /// stays. NULL where `passes` is.
+    /// Pass `pass` of `forward`, from 0; all passes in order give the same bits as `forward`. A pass keeps the output
+    /// of the other passes. NULL if `passes` is NULL.
     pub forward_pass: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -360,8 +364,8 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// `forward` on parameters of 16 bits in `format`, one of [`CONEFIELD_F16`] and [`CONEFIELD_BF16`]: what `forward` makes
-    /// of the same values. A host asks for it where a spec has tables in halves. NULL if there is none.
+    /// `forward` with 16-bit parameters in `format`, [`CONEFIELD_F16`] or [`CONEFIELD_BF16`]: the result of `forward`
+    /// for the same values. Used if a spec sets half-precision tables. NULL if there is none.
     pub forward_halves: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -373,7 +377,7 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// `forward_pass` on parameters of 16 bits, as `forward_halves`. NULL where `forward_pass` or `forward_halves` is.
+    /// `forward_pass` with 16-bit parameters, as `forward_halves`. NULL if `forward_pass` or `forward_halves` is NULL.
     pub forward_pass_halves: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -386,7 +390,7 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// `backward` on parameters of 16 bits, as `forward_halves`. Gradients are floats. NULL where `forward_halves` is.
+    /// `backward` with 16-bit parameters, as `forward_halves`. Gradients are floats. NULL if `forward_halves` is NULL.
     pub backward_halves: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -400,9 +404,9 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Of an encoder: writes for each of its `count` channels how many cells along the unit cube's side the channel
-    /// resolves, a finite number above 0. Projectors count in the finest cell, and channels finer than the data can be left
-    /// out. Returns [`CONEFIELD_UNSUPPORTED`] where that is not known. NULL: it is not known.
+    /// For an encoder: writes the resolution of each of its `count` channels in cells along the unit cube's side,
+    /// finite numbers above 0. Projectors may count in the finest cell, and channels finer than the data can be left
+    /// out. Returns [`CONEFIELD_UNSUPPORTED`] if unknown. NULL: unknown.
     pub resolutions: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -411,8 +415,8 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Of a line field, since 2.2: overwrites `out` with the line integrals of `count` rays, in cube sides. A ray that is not
-    /// inside has 0. NULL elsewhere.
+    /// For a line field, since 2.2: overwrites `out` with the line integrals of `count` rays, in cube sides; 0 for a
+    /// ray that misses the box. NULL otherwise.
     pub project: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -423,8 +427,8 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// The adjoint of `project`: given `dlines` = ∂L/∂out, adds ∂L/∂params to `grads`. The order in which one parameter's
-    /// gradient is summed must not depend on the range in `grads`. NULL where `project` is.
+    /// The adjoint of `project`: given `dlines` = ∂L/∂out, adds ∂L/∂params to `grads`. The summation order of a
+    /// parameter's gradient must not depend on the range in `grads`. NULL if `project` is NULL.
     pub backproject: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -436,7 +440,7 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// `project` in double precision, by which gradients are checked. Needed of a line field.
+    /// `project` in double precision, for checking gradients. Required for a line field.
     pub project_f64: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -447,7 +451,7 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// `backproject` in double precision. Needed of a line field.
+    /// `backproject` in double precision. Required for a line field.
     pub backproject_f64: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -469,21 +473,21 @@ pub struct ConefieldRay {
     pub origin: [f32; 3],
     /// Unit vector.
     pub direction: [f32; 3],
-    /// Entry into and exit from the reconstruction box; equal where the ray misses it.
+    /// Entry into and exit from the reconstruction box; equal if the ray misses it.
     pub inside: [f32; 2],
     /// Beginning and end of the published sampling range (near, far).
     pub published: [f32; 2],
-    /// Cube sides a millimetre.
+    /// Cube sides per millimetre.
     pub per_mm: f32,
 }
 
-/// Lengths of a scene that a projector's settings may count in.
+/// Lengths of a scene that projector settings may be relative to.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldLengths {
     /// The shortest side of a voxel, mm.
     pub voxel_mm: f64,
-    /// The side of the encoder's finest cell, mm; 0 where the encoder does not say how fine it is.
+    /// The side of the encoder's finest cell, mm; 0 if the encoder does not report its resolution.
     pub cell_mm: f64,
 }
 
@@ -493,11 +497,11 @@ pub struct ConefieldLengths {
 pub struct ConefieldProjector {
     /// Bytes of this table.
     pub size: usize,
-    /// Samples that `sample` writes at most for `ray`; 0 where it sees nothing of the scene.
+    /// Maximum number of samples that `sample` writes for `ray`; 0 if it misses the scene.
     pub max_samples: Option<unsafe extern "C" fn(stage: *const c_void, ray: *const ConefieldRay) -> usize>,
-    /// Writes the samples of `ray`: `x, y, z` in the unit cube to `points`, the length that each stands for, in cube sides,
-    /// to `weights`, and how many they are (at most `capacity`) to `count`. `seed` decides random positions; NULL
-    /// (rendering) means that none are random.
+    /// Writes the samples of `ray`: positions `x, y, z` in the unit cube to `points`, the length of each in cube sides
+    /// to `weights`, and their number (at most `capacity`) to `count`. `seed` determines random positions; with NULL
+    /// (rendering) none are random.
     pub sample: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -510,15 +514,16 @@ pub struct ConefieldProjector {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// The line integral of `count` attenuations. NULL: their sum, each times its weight.
+    /// The line integral of `count` attenuations. NULL: their sum, weighted by the lengths.
     pub integrate:
         Option<unsafe extern "C" fn(stage: *const c_void, weights: *const f32, mu: *const f64, count: usize) -> f64>,
-    /// The exact adjoint of `integrate`: overwrites `dmu` with its derivatives times `dline`. NULL as `integrate`.
+    /// The exact adjoint of `integrate`: overwrites `dmu` with its derivatives times `dline`. NULL if `integrate` is
+    /// NULL.
     pub adjoint: Option<
         unsafe extern "C" fn(stage: *const c_void, weights: *const f32, dline: f64, dmu: *mut f64, count: usize),
     >,
-    /// Makes the projector for a scene with these lengths, a new one, and sets `fitted` to it. A projector whose settings do
-    /// not count in them leaves `fitted` as it is. NULL: its settings do not.
+    /// Creates the projector for a scene with these lengths and sets `fitted` to it. A projector whose settings do not
+    /// depend on them leaves `fitted` unchanged. NULL: the settings never depend on them.
     pub fitted: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -527,8 +532,8 @@ pub struct ConefieldProjector {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// WGSL of `sample`, of a projector that integrates as one without `integrate` does: a function `stage_sample`, as
-    /// docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
+    /// WGSL of `sample`, for a projector that integrates like one without `integrate`: a function `stage_sample`; see
+    /// docs/guide/writing-stages.md. NULL: CPU only.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 
@@ -560,18 +565,18 @@ pub struct ConefieldTensor {
     pub dimensions: usize,
     /// Its numbers.
     pub values: *const f32,
-    /// How many these are.
+    /// Number of values.
     pub length: usize,
 }
 
-/// Functions of an initializer. What is optional may be NULL.
+/// Functions of an initializer. Optional functions may be NULL.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldInitializer {
     /// Bytes of this table.
     pub size: usize,
-    /// Fills what it fills of `params`, which every stage's own scheme has filled before, and sets the entry of `filled` to
-    /// 1 for every block that it filled.
+    /// Initializes some of `params`, after every stage's own initialization, and sets the entry of each initialized
+    /// block in `filled` to 1.
     pub apply: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -583,7 +588,7 @@ pub struct ConefieldInitializer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Optional, since 2.1. Refuses parameters that it does not fit, before a run begins.
+    /// Optional, since 2.1. Refuses parameters that do not fit, before a run begins.
     pub check: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -592,10 +597,11 @@ pub struct ConefieldInitializer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Optional, since 2.1. The weights file that the settings name; [`CONEFIELD_UNSUPPORTED`] where they name none. The host
-    /// reads it and goes on with the stage that `with_weights` makes of it.
+    /// Optional, since 2.1. The weights file named by the settings; [`CONEFIELD_UNSUPPORTED`] if there is none. The
+    /// host reads the file and continues with the stage that `with_weights` creates.
     pub weights: Option<unsafe extern "C" fn(stage: *const c_void, path: *mut ConefieldStr) -> ConefieldStatus>,
-    /// Since 2.1, needed beside `weights`. Makes a stage that has these weights. They live for the time of the call.
+    /// Since 2.1, required together with `weights`. Creates a stage with these weights, which are valid during the
+    /// call.
     pub with_weights: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -605,23 +611,23 @@ pub struct ConefieldInitializer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Optional, since 2.1. The file of a known volume that the field learns in `steps` steps once weights are filled;
-    /// [`CONEFIELD_UNSUPPORTED`] where there is none.
+    /// Optional, since 2.1. The file of a known volume that the field learns in `steps` steps after weights are
+    /// initialized; [`CONEFIELD_UNSUPPORTED`] if there is none.
     pub volume:
         Option<unsafe extern "C" fn(stage: *const c_void, path: *mut ConefieldStr, steps: *mut u64) -> ConefieldStatus>,
 }
 
-/// The noise of a scan, in the scale that stages see: a line integral `p` has the variance `sigma² · exp(growth · p)`.
+/// The noise of a scan, in the scale of the stages: a line integral `p` has the variance `sigma² · exp(growth · p)`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldNoise {
-    /// Standard deviation where nothing is in the way.
+    /// Standard deviation for an unattenuated ray.
     pub sigma: f64,
-    /// How the variance grows with the line integral, 0 or more.
+    /// Growth of the variance with the line integral, 0 or more.
     pub growth: f64,
-    /// Measured line integrals, drawn as training draws them.
+    /// Measured line integrals, sampled as in training.
     pub measured: *const f64,
-    /// How many.
+    /// Number of line integrals.
     pub count: usize,
 }
 
@@ -631,8 +637,9 @@ pub struct ConefieldNoise {
 pub struct ConefieldLoss {
     /// Bytes of this table.
     pub size: usize,
-    /// Compares `count` predicted values with the measured ones: the loss of each pair to `loss`, its derivative by the
-    /// predicted value to `slope`. A loss is 0 where both agree, never negative, and NaN where a value is NaN.
+    /// Compares `count` predicted values with measured ones: writes the loss of each pair to `loss`, and its derivative
+    /// with respect to the predicted value to `slope`. A loss is 0 if both values agree, never negative, and NaN if a
+    /// value is NaN.
     pub at: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -644,10 +651,10 @@ pub struct ConefieldLoss {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// 1 if it learns from the scan: training then uses what `fitted` makes. NULL: it does not.
+    /// 1 if the loss is fitted to the scan: training then uses the result of `fitted`. NULL: it is not.
     pub needs_scan: Option<unsafe extern "C" fn(stage: *const c_void) -> u32>,
-    /// Makes the loss for a scan with this noise, a new one, and sets `fitted` to it; one that learns nothing leaves `fitted`
-    /// as it is. NULL where `needs_scan` is.
+    /// Creates the loss for a scan with this noise and sets `fitted` to it; a loss that does not depend on the noise
+    /// leaves `fitted` unchanged. NULL if `needs_scan` is NULL.
     pub fitted: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -656,21 +663,21 @@ pub struct ConefieldLoss {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// WGSL of `at`: a function `stage_at`, as docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
+    /// WGSL of `at`: a function `stage_at`; see docs/guide/writing-stages.md. NULL: CPU only.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 
-/// Where a prior looks, and how much it counts.
+/// Blocks and weight of a prior.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldBlocks {
     /// Points along a block's edge, 2 to 32.
     pub edge: usize,
-    /// Blocks a step.
+    /// Blocks per step.
     pub count: usize,
-    /// Distance of neighbouring points in voxels.
+    /// Distance between neighbouring points in voxels.
     pub spacing: f64,
-    /// Weight of the mean over all points against the mean loss of a ray.
+    /// Weight of the mean over all points relative to the mean loss of a ray.
     pub weight: f64,
 }
 
@@ -680,10 +687,11 @@ pub struct ConefieldBlocks {
 pub struct ConefieldPrior {
     /// Bytes of this table.
     pub size: usize,
-    /// Its blocks; always the same for one stage.
+    /// Its blocks; constant for a stage.
     pub blocks: Option<unsafe extern "C" fn(stage: *const c_void, blocks: *mut ConefieldBlocks) -> ConefieldStatus>,
-    /// The penalty of one block, not negative, to `penalty`. `values` are those of its `count = edge³` points, z fastest.
-    /// Adds `scale` times the derivative by each of them to `gradient`. A penalty is NaN where a value is NaN.
+    /// Writes the non-negative penalty of one block to `penalty`. `values` are those of its `count = edge³` points, z
+    /// fastest. Adds `scale` times the derivative with respect to each of them to `gradient`. The penalty is NaN if a
+    /// value is NaN.
     pub block: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -695,44 +703,44 @@ pub struct ConefieldPrior {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// WGSL of `block`: a function `stage_at`, as docs/guide/writing-stages.md says. NULL: it runs on the CPU alone.
+    /// WGSL of `block`: a function `stage_at`; see docs/guide/writing-stages.md. NULL: CPU only.
     pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 
-/// A grid of voxels or of coefficients. Numbers on it stand x by x, then y by y, z fastest.
+/// A grid of voxels or of coefficients. Arrays on it are row-major, z fastest.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldGrid {
-    /// How many along x, y and z.
+    /// Number of points along x, y and z.
     pub shape: [usize; 3],
-    /// Distances of neighbours, mm.
+    /// Distance between neighbours, mm.
     pub spacing: [f64; 3],
-    /// The middle of the grid, mm.
+    /// Centre of the grid, mm.
     pub center: [f64; 3],
 }
 
-/// Named numbers that a penalty keeps from call to call.
+/// Named state of a penalty, kept between calls.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldState {
     /// Their name, such as `dual`; valid as long as the penalty lives.
     pub name: ConefieldStr,
-    /// The first of them.
+    /// The first number.
     pub data: *mut f32,
-    /// How many.
+    /// Count of numbers.
     pub length: usize,
 }
 
-/// Functions of a regularizer: a convex penalty R of coefficients, for any grid. What `on` makes is a stage of its own, which
-/// `destroy` frees; `value`, `prox` and `state` get it.
+/// Functions of a regularizer: a convex penalty R of coefficients, for any grid. The result of `on` is a stage of its
+/// own, which `destroy` frees; it is the argument of `value`, `prox`, `adapt` and `state`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldRegularizer {
     /// Bytes of this table.
     pub size: usize,
-    /// Bytes that the penalty on `grid` holds. NULL: next to none.
+    /// Bytes held by the penalty on `grid`. NULL: negligible.
     pub bytes: Option<unsafe extern "C" fn(stage: *const c_void, grid: *const ConefieldGrid) -> u64>,
-    /// Makes the penalty on `grid`.
+    /// Creates the penalty on `grid`.
     pub on: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -741,8 +749,8 @@ pub struct ConefieldRegularizer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// The weight λ, 0 or more, for attenuation in 1/mm and lengths in mm. `noise(context, k)` measures k times what the scan's
-    /// noise comes to in the gradient of the data term; it takes a back-projection.
+    /// The weight λ, 0 or more, for attenuation in 1/mm and lengths in mm. `noise(context, k)` returns k times the root
+    /// mean square of the scan's noise in the gradient of the data term; it takes a back-projection.
     pub weight: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -763,8 +771,8 @@ pub struct ConefieldRegularizer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Overwrites `u` with the coefficients ≥ 0 that have the least `½‖u − v‖² + tau·R(u)`, or comes nearer to them with each
-    /// call for the same `v`.
+    /// Overwrites `u` with the coefficients ≥ 0 that minimize `½‖u − v‖² + tau·R(u)`, or approaches them with each call
+    /// for the same `v`.
     pub prox: Option<
         unsafe extern "C" fn(
             penalty: *mut c_void,
@@ -775,12 +783,13 @@ pub struct ConefieldRegularizer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Entry `index` of what the next `prox` starts from, which goes into checkpoints; [`CONEFIELD_UNSUPPORTED`] past the last.
-    /// NULL: every call starts afresh.
+    /// Entry `index` of the state from which the next `prox` starts, for checkpoints; [`CONEFIELD_UNSUPPORTED`] past
+    /// the last. NULL: no state.
     pub state:
         Option<unsafe extern "C" fn(penalty: *mut c_void, index: usize, state: *mut ConefieldState) -> ConefieldStatus>,
-    /// Fits the penalty to the coefficients `x`, before each pass over the scan. What it leaves follows from `x` alone, and is no
-    /// part of `state`. Writes the new R(x); returns [`CONEFIELD_UNSUPPORTED`] where the penalty stays as it is. NULL: it always does.
+    /// Adapts the penalty to the coefficients `x`, before each pass over the scan. The result depends on `x` only and
+    /// is not part of `state`. Writes the new R(x); returns [`CONEFIELD_UNSUPPORTED`] if the penalty does not change.
+    /// NULL: it never changes.
     pub adapt: Option<
         unsafe extern "C" fn(
             penalty: *mut c_void,
@@ -792,18 +801,17 @@ pub struct ConefieldRegularizer {
     >,
 }
 
-/// Functions of a data term `Σ φ(r)` of residuals `r = measured − predicted`. What `of` makes of a scan is a stage of its own,
-/// which `destroy` frees; all but `bytes` and `of` get it. They are asked for an image at a time: `count` pixels of the view
-/// `view`, whose line integrals `measured` were found, row by row.
+/// Functions of a data term `Σ φ(r)` of residuals `r = measured − predicted`. The result of `of` is a stage of its own,
+/// which `destroy` frees; it is the argument of all functions except `bytes` and `of`. Each call is for one image:
+/// `count` pixels of view `view`, with its line integrals `measured`, row by row.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldDataTerm {
     /// Bytes of this table.
     pub size: usize,
-    /// Bytes that it holds for a scan of `shape`: views, rows, columns; and those that `of` takes for a moment. NULL: next to
-    /// none.
+    /// Bytes held for a scan of `shape` (views, rows, columns), and temporary bytes of `of`. NULL: negligible.
     pub bytes: Option<unsafe extern "C" fn(stage: *const c_void, shape: *const usize, held: *mut u64, brief: *mut u64)>,
-    /// Makes the data term of the line integrals `measured`, which are only looked at.
+    /// Creates the data term for the line integrals `measured`, which it does not keep.
     pub of: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -838,7 +846,7 @@ pub struct ConefieldDataTerm {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Multiplies each value by the standard deviation that noise gives φ', in units of `noise`.
+    /// Multiplies each value by the standard deviation of φ' under noise, in units of `noise`.
     pub spread: Option<
         unsafe extern "C" fn(
             misfit: *const c_void,
@@ -855,24 +863,24 @@ pub struct ConefieldDataTerm {
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldExpansion {
-    /// Where the coefficients stand.
+    /// Positions of the coefficients.
     pub coefficients: ConefieldGrid,
-    /// Bytes that either direction takes while it works.
+    /// Working memory of either direction, in bytes.
     pub scratch: u64,
-    /// 1 if coefficients are the volume's values where they stand, on a grid that fills the same box.
+    /// 1 if coefficients are samples of the volume, on a grid that fills the same box.
     pub samples: u32,
-    /// 1 if it works in double precision too.
+    /// 1 if it also works in double precision.
     pub double_precision: u32,
 }
 
-/// Functions of a basis: a matrix B from coefficients to voxels. Its entries are not negative, unless coefficients are samples.
-/// What `on` makes is a stage of its own, which `destroy` frees; all others get it.
+/// Functions of a basis: a matrix B from coefficients to voxels. Its entries are non-negative, unless coefficients are
+/// samples. The result of `on` is a stage of its own, which `destroy` frees; it is the argument of all other functions.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldBasis {
     /// Bytes of this table.
     pub size: usize,
-    /// Makes the basis for the voxels of a grid. The number of coefficients follows from the grid's shape alone.
+    /// Creates the basis for the voxels of a grid. The number of coefficients depends on the grid's shape only.
     pub on: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -881,7 +889,7 @@ pub struct ConefieldBasis {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// What it is like there; always the same.
+    /// Its properties on this grid; constant.
     pub info: Option<unsafe extern "C" fn(expansion: *const c_void, info: *mut ConefieldExpansion) -> ConefieldStatus>,
     /// Overwrites `voxels` with `B·coefficients`.
     pub expand: Option<
@@ -901,7 +909,7 @@ pub struct ConefieldBasis {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// `expand` in double precision, by which it is checked. NULL: there is none.
+    /// `expand` in double precision, for checks. NULL: there is none.
     pub expand_f64: Option<
         unsafe extern "C" fn(
             expansion: *const c_void,
@@ -910,7 +918,7 @@ pub struct ConefieldBasis {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// `adjoint` in double precision. NULL where `expand_f64` is.
+    /// `adjoint` in double precision. NULL if `expand_f64` is NULL.
     pub adjoint_f64: Option<
         unsafe extern "C" fn(
             expansion: *const c_void,
@@ -921,7 +929,7 @@ pub struct ConefieldBasis {
     >,
 }
 
-/// A stage type that a plugin brings.
+/// A stage type of a plugin.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldStage {
@@ -929,16 +937,16 @@ pub struct ConefieldStage {
     pub kind: u32,
     /// The value of `type` in a spec: lower-case letters, digits and hyphens.
     pub name: ConefieldStr,
-    /// One line for people.
+    /// A one-line description.
     pub doc: ConefieldStr,
-    /// JSON Schema of its settings: an object whose `properties` have a `default` each, or are `required`. Its `examples`,
-    /// if any, are settings that `conefield plugins check` tries.
+    /// JSON Schema of its settings: an object whose `properties` each have a `default` or are `required`. Its
+    /// `examples`, if any, are settings that `conefield plugins check` tries.
     pub schema: ConefieldStr,
-    /// Handed to `create`.
+    /// Argument of `create`.
     pub context: *const c_void,
-    /// Makes a stage from `settings`: one JSON object that fits the schema, with every default written. `width` is the
-    /// number of channels that go in; 3 for an encoder, 0 where there are none. Returns [`CONEFIELD_INVALID`] and a text
-    /// such as `bands: found 0, expected at least 1` for settings that make no stage.
+    /// Creates a stage from `settings`: one JSON object that fits the schema, with all defaults written out. `width` is
+    /// the number of input channels; 3 for an encoder, 0 if there are none. Returns [`CONEFIELD_INVALID`] and a text
+    /// such as `bands: found 0, expected at least 1` for invalid settings.
     pub create: Option<
         unsafe extern "C" fn(
             context: *const c_void,
@@ -948,37 +956,38 @@ pub struct ConefieldStage {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Frees what `create` or another function of the stage made: every stage that was handed over, once.
+    /// Frees the result of `create` or of another function of the stage. Called once for every stage passed to the
+    /// host.
     pub destroy: Option<unsafe extern "C" fn(stage: *mut c_void)>,
-    /// One line on a stage, such as `10 levels x 2`.
+    /// A one-line description of a stage, such as `10 levels x 2`.
     pub describe: Option<unsafe extern "C" fn(stage: *const c_void, text: *mut ConefieldText) -> ConefieldStatus>,
-    /// Of an encoder, a normalizer, a field or a line field; otherwise NULL.
+    /// Functions of an encoder, normalizer, field or line field; otherwise NULL.
     pub map: *const ConefieldMap,
-    /// Of a projector; otherwise NULL.
+    /// Functions of a projector; otherwise NULL.
     pub projector: *const ConefieldProjector,
-    /// Of an initializer; otherwise NULL.
+    /// Functions of an initializer; otherwise NULL.
     pub initializer: *const ConefieldInitializer,
-    /// Of a loss; otherwise NULL.
+    /// Functions of a loss; otherwise NULL.
     pub loss: *const ConefieldLoss,
-    /// Of a prior; otherwise NULL.
+    /// Functions of a prior; otherwise NULL.
     pub prior: *const ConefieldPrior,
-    /// Of a regularizer; otherwise NULL. Since 2.2, as the rest.
+    /// Functions of a regularizer; otherwise NULL. Since 2.2, like the remaining fields.
     pub regularizer: *const ConefieldRegularizer,
-    /// Of a data term; otherwise NULL.
+    /// Functions of a data term; otherwise NULL.
     pub data_term: *const ConefieldDataTerm,
-    /// Of a basis; otherwise NULL.
+    /// Functions of a basis; otherwise NULL.
     pub basis: *const ConefieldBasis,
 }
 
-/// What a plugin is and brings.
+/// Description and contents of a plugin.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldPlugin {
     /// Bytes of this table.
     pub size: usize,
-    /// [`CONEFIELD_ABI_MAJOR`] as the plugin was built with.
+    /// [`CONEFIELD_ABI_MAJOR`] of the build.
     pub abi_major: u32,
-    /// [`CONEFIELD_ABI_MINOR`] as the plugin was built with.
+    /// [`CONEFIELD_ABI_MINOR`] of the build.
     pub abi_minor: u32,
     /// The plugin's name.
     pub name: ConefieldStr,
@@ -986,22 +995,22 @@ pub struct ConefieldPlugin {
     pub version: ConefieldStr,
     /// Its licence, an SPDX expression.
     pub licence: ConefieldStr,
-    /// Its stage types, one after the other.
+    /// Its stage types, consecutive.
     pub stages: *const ConefieldStage,
-    /// How many.
+    /// Number of stage types.
     pub stage_count: usize,
-    /// Bytes from one to the next.
+    /// Bytes between the starts of two entries.
     pub stage_size: usize,
 }
 
-/// The one function that a plugin exports, under the name [`ENTRY`]. What it returns lives as long as the library; NULL
-/// where there is nothing to offer.
+/// The only function that a plugin exports, under the name [`ENTRY`]. Its result lives as long as the library; NULL if
+/// there is nothing to offer.
 pub type ConefieldEntry = unsafe extern "C" fn() -> *const ConefieldPlugin;
 
 /// The name of the function that a plugin exports.
 pub const ENTRY: &str = "conefield_plugin";
 
-/// The contract as C reads it: the text of `conefield_plugin.h`.
+/// The contract for C: the text of `conefield_plugin.h`.
 pub const HEADER: &str = include_str!("../include/conefield_plugin.h");
 
 impl ConefieldStr {

@@ -1,10 +1,10 @@
-//! The C header is what `src/lib.rs` says, and the layout is what it was: both are what plugins were built with.
+//! The C header matches `src/lib.rs`, and the layout has not changed: plugins were built against both.
 
 use conefield_plugin_abi::*;
 use std::mem::offset_of;
 use std::path::Path;
 
-/// Writes the header anew with `CONEFIELD_BLESS=1`.
+/// `CONEFIELD_BLESS=1` writes the header.
 #[test]
 fn the_header_is_current() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -58,7 +58,7 @@ fn the_header_is_current() {
     assert!(found == text, "{} is not current; CONEFIELD_BLESS=1 writes it", path.display());
 }
 
-/// A change here breaks every plugin that was built: it needs a new major version.
+/// A change here breaks all existing plugins and needs a new major version.
 #[test]
 #[cfg(target_pointer_width = "64")]
 fn the_layout_is_pinned() {
@@ -180,7 +180,7 @@ fn the_layout_is_pinned() {
     assert_eq!(info, [0, 8, 16, 24, 32, 40, 48, 56, 60, 64, 68, 72, 76]);
 }
 
-/// What the kinds since 2.2 have.
+/// The layout of the kinds added in 2.2.
 #[test]
 #[cfg(target_pointer_width = "64")]
 fn the_layout_of_pieces_of_iterative_methods_is_pinned() {

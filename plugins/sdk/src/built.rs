@@ -94,7 +94,7 @@ impl Waiting {
         }
     }
 
-    /// The initializer with the weights of the file.
+    /// The initializer with these weights.
     pub fn with(&self, weights: &Weights) -> Result<AnyStage> {
         let only = |path: &str| {
             let why = || Error::unsupported(path, "an initializer from a plugin has one weights file");

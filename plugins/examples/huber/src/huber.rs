@@ -1,9 +1,10 @@
-//! Total variation by Huber's function: gradients below `threshold` count by their square, so that slopes stay smooth, and
-//! larger ones by their size, so that edges stay sharp. Where all of the gradient is small, total variation makes stairs.
+//! Total variation with Huber's function: gradients below `threshold` have a quadratic cost, so that slopes stay
+//! smooth; larger ones have a linear cost, so that edges stay sharp. Where all gradients are small, total variation
+//! causes staircase artefacts.
 //!
-//! `R(x) = Σ_j h(|∇x|_j)`, `h(t) = t²/2δ` up to δ and `t − δ/2` beyond. Its proximal map is found on the dual, as that of total
-//! variation is: `u = max(0, v − τ·∇ᵀp)` with `|p_j| ≤ 1`, and p goes up `∇u − δ·p` (Chambolle and Pock, J. Math. Imaging
-//! Vis. 40(1), 2011, section 6.2.2).
+//! `R(x) = Σ_j h(|∇x|_j)`, `h(t) = t²/2δ` up to δ and `t − δ/2` above. Its proximal map is computed on the dual, like
+//! that of total variation: `u = max(0, v − τ·∇ᵀp)` with `|p_j| ≤ 1`, and p ascends along `∇u − δ·p` (Chambolle and
+//! Pock, J. Math. Imaging Vis. 40(1), 2011, section 6.2.2).
 
 use conefield_plugin::prelude::*;
 
@@ -13,7 +14,7 @@ use conefield_plugin::prelude::*;
 pub struct Huber {
     /// Strength, as a multiple of the root mean square of back-projected noise.
     pub weight: f64,
-    /// Differences of neighbours, in 1/mm, below which slopes stay smooth.
+    /// Differences between neighbours, in 1/mm, below which slopes stay smooth.
     pub threshold: f64,
     /// Dual steps per update.
     pub inner: usize,
@@ -59,7 +60,7 @@ impl Regularizer for Huber {
 /// The penalty on one grid.
 struct On {
     shape: [usize; 3],
-    /// What differences along each axis are multiplied with.
+    /// Factors of differences along each axis.
     scale: [f32; 3],
     threshold: f32,
     inner: usize,
@@ -68,7 +69,7 @@ struct On {
 }
 
 impl On {
-    /// How far apart neighbours along each axis stand.
+    /// Strides between neighbours along each axis.
     fn steps(&self) -> [usize; 3] {
         [self.shape[1] * self.shape[2], self.shape[2], 1]
     }

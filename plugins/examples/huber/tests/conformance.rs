@@ -1,4 +1,4 @@
-//! The regularizer through conefield's conformance kit.
+//! Tests the regularizer with conefield's conformance kit.
 
 use conefield_conformance::check_regularizer;
 use conefield_plugin::prelude::*;
@@ -6,7 +6,7 @@ use huber::huber::Huber;
 
 #[test]
 fn huber_conforms() {
-    // Coefficients of the kit are of order one.
+    // The kit's coefficients are of order one.
     for settings in
         [Huber { threshold: 0.2, ..Huber::default() }, Huber { threshold: 0.05, inner: 1, ..Huber::default() }]
     {

@@ -22,7 +22,7 @@ pub struct Siren {
     pub width: usize,
     /// Hidden layers.
     pub depth: usize,
-    /// Angular frequency of the sines. The paper has 30 for coordinates; features of order one need less.
+    /// Angular frequency of the sines. The paper uses 30 for coordinates; features of order one need less.
     pub omega: f64,
 }
 
@@ -43,7 +43,7 @@ impl FieldSpec for Siren {
     }
 }
 
-/// One layer: `output` sums over `input` channels, and where its weights and biases stand.
+/// One layer: numbers of `input` and `output` channels, and the positions of its weights and biases.
 #[derive(Debug, Clone, Copy)]
 struct Layer {
     input: usize,
@@ -91,7 +91,7 @@ fn sums<R: Real>(layer: &Layer, params: &[R], x: &[R], y: &mut [R], rows: usize)
 }
 
 impl<R: Real> Kernel<R> for SirenField {
-    /// Leaves the outputs of every hidden layer, then the slopes of all activations.
+    /// Computes the outputs of every hidden layer, then the derivatives of all activations.
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         let rows = x.rows;
         let omega = R::of(self.settings.omega);
@@ -135,7 +135,7 @@ impl<R: Real> Kernel<R> for SirenField {
                 grads.values[at - grads.range.start] += sum;
             }
         };
-        // The gradient of each layer's sums takes the place of its slopes.
+        // The gradient of each layer's sums replaces its derivatives.
         slopes[hidden..].iter_mut().zip(dy.data).for_each(|(slope, &dy)| *slope *= dy);
         for (k, layer) in self.layers.iter().enumerate().rev() {
             let (before, own) = slopes.split_at_mut(k * size);
@@ -147,7 +147,8 @@ impl<R: Real> Kernel<R> for SirenField {
                 }
                 add(layer.biases + o, d.iter().copied().sum());
             }
-            // To the outputs of the layer before; times its slopes these are the gradients of its sums.
+            // Gradients with respect to the outputs of the previous layer; times its derivatives they are the gradients
+            // of its sums.
             let back = |i: usize, row: usize| -> R {
                 (0..layer.output).map(|o| params[layer.weights + o * layer.input + i] * own[o * rows + row]).sum()
             };
@@ -208,7 +209,7 @@ impl Stage for SirenField {
         Some(self)
     }
 
-    /// The same layers for one row. Every row touches every weight: gradients are sums over rows.
+    /// The same layers for one row. Every row affects every weight: gradients are sums over rows.
     fn wgsl(&self) -> Option<Fragment> {
         let (n, last) = (self.input, self.layers.len() - 1);
         let (mut layers, mut back) = (String::new(), String::new());

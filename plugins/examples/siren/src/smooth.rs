@@ -1,5 +1,5 @@
-//! Features smoothed along each ray: `yᵢ = (1 − s)·xᵢ + s·(xᵢ₋₁ + xᵢ₊₁)/2`, the ends repeated. A point off any ray is a ray
-//! of one sample and stays as it is.
+//! Smooths features along each ray: `yᵢ = (1 − s)·xᵢ + s·(xᵢ₋₁ + xᵢ₊₁)/2`, with the ends repeated. A point off any ray
+//! is a ray of one sample and does not change.
 
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::settings::NormalizerSpec;

@@ -1,4 +1,4 @@
-//! Both stages through conefield's conformance kit.
+//! Tests both stages with conefield's conformance kit.
 
 use conefield_conformance::{Options, check_field, check_normalizer};
 use conefield_plugin::settings::{FieldSpec, NormalizerSpec};

@@ -1,6 +1,7 @@
-//! Features as products of a plane and a line (vector-matrix factors; Chen et al., "TensoRF", 2022), on several levels: for
-//! each of the three orientations `F` channels `y = P(a, b)·L(c)`, where P is a grid read bilinearly at two coordinates and
-//! L one read linearly at the third. `R²·F + R·F` numbers an orientation instead of `R³·F`.
+//! Features as products of a plane and a line (vector-matrix factors; Chen et al., "TensoRF", 2022), on several levels:
+//! for each of the three orientations `F` channels `y = P(a, b)·L(c)`, where P is a grid, interpolated bilinearly at
+//! two coordinates, and L a line, interpolated linearly at the third. `R²·F + R·F` numbers per orientation instead of
+//! `R³·F`.
 
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::half::Stored;
@@ -22,7 +23,7 @@ conefield_plugin::stage_type!(Encoder, "triplane", Triplane, "products of planes
 pub struct Triplane {
     /// Levels, each with half the nodes of the next.
     pub levels: usize,
-    /// Nodes along a side of a plane, and of a line, of the finest level.
+    /// Nodes per side of a plane, and of a line, on the finest level.
     pub resolution: usize,
     /// Channels of each orientation of a level.
     pub features: usize,
@@ -58,7 +59,7 @@ impl EncoderSpec for Triplane {
     }
 }
 
-/// The two axes of each plane, and that of its line.
+/// The two axes of each plane, and the axis of its line.
 const AXES: [[usize; 3]; 3] = [[0, 1, 2], [0, 2, 1], [1, 2, 0]];
 
 /// A plane and a line: one orientation of one level.
@@ -66,20 +67,20 @@ const AXES: [[usize; 3]; 3] = [[0, 1, 2], [0, 2, 1], [1, 2, 0]];
 struct Factor {
     name: String,
     axes: [usize; 3],
-    /// Along a side of the plane, and of the line.
+    /// Nodes per side of the plane, and of the line.
     nodes: usize,
     features: usize,
-    /// Output channel of each feature, where it is read.
+    /// Output channel of each feature; `None` if unused.
     outputs: Vec<Option<usize>>,
 }
 
-/// A place between two nodes of a line of nodes.
+/// A position between two nodes of a line.
 #[derive(Clone, Copy)]
 struct Between<R> {
     node: usize,
-    /// Weights of the node and of the next.
+    /// Weights of the node and of the next one.
     weights: [R; 2],
-    /// Their derivatives by the coordinate.
+    /// Their derivatives with respect to the coordinate.
     slopes: [R; 2],
 }
 
@@ -92,12 +93,12 @@ impl Factor {
         self.plane_len() + self.nodes * self.features
     }
 
-    /// The features that are read, with their output channels.
+    /// The features in use, with their output channels.
     fn read(&self) -> impl Iterator<Item = (usize, usize)> {
         self.outputs.iter().enumerate().filter_map(|(k, c)| Some((k, (*c)?)))
     }
 
-    /// Coordinates outside the cube are taken for those of its face.
+    /// Coordinates outside the cube are clamped to its faces.
     fn between<R: Real>(&self, x: R) -> Between<R> {
         let cells = R::of((self.nodes - 1) as f64);
         let inside = x > R::ZERO && x < R::ONE;
@@ -115,12 +116,13 @@ impl Factor {
         Between { node, weights: [R::ONE - right, right], slopes: [R::ZERO - slope, slope] }
     }
 
-    /// Places of row `i` on the two axes of the plane and on the line.
+    /// Positions of row `i` on the two axes of the plane and on the line.
     fn row<R: Real>(&self, x: &Tile<'_, R>, i: usize) -> [Between<R>; 3] {
         self.axes.map(|axis| self.between(x.channel(axis)[i]))
     }
 
-    /// The four nodes of the plane around a place: index of the first feature, and a weight made of those of both axes.
+    /// The four nodes of the plane around a position: index of the first feature, and the product of the weights along
+    /// both axes.
     fn corners<R: Real>(&self, [a, b]: [usize; 2], wa: [R; 2], wb: [R; 2]) -> [(usize, R); 4] {
         let at = |i: usize, j: usize| ((a + i) * self.nodes + b + j) * self.features;
         [(at(0, 0), wa[0] * wb[0]), (at(0, 1), wa[0] * wb[1]), (at(1, 0), wa[1] * wb[0]), (at(1, 1), wa[1] * wb[1])]
@@ -216,7 +218,7 @@ impl TriplaneStage {
     }
 }
 
-// One source for single precision, for double precision that checks it, and for parameters in halves.
+// One source for single precision, for double precision (checks), and for half-precision parameters.
 impl<R: Real, P: Stored<R>> Kernel<R, P> for TriplaneStage {
     fn forward(&self, params: &[P], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
         for (factor, range) in self.factors.iter().zip(&self.ranges) {
@@ -278,7 +280,7 @@ impl Stage for TriplaneStage {
         self.factors.iter().zip(&self.ranges).flat_map(of).collect()
     }
 
-    /// Planes around 0, lines around 1, so that products begin small but learn.
+    /// Planes start around 0 and lines around 1, so that products start small but learn.
     fn init(&self, seed: u64, params: &mut [f32]) {
         for (i, p) in params.iter_mut().enumerate() {
             *p = 0.1 * (2.0 * unit(mix(seed, i as u64)) - 1.0);
@@ -300,7 +302,7 @@ impl Stage for TriplaneStage {
         Some(Halves::of(self))
     }
 
-    /// A plane and its line a worker.
+    /// A plane and its line per worker.
     fn partition(&self) -> Vec<Range<usize>> {
         self.ranges.clone()
     }

@@ -1,4 +1,4 @@
-//! An encoder that panics on request. No panic may take the host down.
+//! An encoder that panics on request. No panic may crash the host.
 
 use conefield_plugin::error::Result;
 use conefield_plugin::settings::EncoderSpec;
@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 conefield_plugin::export!();
 conefield_plugin::stage_type!(Encoder, "panics", Panics, "panics on request");
 
-/// When it panics.
+/// When to panic.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 enum When {

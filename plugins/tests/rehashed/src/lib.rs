@@ -1,5 +1,5 @@
-//! The built-in hash grid once more, as a plugin: what the way through the contract costs, and that masks reach it. And two
-//! initializers: what the contract has for them.
+//! The built-in hash grid as a plugin, to measure the cost of the ABI and to test masks through it; and two
+//! initializers, to test the ABI's functions for them.
 
 mod started;
 

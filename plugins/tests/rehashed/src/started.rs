@@ -1,4 +1,5 @@
-//! The built-in initializers `mci` and `volume` as a plugin's: one has weights read by the host, the other a known volume.
+//! The built-in initializers `mci` and `volume` as plugin types: one gets weights read by the host, the other a known
+//! volume.
 
 use conefield_initializers::mci::Mci;
 use conefield_initializers::volume::FromVolume;
