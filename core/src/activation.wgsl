@@ -24,7 +24,7 @@ fn stage_gelu(x: f32) -> vec2<f32> {
 }
 
 fn stage_squareplus(x: f32) -> vec2<f32> {
-    // Past 1e18 the square would overflow, and the root is |x| to the last bit.
+    // Above 1e18 the square would overflow, and the root equals |x| to the last bit.
     let small = min(abs(x), 1e18);
     let root = max(sqrt(small * small + 1.52382103), abs(x));
     return vec2<f32>((x + root) * 0.5, (x / root + 1.0) * 0.5);
@@ -36,7 +36,7 @@ fn stage_logistic(x: f32) -> f32 {
 }
 
 fn stage_softplus(x: f32) -> vec2<f32> {
-    // ln(1 + e) by its series where 1 + e would lose e's digits.
+    // ln(1 + e) by its series if 1 + e would lose digits of e.
     let e = exp(-min(abs(x), 87.0));
     let log = select(log(1.0 + e), e * (1.0 - e * (0.5 - e * (1.0 / 3.0 - e * 0.25))), e < 0.03);
     return vec2<f32>(max(x, 0.0) + log, stage_logistic(x));

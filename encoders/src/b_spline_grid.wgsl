@@ -1,24 +1,24 @@
-// Pyramid of cubic B-splines: the twin of b_spline_grid.rs. `stage_FEATURES` and calls level by level come from there.
+// Pyramid of cubic B-splines, as in b_spline_grid.rs, which adds `stage_FEATURES` and the calls level by level.
 
 struct stage_Level {
     cells: u32,
-    // Coefficients along a side.
+    // Coefficients per side.
     side: u32,
     // First parameter.
     start: u32,
 }
 
 struct stage_Located {
-    // First parameter of the first coefficient that reaches into the cell.
+    // First parameter of the first coefficient that affects the cell.
     first: u32,
-    // Within the cell.
+    // Position within the cell.
     t: vec3<f32>,
 }
 
 fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Located {
     let cells = vec3<f32>(f32(level.cells));
     let p = x * cells;
-    // A coordinate that is not a number counts as 0.
+    // A NaN coordinate counts as 0.
     let q = select(vec3<f32>(0.0), min(p, cells), p > vec3<f32>(0.0));
     let cell = min(floor(q), cells - 1.0);
     let c = vec3<u32>(cell);
@@ -26,7 +26,7 @@ fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Located {
     return stage_Located(level.start + entry * stage_FEATURES, q - cell);
 }
 
-// The four B-splines that reach into a cell.
+// The four B-splines that affect a cell.
 fn stage_splines(t: f32) -> vec4<f32> {
     let rest = 1.0 - t;
     let first = rest * rest * rest / 6.0;
@@ -62,7 +62,7 @@ fn stage_level_forward(x: vec3<f32>, level: stage_Level) -> array<f32, stage_FEA
     return sum;
 }
 
-// Adds to the gradients of the level's coefficients; returns the derivative by the point.
+// Adds to the gradients of the level's coefficients; returns the derivative with respect to the point.
 fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, array<f32, stage_FEATURES>>) -> vec3<f32> {
     let at = stage_locate(x, level);
     var a = stage_splines(at.t.x);
@@ -87,7 +87,7 @@ fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, arra
             slope += along * vec3<f32>(da[i] * b[j] * c[k], a[i] * db[j] * c[k], a[i] * b[j] * dc[k]);
         }
     }
-    // Beyond the rim a position counts as on it, whichever it is.
+    // Beyond the rim a position is clamped, whatever its value.
     let inside = (x >= vec3<f32>(0.0)) & (x <= vec3<f32>(1.0));
     return select(vec3<f32>(0.0), slope * f32(level.cells), inside);
 }

@@ -1,4 +1,4 @@
-// Multi-resolution dense grid: the twin of dense_grid.rs. `stage_FEATURES` and calls level by level come from there.
+// Multi-resolution dense grid, as in dense_grid.rs, which adds `stage_FEATURES` and the calls level by level.
 
 struct stage_Level {
     side: vec3<u32>,
@@ -25,7 +25,7 @@ fn stage_level_forward(x: vec3<f32>, level: stage_Level) -> array<f32, stage_FEA
     return sum;
 }
 
-// Adds to the gradients of the level's entries; returns the derivative by the point.
+// Adds to the gradients of the level's entries; returns the derivative with respect to the point.
 fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, array<f32, stage_FEATURES>>) -> vec3<f32> {
     let at = stage_at(x, level);
     var slope = vec3<f32>(0.0);

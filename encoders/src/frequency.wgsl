@@ -1,9 +1,9 @@
-// Frequency bands: the twin of frequency.rs, which writes the calls wave by wave.
+// Frequency bands, as in frequency.rs, which adds the calls wave by wave.
 
-// sin(2π·t) and cos(2π·t). Whole turns drop out exactly; what remains is at most an eighth of a turn, where the series
-// ends below half a unit in the last place.
+// sin(2π·t) and cos(2π·t). Whole turns cancel exactly; the rest is at most an eighth of a turn, where the truncation
+// error of the series is below half a unit in the last place.
 fn stage_sin_cos_turns(turns: f32) -> vec2<f32> {
-    // From 2^24 on every number is whole.
+    // From 2^24 on every float is an integer.
     let t = select(turns, 0.0, abs(turns) >= 16777216.0);
     let quarter = round(t * 4.0);
     let a = (t - 0.25 * quarter) * 6.2831853;

@@ -1,14 +1,14 @@
-// Multi-resolution hash grid: the twin of hash_grid.rs. `stage_FEATURES`, `stage_PRIMES` and calls level by level come
-// from there.
+// Multi-resolution hash grid, as in hash_grid.rs, which adds `stage_FEATURES`, `stage_PRIMES` and the calls level by
+// level.
 
 struct stage_Level {
     // Position in cells: x·scale + 1/2, at most `top`.
     scale: f32,
-    // The last cell along a side.
+    // The last cell of a side.
     last: f32,
-    // Vertices along a side where the level is indexed directly, else 0.
+    // Vertices per side if the level is indexed directly, else 0.
     side: u32,
-    // Entries less one, where indices are hashes.
+    // Number of entries minus one, for hashed indices.
     mask: u32,
     // First parameter.
     start: u32,
@@ -21,13 +21,13 @@ struct stage_Cell {
 
 fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Cell {
     let p = x * level.scale + 0.5;
-    // A coordinate that is not a number counts as 0.
+    // A NaN coordinate counts as 0.
     let q = select(vec3<f32>(0.0), min(p, vec3<f32>(level.scale + 0.5)), p > vec3<f32>(0.0));
     let corner = min(floor(q), vec3<f32>(level.last));
     return stage_Cell(vec3<u32>(corner), q - corner);
 }
 
-// First parameter of corner `c`, which is further along x, y, z where bits 0, 1, 2 are set.
+// First parameter of corner `c`, which is further along x, y, z if bits 0, 1, 2 are set.
 fn stage_entry(level: stage_Level, cell: stage_Cell, c: u32) -> u32 {
     let v = cell.corner + vec3<u32>(c & 1u, (c >> 1u) & 1u, c >> 2u);
     let direct = v.x + (v.y + v.z * level.side) * level.side;
@@ -53,7 +53,7 @@ fn stage_level_forward(x: vec3<f32>, level: stage_Level) -> array<f32, stage_FEA
     return sum;
 }
 
-// Adds to the gradients of the level's entries; returns the derivative by the point.
+// Adds to the gradients of the level's entries; returns the derivative with respect to the point.
 fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, array<f32, stage_FEATURES>>) -> vec3<f32> {
     let cell = stage_locate(x, level);
     var slope = vec3<f32>(0.0);
@@ -70,7 +70,7 @@ fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, arra
             slope += along * sign * vec3<f32>(w.y * w.z, w.x * w.z, w.x * w.y);
         }
     }
-    // Beyond the rim a position counts as on it, whichever it is.
+    // Beyond the rim a position is clamped, whatever its value.
     let inside = (x <= vec3<f32>(1.0)) & (x * level.scale + 0.5 >= vec3<f32>(0.0));
     return select(vec3<f32>(0.0), slope * level.scale, inside);
 }

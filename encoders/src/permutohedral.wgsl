@@ -1,11 +1,11 @@
-// Multi-resolution hash of a permutohedral lattice: the twin of permutohedral.rs. `stage_FEATURES`, `stage_PRIMES` and calls
-// level by level come from there.
+// Multi-resolution hash of a permutohedral lattice, as in permutohedral.rs, which adds `stage_FEATURES`, `stage_PRIMES`
+// and the calls level by level.
 
 struct stage_Level {
     scale: f32,
-    // Pairs of vertices along a side where the level is indexed directly, else 0.
+    // Pairs of vertices per side if the level is indexed directly, else 0.
     side: u32,
-    // Entries less one.
+    // Number of entries minus one.
     last: u32,
     // First parameter.
     start: u32,
@@ -13,14 +13,14 @@ struct stage_Level {
 
 struct stage_Simplex {
     cell: vec3<u32>,
-    // How many of the other two fractions come before each.
+    // Number of the other two fractions that precede each one.
     rank: vec3<u32>,
     // Barycentric coordinates of the corners.
     weight: vec4<f32>,
 }
 
 fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Simplex {
-    // A coordinate that is not a number counts as 0.
+    // A NaN coordinate counts as 0.
     let p = select(vec3<f32>(0.0), min(x, vec3<f32>(1.0)), x > vec3<f32>(0.0));
     let u = (p.yxx + p.zzy) * level.scale;
     let cell = floor(u);
@@ -59,7 +59,7 @@ fn stage_level_forward(x: vec3<f32>, level: stage_Level) -> array<f32, stage_FEA
     return sum;
 }
 
-// Adds to the gradients of the level's entries; returns the derivative by the point.
+// Adds to the gradients of the level's entries; returns the derivative with respect to the point.
 fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, array<f32, stage_FEATURES>>) -> vec3<f32> {
     let at = stage_locate(x, level);
     var along: array<f32, 4>;
@@ -72,12 +72,12 @@ fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, arra
             }
         }
     }
-    // By a fraction: the corner that it adds to, less the one before.
+    // With respect to a fraction: the corner that it adds to, minus the one before.
     var by: vec3<f32>;
     for (var d = 0u; d < 3u; d++) {
         by[d] = along[at.rank[d] + 1u] - along[at.rank[d]];
     }
-    // Beyond the rim a position counts as on it, whichever it is.
+    // Beyond the rim a position is clamped, whatever its value.
     let inside = (x >= vec3<f32>(0.0)) & (x <= vec3<f32>(1.0));
     return select(vec3<f32>(0.0), (by.yxx + by.zzy) * level.scale, inside);
 }

@@ -1,5 +1,5 @@
-// Features of planes: the twin of planes.rs. `stage_FEATURES`, `stage_LINES` and calls level by level come from there: with
-// lines a call for each orientation, without one for the three planes that are added.
+// Features of planes, as in planes.rs, which adds `stage_FEATURES`, `stage_LINES` and the calls level by level: one
+// call per orientation with lines, one call for all three planes without.
 
 struct stage_Level {
     cells: u32,
@@ -13,9 +13,9 @@ struct stage_Place {
     // Parameter of the first corner on the plane, and of the first node on the line.
     corner: u32,
     node: u32,
-    // From a corner to the next along the plane's first axis.
+    // Offset from a corner to the next along the plane's first axis.
     stride: u32,
-    // Within the cell: along the plane's two axes, and along the line.
+    // Position within the cell, along the plane's two axes and along the line.
     t: vec3<f32>,
 }
 
@@ -30,7 +30,7 @@ fn stage_turn(x: vec3<f32>, orientation: u32) -> vec3<f32> {
     return x.yzx;
 }
 
-// The way back.
+// The inverse of the above.
 fn stage_turn_back(x: vec3<f32>, orientation: u32) -> vec3<f32> {
     if orientation == 0u {
         return x;
@@ -44,7 +44,7 @@ fn stage_turn_back(x: vec3<f32>, orientation: u32) -> vec3<f32> {
 fn stage_place(x: vec3<f32>, level: stage_Level, orientation: u32) -> stage_Place {
     let cells = vec3<f32>(f32(level.cells));
     let p = stage_turn(x, orientation) * cells;
-    // A coordinate that is not a number counts as 0.
+    // A NaN coordinate counts as 0.
     let q = select(vec3<f32>(0.0), min(p, cells), p > vec3<f32>(0.0));
     let cell = min(floor(q), cells - 1.0);
     let c = vec3<u32>(cell);
@@ -55,7 +55,7 @@ fn stage_place(x: vec3<f32>, level: stage_Level, orientation: u32) -> stage_Plac
     return stage_Place(corner, start + plane + c.z * stage_FEATURES, nodes * stage_FEATURES, q - cell);
 }
 
-// Feature `f` on the plane, where nodes along its axes weigh `a` and `b`.
+// Feature `f` on the plane, with the weights `a` and `b` of nodes along its axes.
 fn stage_plane(at: stage_Place, a: vec2<f32>, b: vec2<f32>, f: u32) -> f32 {
     let near = b.x * stage_param(at.corner + f) + b.y * stage_param(at.corner + stage_FEATURES + f);
     let far = b.x * stage_param(at.corner + at.stride + f) + b.y * stage_param(at.corner + at.stride + stage_FEATURES + f);
@@ -89,7 +89,7 @@ fn stage_level_forward(x: vec3<f32>, level: stage_Level) -> array<f32, stage_FEA
     return sum;
 }
 
-// Adds to the gradients of the planes and lines; returns the derivative by the point.
+// Adds to the gradients of the planes and lines; returns the derivative with respect to the point.
 fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, array<f32, stage_FEATURES>>) -> vec3<f32> {
     let ends = vec2<f32>(-1.0, 1.0);
     var slope = vec3<f32>(0.0);
@@ -122,7 +122,7 @@ fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, arra
         }
         slope += stage_turn_back(along, o);
     }
-    // Beyond the rim a position counts as on it, whichever it is.
+    // Beyond the rim a position is clamped, whatever its value.
     let inside = (x >= vec3<f32>(0.0)) & (x <= vec3<f32>(1.0));
     return select(vec3<f32>(0.0), slope * f32(level.cells), inside);
 }

@@ -1,5 +1,5 @@
-// A grid of voxels as the field: the twin of voxel_grid.rs, which gives `stage_SIDE`, `stage_STRIDES` and
-// `stage_output`, the activation.
+// A grid of voxels as the field, as in voxel_grid.rs, which adds `stage_SIDE`, `stage_STRIDES` and `stage_output`, the
+// activation.
 
 fn stage_at(x: ptr<function, array<f32, 3>>) -> stage_Located {
     let p = vec3<f32>((*x)[0], (*x)[1], (*x)[2]);

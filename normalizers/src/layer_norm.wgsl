@@ -1,11 +1,11 @@
-// Layer normalisation: the twin of layer_norm.rs, which gives `stage_WIDTH`, `stage_EPS` and `stage_AFFINE`.
+// Layer normalization, as in layer_norm.rs, which adds `stage_WIDTH`, `stage_EPS` and `stage_AFFINE`.
 
 struct stage_Row {
     first: f32,
     mean: f32,
-    // Reciprocal deviation.
+    // Reciprocal standard deviation.
     root: f32,
-    // 1, but for rows that would overflow when squared.
+    // 1, except for rows that would overflow when squared.
     scale: f32,
 }
 
@@ -27,7 +27,7 @@ fn stage_row(x: ptr<function, array<f32, stage_WIDTH>>) -> stage_Row {
         let d = ((*x)[c] * scale - first) - mean;
         variance += d * d;
     }
-    // At least 2^-120, which has a finite root.
+    // At least 2^-120, whose root is finite.
     let eps = max(stage_EPS * scale * scale, 7.52316384526264e-37);
     return stage_Row(first, mean, 1.0 / sqrt(variance * (1.0 / f32(stage_WIDTH)) + eps), scale);
 }

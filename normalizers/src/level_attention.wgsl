@@ -1,5 +1,5 @@
-// Attention over levels: the twin of level_attention.rs, which gives `stage_LEVELS`, `stage_WIDTH` and `stage_BIAS`, and writes
-// what goes channel by channel.
+// Attention over levels, as in level_attention.rs, which adds `stage_LEVELS`, `stage_WIDTH` and `stage_BIAS`, and
+// writes the code of each channel.
 
 // The weights of the levels.
 fn stage_attention(x: ptr<function, array<f32, stage_WIDTH>>) -> array<f32, stage_LEVELS> {

@@ -1,4 +1,4 @@
-// Ray marching: the twin of ray_march.rs, which gives `stage_PUBLISHED`, `stage_STRATIFIED` and `stage_END_TO_END`.
+// Ray marching, as in ray_march.rs, which adds `stage_PUBLISHED`, `stage_STRATIFIED` and `stage_END_TO_END`.
 
 fn stage_sample(ray: Ray, i: u32, training: bool) -> vec4<f32> {
     let range = select(ray.inside, ray.published, stage_PUBLISHED);

@@ -1,5 +1,5 @@
-// Random numbers that depend on a seed and a position alone: conefield_core::random, bit for bit. Numbers of 64 bits
-// are pairs of 32, the lower first.
+// Random numbers that depend on a seed and a position only, as in conefield_core::random, bit for bit. 64-bit numbers
+// are pairs of 32-bit numbers, the lower first.
 
 fn random_times(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
     let a0 = a.x & 0xffffu;

@@ -1,12 +1,12 @@
 // A ray in the unit cube: origin + t·direction, t in cube sides.
 struct Ray {
     origin: vec3<f32>,
-    // Cube sides a millimetre.
+    // Cube sides per millimetre.
     per_mm: f32,
     direction: vec3<f32>,
-    // What was measured.
+    // The measured line integral.
     measured: f32,
-    // Entry into and exit from the reconstruction box; equal where the ray misses it.
+    // Entry into and exit from the reconstruction box; equal if the ray misses it.
     inside: vec2<f32>,
     // Beginning and end of the published sampling range.
     published: vec2<f32>,
@@ -14,6 +14,6 @@ struct Ray {
     seed: vec2<u32>,
     // Row of the first sample.
     first: u32,
-    // Samples.
+    // Number of samples.
     count: u32,
 }

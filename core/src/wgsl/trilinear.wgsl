@@ -1,26 +1,26 @@
-// Trilinear interpolation on a regular grid over the unit cube: conefield_core::trilinear.
+// Trilinear interpolation on a regular grid over the unit cube, as in conefield_core::trilinear.
 
 struct stage_Located {
     // Entry of the cell's first corner.
     base: u32,
     fraction: vec3<f32>,
-    // Derivative of the position in cells by the point: 0 where it was clamped.
+    // Derivative of the position in cells with respect to the point; 0 where it was clamped.
     slope: vec3<f32>,
 }
 
-// `side`: vertices an axis; `strides`: entries to the next vertex.
+// `side`: vertices per axis; `strides`: offsets to the next vertex.
 fn stage_trilinear_locate(x: vec3<f32>, side: vec3<u32>, strides: vec3<u32>, scale: vec3<f32>, shift: f32) -> stage_Located {
     let top = vec3<f32>(side - 1u);
     let last = max(top - 1.0, vec3<f32>(0.0));
     let p = x * scale + shift;
     let inside = (p >= vec3<f32>(0.0)) & (p <= top);
-    // A coordinate that is not a number counts as 0.
+    // A NaN coordinate counts as 0.
     let q = select(vec3<f32>(0.0), min(p, top), p > vec3<f32>(0.0));
     let cell = min(floor(q), last);
     return stage_Located(dot(vec3<u32>(cell), strides), q - cell, select(vec3<f32>(0.0), scale, inside));
 }
 
-// Entry of corner `c`, which is further along x, y, z where bits 0, 1, 2 are set.
+// Entry of corner `c`, which is further along x, y, z if bits 0, 1, 2 are set.
 fn stage_trilinear_index(l: stage_Located, strides: vec3<u32>, c: u32) -> u32 {
     return l.base + dot(vec3<u32>(c & 1u, (c >> 1u) & 1u, c >> 2u), strides);
 }
@@ -30,7 +30,7 @@ fn stage_trilinear_weight(l: stage_Located, c: u32) -> f32 {
     return f.x * f.y * f.z;
 }
 
-// Derivative of corner `c`'s weight by the point.
+// Derivative of corner `c`'s weight with respect to the point.
 fn stage_trilinear_slopes(l: stage_Located, c: u32) -> vec3<f32> {
     let further = vec3<bool>((c & 1u) != 0u, (c & 2u) != 0u, (c & 4u) != 0u);
     let f = select(1.0 - l.fraction, l.fraction, further);

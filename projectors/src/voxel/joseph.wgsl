@@ -21,7 +21,7 @@ fn stage_walk(ray: VoxelRay) {
     }
     var lower = vec3<f32>(-1.0);
     var upper = vec3<f32>(shape);
-    // A plane more on both sides: positions on the edge are tested voxel by voxel.
+    // One more plane on both sides: positions on the edge are tested voxel by voxel.
     upper[main] = f32(shape[main]);
     let inside = stage_clip(ray, lower, upper);
     if inside.y <= inside.x {

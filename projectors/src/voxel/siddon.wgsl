@@ -1,4 +1,4 @@
-// Exact lengths inside voxels (Siddon 1985), voxel by voxel as Amanatides and Woo step.
+// Exact lengths inside voxels (Siddon 1985), traversed voxel by voxel (Amanatides and Woo).
 
 fn stage_wall(ray: VoxelRay, k: u32, voxel: i32) -> f32 {
     if ray.ahead[k] == 0.0 {
@@ -17,7 +17,7 @@ fn stage_walk(ray: VoxelRay) {
     var voxel = clamp(vec3<i32>(floor(start + 0.5)), vec3<i32>(0), last);
     var next = vec3<f32>(stage_wall(ray, 0u, voxel.x), stage_wall(ray, 1u, voxel.y), stage_wall(ray, 2u, voxel.z));
     var t = inside.x;
-    // A ray passes no more walls than there are.
+    // Upper bound of the number of walls that a ray crosses.
     let most = u32(last.x + last.y + last.z) + 4u;
     for (var i = 0u; i < most; i++) {
         var k = 0u;

@@ -1,5 +1,5 @@
-// Trilinear interpolation at the midpoints of equal steps inside the box that the voxels fill. `stage_SAMPLES`, samples
-// along the smallest side of a voxel, comes from stages.rs.
+// Trilinear interpolation at the midpoints of equal steps inside the box of the voxels. `stage_SAMPLES`, the number of
+// samples along the smallest side of a voxel, comes from stages.rs.
 
 fn stage_walk(ray: VoxelRay) {
     let shape = stage_shape();

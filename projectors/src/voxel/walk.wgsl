@@ -1,5 +1,5 @@
-// The part of a ray inside a box of voxels, from the source on: entry and exit, exit ≤ entry where it misses. The twin of
-// walk.rs.
+// The part of a ray inside a box of voxels, from the source on: entry and exit, with exit ≤ entry if the ray misses it.
+// As in walk.rs.
 fn stage_clip(ray: VoxelRay, lower: vec3<f32>, upper: vec3<f32>) -> vec2<f32> {
     var near = 0.0;
     var far = 1e30;
