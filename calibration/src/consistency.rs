@@ -1,15 +1,16 @@
 //! The criterion without a reconstruction: the consistency of two views on the planes through both sources.
 //!
-//! A plane `n` through a source meets the detector in a line. The view alone gives the derivative of the object's plane integral
-//! along the plane's normal (Grangeat, Mathematical Methods in Tomography, LNM 1497, 1991): `R(n) = ∫ g(θ)·δ'(n·θ) dθ` over all
-//! ray directions `θ` with line integrals `g`. For every plane through both sources, both views must give the same value
-//! (Debbeler et al., Fully3D 2013; Aichert et al., IEEE Trans. Med. Imaging 34, 2015). This holds for every object: the criterion
-//! depends neither on its size nor on the accuracy of a prediction from few views.
+//! A plane `n` through a source meets the detector in a line. The view alone gives the derivative of the object's plane
+//! integral along the plane's normal (Grangeat, Mathematical Methods in Tomography, LNM 1497, 1991): `R(n) = ∫
+//! g(θ)·δ'(n·θ) dθ` over all ray directions `θ` with line integrals `g`. For every plane through both sources, both
+//! views must give the same value (Debbeler et al., Fully3D 2013; Aichert et al., IEEE Trans. Med. Imaging 34, 2015).
+//! This holds for every object: the criterion depends neither on its size nor on the accuracy of a prediction from few
+//! views.
 //!
-//! With `e₁`, `e₂` at right angles to the line through the sources, the planes are `n = e₂ − k·e₁`. A pixel with direction `d`
-//! from the source and solid angle `|det(u, v, w)|/|d|³` (`w` to the detector's centre) lies in the plane `k = d·e₂/d·e₁`, and
-//! `R(k) = Σ g·|det|/(|d|·(d·e₁)²)·δ'(k(pixel) − k)`. The derivative of a Gaussian of the same width for both views replaces
-//! `δ'`. So there is no interpolation, and equal values stay equal.
+//! With `e₁`, `e₂` at right angles to the line through the sources, the planes are `n = e₂ − k·e₁`. A pixel with
+//! direction `d` from the source and solid angle `|det(u, v, w)|/|d|³` (`w` to the detector's centre) lies in the plane
+//! `k = d·e₂/d·e₁`, and `R(k) = Σ g·|det|/(|d|·(d·e₁)²)·δ'(k(pixel) − k)`. The derivative of a Gaussian of the same
+//! width for both views replaces `δ'`. So there is no interpolation, and equal values stay equal.
 
 use crate::criterion::spread;
 use crate::parameters::{Correction, Parameter};
@@ -31,13 +32,13 @@ const END: usize = 5;
 const MARGIN: f64 = 0.1;
 /// Least number of planes of a pair; pairs with fewer are ignored.
 const FEWEST: usize = 4;
-/// Shares of the highest line integral. A local mean below the first is air and is ignored. A local mean above the second at a
-/// side of the detector is an object that is cut off.
+/// Shares of the highest line integral. A local mean below the first is air and is ignored. A local mean above the
+/// second at a side of the detector is an object that is cut off.
 const AIR: f32 = 0.01;
 const CUT: f32 = 0.05;
-/// Least distance of the line through two sources from the volume's centre, and of every ray's end from the plane at right angles
-/// to `e₁`, as shares of the distances from the source: planes around a line through the object do not give parallel lines on the
-/// detector.
+/// Least distance of the line through two sources from the volume's centre, and of every ray's end from the plane at
+/// right angles to `e₁`, as shares of the distances from the source: planes around a line through the object do not
+/// give parallel lines on the detector.
 const PAST: f64 = 0.05;
 const AHEAD: f64 = 0.15;
 /// Number of brightness intervals for the noise measurement.
@@ -85,8 +86,8 @@ struct Seen {
 }
 
 impl Consistency {
-    /// Prepares `scan` with about `width` pixels along the longer side of the detector. Uses the planes that are complete in the
-    /// geometry corrected by `known`.
+    /// Prepares `scan` with about `width` pixels along the longer side of the detector. Uses the planes that are
+    /// complete in the geometry corrected by `known`.
     pub fn new(scan: &Scan, width: usize, known: &Correction) -> Result<Self> {
         let [rows, columns] = scan.geometry.detector;
         let bin = rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1));
@@ -151,8 +152,8 @@ impl Consistency {
         self.pairs.iter().map(|p| p.views).collect()
     }
 
-    /// For each pair in the corrected geometry, the sum of squared differences of its views, divided by their noise variance. For
-    /// pure noise this equals the number of planes in every geometry: the criterion is unbiased.
+    /// For each pair in the corrected geometry, the sum of squared differences of its views, divided by their noise
+    /// variance. For pure noise this equals the number of planes in every geometry: the criterion is unbiased.
     pub fn misfits(&self, correction: &Correction) -> Vec<f64> {
         let of = |[(a, va), (b, vb)]: &[(f64, f64); 2]| (a - b).powi(2) / (va + vb).max(f64::MIN_POSITIVE);
         self.both(correction).iter().map(|pair| pair.iter().map(of).sum()).collect()
@@ -199,8 +200,8 @@ impl Consistency {
         pixels.iter().map(of).collect()
     }
 
-    /// `e₁` and `e₂` of a pair, `e₁` towards the centre of the volume; `None` if the line through the sources passes too near the
-    /// centre.
+    /// `e₁` and `e₂` of a pair, `e₁` towards the centre of the volume; `None` if the line through the sources passes
+    /// too near the centre.
     fn frame(&self, views: &[View], [i, j]: [usize; 2]) -> Option<[Vec3; 2]> {
         let along = sub(views[j].source, views[i].source);
         let along = along.map(|x| x / norm(along));
@@ -303,16 +304,16 @@ fn means(view: ArrayView2<f32>, reach: usize) -> Vec<f32> {
     .collect()
 }
 
-/// Variance of a pixel's noise as a function of brightness. A wrong variance would favour geometries in which noisy pixels have
-/// less weight.
+/// Variance of a pixel's noise as a function of brightness. A wrong variance would favour geometries in which noisy
+/// pixels have less weight.
 struct Noise {
     /// The upper limit of each interval, and the variance in it.
     steps: Vec<(f32, f64)>,
 }
 
 impl Noise {
-    /// Measured from the curvature of three pixels in a row; edges hardly affect its median (Hampel, J. Am. Stat. Assoc. 69,
-    /// 1974).
+    /// Measured from the curvature of three pixels in a row; edges hardly affect its median (Hampel, J. Am. Stat.
+    /// Assoc. 69, 1974).
     fn of(p: &Array3<f32>, air: f32) -> Self {
         let columns = p.dim().2;
         let triples = |view: ArrayView2<f32>| -> Vec<(f32, f32)> {
@@ -328,11 +329,13 @@ impl Noise {
             let mut bends: Vec<f32> = part.iter().map(|x| x.1).collect();
             let middle = bends.len() / 2;
             let median = f64::from(*bends.select_nth_unstable_by(middle, f32::total_cmp).1);
-            // A median deviation is 0.6745 standard deviations; three pixels with weights 1, -2, 1 have six times the variance.
+            // A median deviation is 0.6745 standard deviations; three pixels with weights 1, -2, 1 have six times the
+            // variance.
             (part[part.len() - 1].0, (median / 0.6745).powi(2) / 6.0)
         };
         let mut steps: Vec<(f32, f64)> = all.chunks(all.len().div_ceil(STEPS).max(1)).map(step).collect();
-        // Fewer photons reach brighter pixels, so their noise is larger: a larger variance at lower brightness comes from edges.
+        // Fewer photons reach brighter pixels, so their noise is larger: a larger variance at lower brightness comes
+        // from edges.
         for i in (1..steps.len()).rev() {
             steps[i - 1].1 = steps[i - 1].1.min(steps[i].1);
         }

@@ -21,8 +21,8 @@ const SUBSETS: usize = 8;
 const PASSES: u64 = 3;
 /// More views than this add little information on the geometry.
 const MOST_VIEWS: usize = 120;
-/// The volume grows if rays that miss it have more than this share of the views' sum of squares; the growth factor, and the
-/// largest number of such steps.
+/// The volume grows if rays that miss it have more than this share of the views' sum of squares; the growth factor, and
+/// the largest number of such steps.
 const BESIDE: f64 = 0.01;
 const GROWTH: f64 = 1.4;
 const GROWN: usize = 3;
@@ -72,8 +72,8 @@ impl Observer for Quiet<'_> {
 }
 
 impl Level {
-    /// The level of `scan` with about `width` pixels along the longer side of the detector and `folds` folds. Each fold holds out
-    /// another quarter of the views. The voxels cover the object in the geometry corrected by `known`.
+    /// The level of `scan` with about `width` pixels along the longer side of the detector and `folds` folds. Each fold
+    /// holds out another quarter of the views. The voxels cover the object in the geometry corrected by `known`.
     pub fn new(scan: &Scan, width: usize, folds: usize, known: &Correction) -> Result<Self> {
         let bin = bin(scan, width);
         Self::of(spread(scan.binned(bin))?, bin, width, folds, known)
@@ -180,8 +180,8 @@ fn bin(scan: &Scan, width: usize) -> usize {
 }
 
 impl Level {
-    /// Voxels that follow the object: it moves along z when the detector moves along v. Its position on the voxels then stays the
-    /// same; otherwise the error would oscillate with every voxel.
+    /// Voxels that follow the object: it moves along z when the detector moves along v. Its position on the voxels then
+    /// stays the same; otherwise the error would oscillate with every voxel.
     fn following(&self, correction: &Correction) -> VoxelGrid {
         let mut grid = self.geometry.volume;
         let v = self.geometry.views[0].v;
@@ -218,8 +218,8 @@ pub(crate) fn spread(scan: Scan) -> Result<Scan> {
     Ok(scan.split(&kept)?.1)
 }
 
-/// Voxels as fine as the pixels, in the volume of the scan. If the object extends beyond the detector or the volume, the box is
-/// larger than the volume.
+/// Voxels as fine as the pixels, in the volume of the scan. If the object extends beyond the detector or the volume,
+/// the box is larger than the volume.
 fn grid(scan: &Scan, width: usize) -> VoxelGrid {
     let asked = scan.geometry.volume;
     let mut size = asked.size();

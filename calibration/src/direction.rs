@@ -1,7 +1,8 @@
-//! The direction in which the source moves around the object. Both are calibrated; the better prediction of views decides.
+//! The direction in which the source moves around the object. Both are calibrated; the better prediction of views
+//! decides.
 //!
-//! With parallel rays, views in the wrong direction are exactly those of the mirrored object. The wider the cone, the less any object
-//! explains them. Reversed columns have the same effect.
+//! With parallel rays, views in the wrong direction are exactly those of the mirrored object. The wider the cone, the
+//! less any object explains them. Reversed columns have the same effect.
 
 use crate::criterion::spread;
 use crate::{COARSEST, Correction, Parameter, Settings, Watch, calibrate, on_a_circle};

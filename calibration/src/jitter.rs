@@ -1,12 +1,13 @@
 //! Shifts of the detector from view to view: thermal drift, a table or an arm that does not stop where it should.
 //!
-//! Each view is compared with its prediction from a reconstruction of other views (projection matching: Dengler, Ultramicroscopy 30,
-//! 1989; reconstruction and alignment in turn: Gürsoy et al., Scientific Reports 7, 2017). If the detector is shifted by
-//! `d` pixels, the view differs from the prediction `p` by about `d·∇p`; least squares give `d`. The detectors move by that, and the
-//! prediction is repeated, from coarse to fine pixels. Held-out views take turns, so no view is compared with itself.
+//! Each view is compared with its prediction from a reconstruction of other views (projection matching: Dengler,
+//! Ultramicroscopy 30, 1989; reconstruction and alignment in turn: Gürsoy et al., Scientific Reports 7, 2017). If the
+//! detector is shifted by `d` pixels, the view differs from the prediction `p` by about `d·∇p`; least squares give `d`.
+//! The detectors move by that, and the prediction is repeated, from coarse to fine pixels. Held-out views take turns,
+//! so no view is compared with itself.
 //!
-//! A shift of the object changes all views as shifts of the detectors do. That part of the shifts is removed: the object stays in
-//! place.
+//! A shift of the object changes all views as shifts of the detectors do. That part of the shifts is removed: the
+//! object stays in place.
 
 use crate::criterion::Level;
 use crate::search::{LONGEST, Meter, SMALL, inverse};
@@ -22,11 +23,13 @@ use std::sync::Mutex;
 
 /// Rounds of prediction and comparison at each level.
 const ROUNDS: usize = 6;
-/// Shifts are real if their size exceeds their uncertainty by this factor, and the held-out error falls below this share.
+/// Shifts are real if their size exceeds their uncertainty by this factor, and the held-out error falls below this
+/// share.
 const CLEAR: f64 = 2.0;
 const LOWER: f64 = 0.97;
-/// A round that does not lower the held-out error to this share is undone and ends its level. Shifts that vary slowly from view to
-/// view change the reconstruction more than its predictions: further rounds would follow errors of the reconstruction.
+/// A round that does not lower the held-out error to this share is undone and ends its level. Shifts that vary slowly
+/// from view to view change the reconstruction more than its predictions: further rounds would follow errors of the
+/// reconstruction.
 const GAIN: f64 = 0.99;
 /// Side of the squares of a chessboard on the detector, in pixels; its two colours give two independent estimates.
 const SQUARE: usize = 4;
@@ -40,8 +43,8 @@ pub struct Jitter {
     pub shifts: Vec<[f64; 2]>,
     /// Their root mean square along v and u, in pixels of the scan.
     pub pixels: [f64; 2],
-    /// Standard deviation of the random error of a shift along v and u, in pixels of the scan. Errors of the reconstruction, which
-    /// change slowly from view to view, are not part of it.
+    /// Standard deviation of the random error of a shift along v and u, in pixels of the scan. Errors of the
+    /// reconstruction, which change slowly from view to view, are not part of it.
     pub uncertainty: [f64; 2],
     /// The held-out error at the finest level, before and after the correction.
     pub held_out: [f64; 2],
@@ -182,8 +185,8 @@ impl Normal {
     }
 }
 
-/// The equations of a view's shift from the squares of either colour of the chessboard. A detector shifted by `d` pixels shows
-/// `p(x + d)`, so that measured minus predicted is about `d·∇p`.
+/// The equations of a view's shift from the squares of either colour of the chessboard. A detector shifted by `d`
+/// pixels shows `p(x + d)`, so that measured minus predicted is about `d·∇p`.
 fn normal_equations(measured: ArrayView2<'_, f32>, residual: ArrayView2<'_, f32>) -> [Normal; 2] {
     let (rows, columns) = measured.dim();
     let mut sums = [Normal::default(); 2];

@@ -1,14 +1,15 @@
 //! Estimates a scan's geometry from its own views, without a phantom.
 //!
-//! [`calibrate`] finds the [`Correction`] with the smallest held-out error: a quick reconstruction (ordered subsets of SART, three
-//! passes) of some views predicts the held-out ones. Pixels, voxels and the search range go from coarse to fine (`search`). The
-//! criterion needs no marker, no symmetry and no full circle.
+//! [`calibrate`] finds the [`Correction`] with the smallest held-out error: a quick reconstruction (ordered subsets of
+//! SART, three passes) of some views predicts the held-out ones. Pixels, voxels and the search range go from coarse to
+//! fine (`search`). The criterion needs no marker, no symmetry and no full circle.
 //!
 //! The held-out error also depends on the size of the reconstructed object. Parameters that change this size
-//! ([`Parameter::by_pairs`]) are found by comparing pairs of views on the same planes (`consistency`, `newton`). This comparison
-//! is independent of the object.
+//! ([`Parameter::by_pairs`]) are found by comparing pairs of views on the same planes (`consistency`, `newton`). This
+//! comparison is independent of the object.
 //!
-//! [`directions`] compares the angles with the reversed ones. [`jitter()`] estimates a shift of the detector for each view.
+//! [`directions`] compares the angles with the reversed ones. [`jitter()`] estimates a shift of the detector for each
+//! view.
 
 mod consistency;
 mod criterion;
@@ -43,13 +44,14 @@ const COARSEST: usize = 32;
 const FOLDS: usize = 2;
 /// A parameter is wrong if its change exceeds this many standard deviations.
 const CLEAR: f64 = 3.0;
-/// A parameter is not determined if its deviation exceeds this number of pixels of the finest level, or if its sensitivity is
-/// below these limits.
+/// A parameter is not determined if its deviation exceeds this number of pixels of the finest level, or if its
+/// sensitivity is below these limits.
 const VAGUE: f64 = 1.0;
 const FLAT: f64 = 0.03;
 const FLAT_PAIRS: f64 = 0.01;
-/// The voxel positions shift the minimum of the error by about this many pixels of a level. The views do not show this shift, so
-/// it is part of every deviation. For pairs of views, the sampling of the object by pixels has the same effect.
+/// The voxel positions shift the minimum of the error by about this many pixels of a level. The views do not show this
+/// shift, so it is part of every deviation. For pairs of views, the sampling of the object by pixels has the same
+/// effect.
 const INEXACT: f64 = 0.02;
 const INEXACT_PAIRS: f64 = 0.1;
 /// Pairs of views are compared on pixels finer by this factor, at little cost; the largest number of Newton's steps.
@@ -108,12 +110,14 @@ pub struct Found {
     pub change: f64,
     /// Standard deviation of the change.
     pub uncertainty: f64,
-    /// Both in pixels of the scan: for parameters other than offsets, the shift of a shadow at the side of the detector.
+    /// Both in pixels of the scan: for parameters other than offsets, the shift of a shadow at the side of the
+    /// detector.
     pub pixels: [f64; 2],
     /// Change of the predicted views with it, relative to a shift by a pixel.
     pub sensitivity: f64,
-    /// The criterion for changes around the best one, with the other parameters corrected: the held-out error relative to the
-    /// largest line integral or, if [`Parameter::by_pairs`], the difference of pairs of views relative to their values.
+    /// The criterion for changes around the best one, with the other parameters corrected: the held-out error relative
+    /// to the largest line integral or, if [`Parameter::by_pairs`], the difference of pairs of views relative to their
+    /// values.
     pub curve: Vec<(f64, f64)>,
 }
 
@@ -244,8 +248,8 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
 const WORTH: f64 = 0.5;
 const LOWER: f64 = 0.85;
 
-/// Quick test on coarse pixels for a shifted or rotated detector. Returns the result of [`calibrate`] if the correction lowers the
-/// held-out error clearly.
+/// Quick test on coarse pixels for a shifted or rotated detector. Returns the result of [`calibrate`] if the correction
+/// lowers the held-out error clearly.
 pub fn suspect(scan: &Scan, backend: &dyn Backend, watch: &dyn Watch) -> Result<Option<Calibration>> {
     if scan.geometry.views.len() < FEWEST {
         return Ok(None);
@@ -257,7 +261,8 @@ pub fn suspect(scan: &Scan, backend: &dyn Backend, watch: &dyn Watch) -> Result<
     Ok((after < LOWER * before && found.found.iter().any(off)).then_some(found))
 }
 
-/// Pixels along the detector's longer side at each level. Each level has twice as many as the previous one, up to about `finest`.
+/// Pixels along the detector's longer side at each level. Each level has twice as many as the previous one, up to about
+/// `finest`.
 fn widths(scan: &Scan, finest: usize) -> Vec<usize> {
     let finest = finest.min(scan.geometry.detector.into_iter().max().unwrap_or(0)).max(1);
     let mut all = vec![finest];
@@ -321,11 +326,11 @@ fn compare_pairs(
     Ok((found, place.correction))
 }
 
-/// Whether the sources are on a circle around the z axis. With z measured from the plane of the circle, the map
-/// `(x, y, z) → (x, y, z)/(1 + b·z)` of space changes every view like a tilt of the detector: the same planes meet the views in
-/// the same lines. Views on a turntable leave two maps undetermined: this one and the scale of z (Fitzgibbon, Cross and Zisserman,
-/// SMILE 1998). Only the lengths of rays change, by the tilt times the ray's slope. A change of the object compensates most of
-/// this.
+/// Whether the sources are on a circle around the z axis. With z measured from the plane of the circle, the map `(x, y,
+/// z) → (x, y, z)/(1 + b·z)` of space changes every view like a tilt of the detector: the same planes meet the views in
+/// the same lines. Views on a turntable leave two maps undetermined: this one and the scale of z (Fitzgibbon, Cross and
+/// Zisserman, SMILE 1998). Only the lengths of rays change, by the tilt times the ray's slope. A change of the object
+/// compensates most of this.
 fn on_a_circle(views: &[View]) -> bool {
     let place = |v: &View| (v.source[0].hypot(v.source[1]), v.source[2]);
     let Some((radius, height)) = views.first().map(place) else { return false };
@@ -333,8 +338,8 @@ fn on_a_circle(views: &[View]) -> bool {
     views.iter().map(place).all(|(r, h)| near(r, radius) && near(h, height))
 }
 
-/// Removes the parameters that the views do not determine or that are already right. It removes the least certain one first and
-/// fits again, because this can make the others more certain.
+/// Removes the parameters that the views do not determine or that are already right. It removes the least certain one
+/// first and fits again, because this can make the others more certain.
 fn settle<F>(
     mut fit: F,
     findings: impl Fn(&F) -> Vec<Found>,

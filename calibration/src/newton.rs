@@ -1,11 +1,12 @@
 //! The search for the geometry in which pairs of views are consistent.
 //!
-//! The residuals of pairs are mostly noise, and so are their derivatives: in `JᵀJ` of Gauss-Newton, noise would appear as
-//! steepness of the criterion. The curvature of the criterion itself has no such term, because noise contributes the same in
-//! every geometry. So the steps are Newton's, `H·δ = −g`, with gradient and curvature from differences of the criterion.
+//! The residuals of pairs are mostly noise, and so are their derivatives: in `JᵀJ` of Gauss-Newton, noise would appear
+//! as steepness of the criterion. The curvature of the criterion itself has no such term, because noise contributes the
+//! same in every geometry. So the steps are Newton's, `H·δ = −g`, with gradient and curvature from differences of the
+//! criterion.
 //!
-//! The jackknife gives the uncertainty: the scatter of the step when each view in turn is removed (Efron and Stein, Annals of
-//! Statistics 9, 1981). It includes the noise of the curvature.
+//! The jackknife gives the uncertainty: the scatter of the step when each view in turn is removed (Efron and Stein,
+//! Annals of Statistics 9, 1981). It includes the noise of the curvature.
 
 use crate::CLEAR;
 use crate::consistency::Consistency;
@@ -130,8 +131,8 @@ impl Newton<'_> {
         })
     }
 
-    /// Whether the criterion falls by more than the pairs of single views can explain. Noise alone also has minima, far from the
-    /// truth where the object contributes little, and each has a positive curvature.
+    /// Whether the criterion falls by more than the pairs of single views can explain. Noise alone also has minima, far
+    /// from the truth where the object contributes little, and each has a positive curvature.
     fn surely_better(&self, here: &[f64], there: &[f64]) -> bool {
         let pairs = self.pairs.pairs();
         let mut views = vec![0.0; self.pairs.geometry.views.len()];

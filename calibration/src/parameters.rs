@@ -9,8 +9,8 @@ use std::str::FromStr;
 
 /// One number of a scan's geometry that its own views can determine.
 ///
-/// They cannot determine the distance from source to axis: an object twice as large and twice as far from the source gives the
-/// same views. Nor can they determine the angle of the first view, which only rotates the object.
+/// They cannot determine the distance from source to axis: an object twice as large and twice as far from the source
+/// gives the same views. Nor can they determine the angle of the first view, which only rotates the object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Parameter {
@@ -71,9 +71,9 @@ impl Parameter {
         }
     }
 
-    /// The change that moves shadows at the side of the detector by about a pixel of `geometry` relative to each other. An equal
-    /// shift of all shadows along v is a shift of the object; only the larger shift of parts near the source is evidence of the
-    /// detector.
+    /// The change that moves shadows at the side of the detector by about a pixel of `geometry` relative to each other.
+    /// An equal shift of all shadows along v is a shift of the object; only the larger shift of parts near the source
+    /// is evidence of the detector.
     pub fn pixel(self, geometry: &Geometry) -> f64 {
         let view = &geometry.views[0];
         let [v, u] = [norm(view.v), norm(view.u)];
@@ -85,7 +85,8 @@ impl Parameter {
             Self::Rotation => pixel / half,
             Self::Tilt | Self::Slant => pixel * depth / (half * half),
             Self::OffsetV => pixel * depth / half,
-            // A larger distance enlarges all shadows, like a larger object. Only the stronger growth of near parts is evidence.
+            // A larger distance enlarges all shadows, like a larger object. Only the stronger growth of near parts is
+            // evidence.
             Self::Distance => pixel * (depth / half).powi(2),
             Self::Step => {
                 let turns = turns(&geometry.views);
@@ -133,8 +134,8 @@ impl Correction {
         self
     }
 
-    /// The corrected views of a scan: rotates the views about z by the step, then shifts the detectors along their own axes, then
-    /// rotates them about their centres.
+    /// The corrected views of a scan: rotates the views about z by the step, then shifts the detectors along their own
+    /// axes, then rotates them about their centres.
     pub fn views(&self, views: &[View]) -> Vec<View> {
         let get = |p| self.get(p);
         let angles = [get(Parameter::Tilt), get(Parameter::Slant), get(Parameter::Rotation)].map(Radians);

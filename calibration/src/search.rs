@@ -1,11 +1,11 @@
-//! The search for the correction with the smallest held-out error of a level: a scan along single parameters where the start may
-//! be far off, then Gauss-Newton steps in all parameters.
+//! The search for the correction with the smallest held-out error of a level: a scan along single parameters where the
+//! start may be far off, then Gauss-Newton steps in all parameters.
 //!
-//! The residual `r(θ)` of the held-out views depends on the correction `θ` through the whole reconstruction. Central differences
-//! give its derivatives `J` for all parameters at once; a step solves `JᵀJ·δ = −Jᵀr` (Nocedal and Wright, Numerical Optimization,
-//! section 10.3). Each view contributes its gradient `g_v = J_vᵀ·r_v`. The scatter of these gradients gives the uncertainty of
-//! their sum: `cov θ = (JᵀJ)⁻¹·(Σ g_v·g_vᵀ)·(JᵀJ)⁻¹` (the sandwich of Huber, Proc. 5th Berkeley Symposium, 1967, with views as
-//! clusters).
+//! The residual `r(θ)` of the held-out views depends on the correction `θ` through the whole reconstruction. Central
+//! differences give its derivatives `J` for all parameters at once; a step solves `JᵀJ·δ = −Jᵀr` (Nocedal and Wright,
+//! Numerical Optimization, section 10.3). Each view contributes its gradient `g_v = J_vᵀ·r_v`. The scatter of these
+//! gradients gives the uncertainty of their sum: `cov θ = (JᵀJ)⁻¹·(Σ g_v·g_vᵀ)·(JᵀJ)⁻¹` (the sandwich of Huber, Proc.
+//! 5th Berkeley Symposium, 1967, with views as clusters).
 
 use crate::criterion::{Level, Prediction};
 use crate::parameters::{Correction, Parameter};
@@ -101,8 +101,8 @@ impl Search<'_> {
         Ok(values.iter().copied().zip(errors).collect())
     }
 
-    /// Scans one parameter around `at`: `steps` steps of `pixels` pixels of the level to either side. Extends the range, up to
-    /// `most` steps, while the best value lies at an end. Returns the best correction.
+    /// Scans one parameter around `at`: `steps` steps of `pixels` pixels of the level to either side. Extends the
+    /// range, up to `most` steps, while the best value lies at an end. Returns the best correction.
     pub fn scan(&self, parameter: Parameter, at: Correction, pixels: f64, steps: i32, most: i32) -> Result<Correction> {
         let (from, step) = (at.get(parameter), pixels * parameter.pixel(&self.level.geometry));
         let place = |i: i32| from + f64::from(i) * step;

@@ -10,8 +10,8 @@ use std::path::Path;
 pub struct Board(EventFile);
 
 impl Board {
-    /// Opens the file `path` for a run with the existing records in `metrics`, one per line. Events up to the last record
-    /// stay in the file; records after its last event are added.
+    /// Opens the file `path` for a run with the existing records in `metrics`, one per line. Events up to the last
+    /// record stay in the file; records after its last event are added.
     pub fn new(path: &Path, metrics: &Path) -> Result<Self> {
         let text = fs::read_to_string(metrics).map_err(|e| Error::io(metrics, e))?;
         let records: Vec<Value> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();

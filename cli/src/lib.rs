@@ -57,9 +57,9 @@ pub fn main(held: fn() -> u64) -> ExitCode {
     ExitCode::from(run(std::env::args_os(), None))
 }
 
-/// Runs a command line, starting with the program's name. Returns the exit status: 0 success, 1 failure, 2 usage error, 130
-/// or 143 interrupted. `program` are the words that start the command in another process if the executable of this one
-/// does not: an interpreter and its arguments.
+/// Runs a command line, starting with the program's name. Returns the exit status: 0 success, 1 failure, 2 usage error,
+/// 130 or 143 interrupted. `program` are the words that start the command in another process if the executable of this
+/// one does not: an interpreter and its arguments.
 pub fn run(args: impl IntoIterator<Item = OsString>, program: Option<Vec<OsString>>) -> u8 {
     let args: Vec<OsString> = args.into_iter().collect();
     program::note(program, args.iter().skip(1).cloned().collect());

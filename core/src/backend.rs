@@ -154,7 +154,7 @@ pub trait Executable: Send {
     fn profile(&mut self) -> Vec<(String, f64)> {
         vec![]
     }
-    /// Informs the backend that the model's arena was changed elsewhere: the next call reads it again. Fetch first if the
-    /// device's state is needed.
+    /// Informs the backend that the model's arena was changed elsewhere: the next call reads it again. Fetch first if
+    /// the device's state is needed.
     fn renew(&mut self) {}
 }

@@ -107,8 +107,9 @@ fn affine_block<S: Simd, R: Real, const M: usize, const C: usize, const FULL: bo
     }
 }
 
-/// Vector `c` from `x[i]`. `x` is the whole tile, not one channel: if the rows left do not fill a vector, its last lanes
-/// hold values of the next channel, which `write` drops. Only at the end of the tile is a vector read lane by lane.
+/// Vector `c` from `x[i]`. `x` is the whole tile, not one channel: if the rows left do not fill a vector, its last
+/// lanes hold values of the next channel, which `write` drops. Only at the end of the tile is a vector read lane by
+/// lane.
 #[inline(always)]
 fn read<S: Simd, R: Real, const FULL: bool>(s: S, x: &[R], i: usize, c: usize) -> V<S, R> {
     let (at, len) = (i + c * V::<S, R>::LEN, V::<S, R>::LEN);
@@ -275,7 +276,8 @@ fn weights_block<S: Simd, R: Real, const M: usize, const K: usize>(
         }
     }
     if whole < n {
-        // Lanes past the last row hold values of the next channel, infinities too: they are replaced, not multiplied by 0.
+        // Lanes past the last row hold values of the next channel, infinities too: they are replaced, not multiplied by
+        // 0.
         let fill = last.simd_ge(V::<S, R>::splat(s, R::ONE));
         let mut v = [zero; K];
         for k in 0..K {

@@ -194,8 +194,8 @@ pub trait Kernel<R: Real, P = R>: Send + Sync {
         self.forward(params, x, y, tape);
     }
 
-    /// For a stage that looks along rays ([`Scope::Ray`]): the same function of points off any ray, each row a ray of one
-    /// sample. Without it, a host passes such rows one at a time, which is slow.
+    /// For a stage that looks along rays ([`Scope::Ray`]): the same function of points off any ray, each row a ray of
+    /// one sample. Without it, a host passes such rows one at a time, which is slow.
     fn points(&self) -> Option<&(dyn Kernel<R, P> + '_)> {
         None
     }

@@ -12,18 +12,21 @@ use serde::{Deserialize, Serialize};
 const AIR: f64 = 0.15;
 /// Segments above this level are air too, up to this multiple of the distance from the lowest segment to the level.
 const NOISE: f32 = 3.0;
-/// No tube varies by more than this between views: a larger line integral in air means that the region shows something else.
+/// No tube varies by more than this between views: a larger line integral in air means that the region shows something
+/// else.
 const MOST: f32 = 0.5;
 
-/// Corrects the tube's brightness. A tube that is `k` times as bright in a view as in the flat field lowers every line integral of
-/// this view by `ln k`. The value in air, where nothing absorbs, shows this offset; it is subtracted from the whole view.
+/// Corrects the tube's brightness. A tube that is `k` times as bright in a view as in the flat field lowers every line
+/// integral of this view by `ln k`. The value in air, where nothing absorbs, shows this offset; it is subtracted from
+/// the whole view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Flux {
     /// The first row of a region that shows air in every view, and the one after its last; all rows if absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rows: Option<[usize; 2]>,
-    /// Its columns; all if absent. With neither, the border of each view is used: some of its 16 segments must show air.
+    /// Its columns; all if absent. With neither, the border of each view is used: some of its 16 segments must show
+    /// air.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub columns: Option<[usize; 2]>,
 }

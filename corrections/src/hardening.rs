@@ -13,8 +13,8 @@ const NODES: usize = 4096;
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Hardening {
-    /// Factors of A, A², A³, ...: their sum replaces A (Herman, Phys. Med. Biol. 24(1), 1979). Measure them with a step wedge, or
-    /// adjust them until a homogeneous part is as bright inside as at its rim.
+    /// Factors of A, A², A³, ...: their sum replaces A (Herman, Phys. Med. Biol. 24(1), 1979). Measure them with a step
+    /// wedge, or adjust them until a homogeneous part is as bright inside as at its rim.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub polynomial: Vec<f64>,
     /// The tube; the object is treated as water.
@@ -22,8 +22,8 @@ pub struct Hardening {
     pub water: Option<Water>,
 }
 
-/// The tube and its filter. The absorption of its spectrum by a length of water is computed and inverted (Joseph and Spital,
-/// J. Comput. Assist. Tomogr. 2(1), 1978); thin paths keep their values.
+/// The tube and its filter. The absorption of its spectrum by a length of water is computed and inverted (Joseph and
+/// Spital, J. Comput. Assist. Tomogr. 2(1), 1978); thin paths keep their values.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Water {
@@ -115,7 +115,8 @@ impl Table {
         let mut length = 0.0;
         for i in 0..NODES {
             let measured = step * i as f64;
-            // Newton's steps from the last length; the measured integral is increasing and concave, so no step overshoots.
+            // Newton's steps from the last length; the measured integral is increasing and concave, so no step
+            // overshoots.
             for _ in 0..50 {
                 let off = measured - spectrum.measured(length);
                 let small = 1e-4 / thin;

@@ -120,8 +120,8 @@ impl Corrections {
         self.chosen().into_iter().try_for_each(|(name, c, _)| c.validate().map_err(|e| settings::placed(e, name)))
     }
 
-    /// Returns the corrected scan and the results of the corrections. Adds the list `corrections` to its provenance; another call
-    /// appends to it. Refuses an invalid scan, invalid settings, and a scan that a correction cannot use.
+    /// Returns the corrected scan and the results of the corrections. Adds the list `corrections` to its provenance;
+    /// another call appends to it. Refuses an invalid scan, invalid settings, and a scan that a correction cannot use.
     pub fn apply(&self, mut scan: Scan, place: &str) -> Result<(Scan, Vec<Applied>)> {
         if self.is_none() {
             return Ok((scan, vec![]));

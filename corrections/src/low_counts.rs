@@ -10,12 +10,13 @@ use serde::{Deserialize, Serialize};
 
 /// Largest distance of averaged neighbours, in pixels.
 const FARTHEST: usize = 4;
-/// The number of photons comes from the mean within this distance in pixels; a pixel's own noisy count would bias the choice.
+/// The number of photons comes from the mean within this distance in pixels; a pixel's own noisy count would bias the
+/// choice.
 const LOOK: usize = 2;
 
-/// Corrects the logarithm of few photons: it is too large on average and very noisy. Each such pixel gets the mean intensity of
-/// as many neighbours as together count enough photons, and the logarithm follows (after the idea of Hsieh, Med. Phys. 25(11),
-/// 1998: a filter that widens as the signal falls). Pixels with enough photons do not change.
+/// Corrects the logarithm of few photons: it is too large on average and very noisy. Each such pixel gets the mean
+/// intensity of as many neighbours as together count enough photons, and the logarithm follows (after the idea of
+/// Hsieh, Med. Phys. 25(11), 1998: a filter that widens as the signal falls). Pixels with enough photons do not change.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LowCounts {

@@ -21,8 +21,8 @@ const STANDS_OUT: f32 = 0.1;
 /// With a larger share of bad values, the scan is wrong, not the detector.
 const MOST: f64 = 0.2;
 
-/// Dead, hot and flickering pixels, and single outliers (cosmic rays): each gets the mean of the good pixels around it, weighted
-/// by one over their squared distance.
+/// Dead, hot and flickering pixels, and single outliers (cosmic rays): each gets the mean of the good pixels around it,
+/// weighted by one over their squared distance.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Pixels {
@@ -126,8 +126,8 @@ fn range(values: ArrayView3<'_, f32>) -> f32 {
     at(0.99) - at(0.01)
 }
 
-/// For each pixel: the change of its value over the views (mean distance from the mean), and the change of its difference from its
-/// neighbours (median distance from the median).
+/// For each pixel: the change of its value over the views (mean distance from the mean), and the change of its
+/// difference from its neighbours (median distance from the median).
 fn over_time(values: ArrayView3<'_, f32>) -> [Array2<f32>; 2] {
     let (views, rows, columns) = values.dim();
     let mut apart = Array3::<f32>::zeros((rows, columns, views));

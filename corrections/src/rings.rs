@@ -1,7 +1,7 @@
 //! Ring artefacts, from a constant that a pixel adds to every view.
 //!
-//! A pixel whose gain differs from its flat field adds the same number to all of its line integrals. The object moves over the
-//! detector from view to view; this number stays.
+//! A pixel whose gain differs from its flat field adds the same number to all of its line integrals. The object moves
+//! over the detector from view to view; this number stays.
 
 use crate::Correct;
 use conefield_core::error::{Result, ensure};
@@ -18,14 +18,15 @@ const CHANCE: f32 = 3.0;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RingMethod {
-    /// The difference from a moving average along the row is the pixel's offset if it is constant over the views (Boin and Haibel,
-    /// Optics Express 14(25), 2006). Medians replace both of their means: with few views each has a large weight, and edges of the
-    /// object must not count.
+    /// The difference from a moving average along the row is the pixel's offset if it is constant over the views (Boin
+    /// and Haibel, Optics Express 14(25), 2006). Medians replace both of their means: with few views each has a large
+    /// weight, and edges of the object must not count.
     #[default]
     Median,
-    /// Each pixel's values are sorted over the views: neighbours then differ little, wherever the object was. The difference of
-    /// the sorted values from their moving median along the row is the pixel's offset (Vo, Atwood and Drakopoulos, Optics Express
-    /// 26(22), 2018, algorithm 3). Its median over the ranks, reduced by its chance level, is subtracted from every view.
+    /// Each pixel's values are sorted over the views: neighbours then differ little, wherever the object was. The
+    /// difference of the sorted values from their moving median along the row is the pixel's offset (Vo, Atwood and
+    /// Drakopoulos, Optics Express 26(22), 2018, algorithm 3). Its median over the ranks, reduced by its chance level,
+    /// is subtracted from every view.
     Sorting,
 }
 
@@ -35,8 +36,8 @@ pub enum RingMethod {
 pub struct Rings {
     /// How the constant offset is separated from the object.
     pub method: RingMethod,
-    /// Width of the moving median along the row in pixels, odd. Corrects faults narrower than half of it. A wider window also
-    /// removes more of the object where it stays in the same columns.
+    /// Width of the moving median along the row in pixels, odd. Corrects faults narrower than half of it. A wider
+    /// window also removes more of the object where it stays in the same columns.
     pub window: usize,
 }
 

@@ -8,20 +8,20 @@ use ndarray::{Array2, ArrayView2, ArrayViewMut2, Axis, Zip};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Iterations of computing the scatter from the corrected intensity. If a fifth of the light is scattered, each iteration reduces
-/// the error to a twentieth.
+/// Iterations of computing the scatter from the corrected intensity. If a fifth of the light is scattered, each
+/// iteration reduces the error to a twentieth.
 const ROUNDS: usize = 4;
 /// Largest share of a pixel's light that counts as scatter.
 const MOST: f32 = 0.8;
 
-/// Subtracts scattered light. The scatter of a ray with transmission T = exp(−A) increases with absorption along the ray and
-/// decreases with the light that does not get through: as T·A, spread widely over the detector (Ohnesorge, Flohr and
-/// Klingenbeck-Regn, Eur. Radiol. 9(3), 1999).
+/// Subtracts scattered light. The scatter of a ray with transmission T = exp(−A) increases with absorption along the
+/// ray and decreases with the light that does not get through: as T·A, spread widely over the detector (Ohnesorge,
+/// Flohr and Klingenbeck-Regn, Eur. Radiol. 9(3), 1999).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scatter {
-    /// Scattered light over T·A, both summed over the detector. A strip of lead between source and object allows a measurement:
-    /// all light behind it is scattered.
+    /// Scattered light over T·A, both summed over the detector. A strip of lead between source and object allows a
+    /// measurement: all light behind it is scattered.
     pub share: f64,
     /// Standard deviation of its spread, as a share of the detector's wider side in pixels.
     #[serde(default = "width")]

@@ -10,9 +10,9 @@ const PLACE: &str = "corrections";
 const DEEPEST: usize = 3;
 
 impl Corrections {
-    /// Parses texts such as `rings`, `rings.window=21` or `hardening.polynomial=[1.0, 0.05]`: the name of a correction, with its
-    /// default settings, or one setting of it. Values are TOML; anything else is a string. Refuses unknown names and settings, and
-    /// invalid values.
+    /// Parses texts such as `rings`, `rings.window=21` or `hardening.polynomial=[1.0, 0.05]`: the name of a correction,
+    /// with its default settings, or one setting of it. Values are TOML; anything else is a string. Refuses unknown
+    /// names and settings, and invalid values.
     pub fn parse<S: AsRef<str>>(texts: &[S]) -> Result<Self> {
         let mut all = Table::new();
         for text in texts {

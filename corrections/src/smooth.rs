@@ -5,8 +5,9 @@ use ndarray::{Array2, ArrayView2, Axis};
 /// Passes of a moving average; together they approximate a Gaussian.
 const PASSES: usize = 3;
 
-/// `image` blurred by a Gaussian with a standard deviation of `sigma` pixels, as three moving averages along each axis. Values
-/// beyond the image are 0. Sums are in double precision, so that adding and subtracting values in a wide average leaves no error.
+/// `image` blurred by a Gaussian with a standard deviation of `sigma` pixels, as three moving averages along each axis.
+/// Values beyond the image are 0. Sums are in double precision, so that adding and subtracting values in a wide average
+/// leaves no error.
 pub(crate) fn blurred(image: ArrayView2<'_, f32>, sigma: f64) -> Array2<f32> {
     // Three boxes of 2r + 1 pixels have a variance of ((2r + 1)² − 1)/4.
     let reach = ((((4.0 * sigma * sigma + 1.0).sqrt()) - 1.0) / 2.0).round() as usize;

@@ -1,7 +1,7 @@
 //! The spectrum of an X-ray tube and its absorption by water and aluminium.
 
-/// Photon energies in keV and mass attenuation coefficients in cm²/g of water and of aluminium (Hubbell and Seltzer, Tables of X-Ray Mass
-/// Attenuation Coefficients, NISTIR 5632, 1995). Interpolation is logarithmic.
+/// Photon energies in keV and mass attenuation coefficients in cm²/g of water and of aluminium (Hubbell and Seltzer,
+/// Tables of X-Ray Mass Attenuation Coefficients, NISTIR 5632, 1995). Interpolation is logarithmic.
 const TABLE: [[f64; 3]; 14] = [
     [10.0, 5.329, 26.23],
     [15.0, 1.673, 7.955],
@@ -31,8 +31,8 @@ pub(crate) struct Spectrum {
 }
 
 impl Spectrum {
-    /// Bremsstrahlung of a tube at `kvp` kV through `aluminium` mm of filter, on a detector that sums energies: Kramers' law gives
-    /// (E₀ − E)/E photons of energy E, and each contributes E.
+    /// Bremsstrahlung of a tube at `kvp` kV through `aluminium` mm of filter, on a detector that sums energies:
+    /// Kramers' law gives (E₀ − E)/E photons of energy E, and each contributes E.
     pub fn of_tube(kvp: f64, aluminium: f64) -> Self {
         let lowest = TABLE[0][0];
         let line = |i: usize| {

@@ -1,4 +1,5 @@
-//! Tests each correction on projections with and without its fault. Line integrals are those of ellipsoids in closed form.
+//! Tests each correction on projections with and without its fault. Line integrals are those of ellipsoids in closed
+//! form.
 
 use super::*;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};

@@ -15,10 +15,10 @@ const SIDE: usize = 64;
 /// Share of the largest line integral below which a side shows air.
 const AIR: f32 = 0.05;
 
-/// Extends rows that end in the object beyond the detector's sides, by point reflection about the last value, faded to 0
-/// (Ohnesorge et al., Med. Phys. 27(1), 2000). The detector becomes wider. Without the step at the side, the ramp filter of `fdk`
-/// makes no bright rim. The new values are not measured: for methods that fit them, use `scene.surround.coarse` of the spec
-/// instead.
+/// Extends rows that end in the object beyond the detector's sides, by point reflection about the last value, faded to
+/// 0 (Ohnesorge et al., Med. Phys. 27(1), 2000). The detector becomes wider. Without the step at the side, the ramp
+/// filter of `fdk` makes no bright rim. The new values are not measured: for methods that fit them, use
+/// `scene.surround.coarse` of the spec instead.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Truncation {

@@ -10,7 +10,8 @@ const FEWEST: usize = 8;
 const SIDE: usize = 64;
 /// Largest difference of first and last view, as a share of the difference of neighbours.
 const SHARE: f64 = 0.5;
-/// Least difference of neighbours, as a share of the first view. Below it the object is round, and the test decides nothing.
+/// Least difference of neighbours, as a share of the first view. Below it the object is round, and the test decides
+/// nothing.
 const ROUND: f64 = 1e-4;
 /// Range of source distances, in steps, that counts as one step.
 const STEPS: std::ops::Range<f64> = 0.5..1.5;

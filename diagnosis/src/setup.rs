@@ -114,8 +114,8 @@ impl Setup {
         self.angles.full_circle && self.offset_mm[1].abs() > 0.01 * self.detector_mm[1]
     }
 
-    /// How far the detector extends beyond the axis on the shorter side, in mm on the detector; negative if the axis does
-    /// not project onto it.
+    /// How far the detector extends beyond the axis on the shorter side, in mm on the detector; negative if the axis
+    /// does not project onto it.
     pub fn overlap_mm(&self) -> f64 {
         self.detector_mm[1] / 2.0 - self.offset_mm[1].abs()
     }

@@ -1,10 +1,10 @@
-//! Pyramid of uniform cubic B-splines (Unser et al. 1993, B-Spline Signal Processing: Part I, IEEE Transactions on Signal
-//! Processing 41(2)): points `[n, 3]` in the unit cube to `[n, levels·features]`.
+//! Pyramid of uniform cubic B-splines (Unser et al. 1993, B-Spline Signal Processing: Part I, IEEE Transactions on
+//! Signal Processing 41(2)): points `[n, 3]` in the unit cube to `[n, levels·features]`.
 //!
-//! A level with `r` cells per side has `(r + 3)³` coefficients per feature, and its value is the tensor product
-//! `Σ_ijk B_i(t_x)·B_j(t_y)·B_k(t_z)·c[X + i, Y + j, Z + k]`, where the position `p = clamp(x, 0, 1)·r` lies in cell
-//! `(X, Y, Z)` at `t = p − ⌊p⌋`, and `B_0 … B_3` are `(1 − t)³/6`, `(3t³ − 6t² + 4)/6`, `(−3t³ + 3t² + 3t + 1)/6`,
-//! `t³/6`. It has two continuous derivatives; a trilinear grid has none.
+//! A level with `r` cells per side has `(r + 3)³` coefficients per feature, and its value is the tensor product `Σ_ijk
+//! B_i(t_x)·B_j(t_y)·B_k(t_z)·c[X + i, Y + j, Z + k]`, where the position `p = clamp(x, 0, 1)·r` lies in cell `(X, Y,
+//! Z)` at `t = p − ⌊p⌋`, and `B_0 … B_3` are `(1 − t)³/6`, `(3t³ − 6t² + 4)/6`, `(−3t³ + 3t² + 3t + 1)/6`, `t³/6`. It
+//! has two continuous derivatives; a trilinear grid has none.
 
 use crate::levels::{
     BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, kernel_of_levels, start, stretch,

@@ -281,8 +281,8 @@ pub struct LevelCode {
     pub outputs: Vec<Option<usize>>,
 }
 
-/// `stage_forward` and `stage_backward` of an encoder with `width` output channels, and `stage_features_grad` for its levels,
-/// which adds `w` times `dy` to the gradients of the entry that begins at parameter `entry`.
+/// `stage_forward` and `stage_backward` of an encoder with `width` output channels, and `stage_features_grad` for its
+/// levels, which adds `w` times `dy` to the gradients of the entry that begins at parameter `entry`.
 pub fn functions(levels: &[LevelCode], width: usize) -> String {
     let mut grad =
         String::from("fn stage_features_grad(entry: u32, w: f32, dy: ptr<function, array<f32, stage_FEATURES>>) {\n");

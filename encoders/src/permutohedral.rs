@@ -1,5 +1,5 @@
-//! Multi-resolution hash of a permutohedral lattice (Rosu and Behnke 2023, PermutoSDF, section 3.1; the lattice is that of Adams
-//! et al. 2010, Fast High-Dimensional Filtering Using the Permutohedral Lattice).
+//! Multi-resolution hash of a permutohedral lattice (Rosu and Behnke 2023, PermutoSDF, section 3.1; the lattice is that
+//! of Adams et al. 2010, Fast High-Dimensional Filtering Using the Permutohedral Lattice).
 //!
 //! Points `[n, 3]` in the unit cube to `[n, levels·features]`: on each level the features of the 4 corners of the
 //! point's simplex, weighted by its barycentric coordinates. A hash grid reads 8 corners.
@@ -275,8 +275,8 @@ fn fours<S: Simd, R: Real, const F: usize>(s: S, corners: &[[R; F]; 4]) -> [R::F
 #[inline(always)]
 #[allow(unsafe_code)]
 fn at<T>(table: &[T], i: u32) -> &T {
-    // SAFETY: callers slice `table` to the level's entries. `locate` masks a hash by their number less one, and lowers a
-    // direct index to it.
+    // SAFETY: callers slice `table` to the level's entries. `locate` masks a hash by their number less one, and lowers
+    // a direct index to it.
     unsafe { entry(table, i) }
 }
 

@@ -1,5 +1,5 @@
-//! The order in which files store voxels: x fastest in NIfTI, MetaImage, NRRD and TIFF stacks, z fastest in NumPy's files and in
-//! conefield's arrays.
+//! The order in which files store voxels: x fastest in NIfTI, MetaImage, NRRD and TIFF stacks, z fastest in NumPy's
+//! files and in conefield's arrays.
 
 use crate::affine::Affine;
 use crate::memory;

@@ -1,7 +1,7 @@
 //! Reading and writing of every file format that conefield supports, one module per format.
 //!
-//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NRRD, NumPy, TIFF stacks, OME-Zarr;
-//!   read only: a DICOM series).
+//! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NRRD, NumPy, TIFF stacks,
+//!   OME-Zarr; read only: a DICOM series).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.
@@ -9,7 +9,8 @@
 //!   description).
 //! - Part of a scan, with its geometry: [`Selection`].
 //! - Sizes, before memory is allocated: [`scan_size`], [`scanner_size`], [`volume_voxels`].
-//! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`] (safetensors).
+//! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`]
+//!   (safetensors).
 //! - Curves and images for TensorBoard: [`EventFile`].
 //!
 //! Readers recognize a format by a file's content, check a header before they allocate what it claims, and name the

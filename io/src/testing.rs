@@ -19,8 +19,8 @@ pub(crate) fn data(name: &str) -> Option<PathBuf> {
     None
 }
 
-/// Writes `data` to a file called `name` and reads it: values, grid and affine are the same bits, with the volume centred
-/// and with an affine of its own that turns and mirrors.
+/// Writes `data` to a file called `name` and reads it: values, grid and affine are the same bits, with the volume
+/// centred and with an affine of its own that turns and mirrors.
 pub(crate) fn comes_back_to_the_bit(name: &str, data: Array3<f32>) {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join(name);

@@ -103,9 +103,9 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
     Ok(VolumeFile::Nifti(input, head))
 }
 
-/// Whether the file, or the folder of DICOM files, TIFF files or OME-Zarr, looks like a volume; its data is not read. Also true for paths
-/// that [`read_volume`] refuses with a better error: a single DICOM file, and a file named like a volume that is
-/// damaged or of another format.
+/// Whether the file, or the folder of DICOM files, TIFF files or OME-Zarr, looks like a volume; its data is not read.
+/// Also true for paths that [`read_volume`] refuses with a better error: a single DICOM file, and a file named like a
+/// volume that is damaged or of another format.
 pub fn is_volume(path: impl AsRef<Path>) -> bool {
     let path = path.as_ref();
     if path.is_dir() {

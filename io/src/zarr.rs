@@ -1,9 +1,9 @@
 //! OME-Zarr: a folder with a pyramid of chunks, for volumes too large for a viewer to load at once.
 //!
-//! Written is version 0.4 on Zarr 2, which every reader supports: arrays `0` (the volume), `1` (half as many voxels along each
-//! axis), … down to a single chunk; axes z, y, x in mm, 32-bit floats in chunks of 64³ compressed by zlib. Each chunk
-//! is computed from the eight below it as soon as they are written, so that few chunks are in memory at once whatever
-//! the volume's size.
+//! Written is version 0.4 on Zarr 2, which every reader supports: arrays `0` (the volume), `1` (half as many voxels
+//! along each axis), … down to a single chunk; axes z, y, x in mm, 32-bit floats in chunks of 64³ compressed by zlib.
+//! Each chunk is computed from the eight below it as soon as they are written, so that few chunks are in memory at once
+//! whatever the volume's size.
 //!
 //! Source: ngff.openmicroscopy.org/0.4, zarr-specs.readthedocs.io (v2). The format supports scale and translation, no
 //! rotation: an affine of the volume's own is kept in an attribute that only conefield reads.

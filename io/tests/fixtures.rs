@@ -1,5 +1,5 @@
-//! The conventions of NAF's file and R2-Gaussian's folder, held against files that `fixtures/make.py` writes without this
-//! program: closed-form integrals through ellipsoids, in pickles of NumPy 1 and 2 and in `.npy` files.
+//! The conventions of NAF's file and R2-Gaussian's folder, held against files that `fixtures/make.py` writes without
+//! this program: closed-form integrals through ellipsoids, in pickles of NumPy 1 and 2 and in `.npy` files.
 
 use conefield_core::geometry::Vec3;
 use conefield_core::scan::{Scan, Volume};

@@ -224,7 +224,8 @@ fn long() -> Volume {
     Volume::centered(data, [0.5, 0.75, 2.0])
 }
 
-/// Writes [`long`] as `name`, and compares what `script` prints of it: its sizes along z, y and x, then its values, x fastest.
+/// Writes [`long`] as `name`, and compares what `script` prints of it: its sizes along z, y and x, then its values, x
+/// fastest.
 fn assert_read_by(modules: &[&str], name: &str, script: &str) {
     let Some(python) = python(modules) else { return };
     let dir = tempfile::tempdir().unwrap();

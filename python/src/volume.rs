@@ -39,7 +39,8 @@ pub fn made<'py>(py: Python<'py>, volume: Volume) -> PyResult<Bound<'py, PyAny>>
     class.call1((given(py, data), grid.spacing.to_vec(), grid.center.to_vec(), affine))
 }
 
-/// Reads the volume `name`: a file, the folder of a DICOM series, of TIFF slices or of OME-Zarr, or `phantom:KIND[:SIZE]`.
+/// Reads the volume `name`: a file, the folder of a DICOM series, of TIFF slices or of OME-Zarr, or
+/// `phantom:KIND[:SIZE]`.
 #[pyfunction]
 pub fn read_volume(py: Python<'_>, name: String) -> PyResult<Bound<'_, PyAny>> {
     let volume = without_lock(py, |_| {

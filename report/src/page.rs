@@ -1,7 +1,8 @@
 //! One HTML file that shows runs: volumes in a viewer, scores, curves, projections, geometry, specs, warnings.
 //!
-//! The file contains all data and code and fetches nothing; its content security policy forbids it. Only the page of a run that goes
-//! on asks its own server for a newer one. The viewer and the plots use third-party libraries (`report/page/vendor`).
+//! The file contains all data and code and fetches nothing; its content security policy forbids it. Only the page of a
+//! run that goes on asks its own server for a newer one. The viewer and the plots use third-party libraries
+//! (`report/page/vendor`).
 
 mod picture;
 mod volume;

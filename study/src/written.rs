@@ -119,7 +119,8 @@ pub struct WrittenSimulation {
     #[serde(deserialize_with = "angles")]
     #[schemars(with = "Option<String>")]
     pub angles: Option<AnglesOption>,
-    /// none, tigre:I0,SIGMA such as tigre:1e4,10 (the published one), or poisson:I0 [default: the protocol's; r2: none].
+    /// none, tigre:I0,SIGMA such as tigre:1e4,10 (the published one), or poisson:I0 [default: the protocol's; r2:
+    /// none].
     #[serde(deserialize_with = "noise")]
     #[schemars(with = "Option<String>")]
     pub noise: Option<DetectorNoise>,
@@ -148,8 +149,8 @@ pub struct Protocol {
     #[serde(deserialize_with = "hold_out", serialize_with = "shown", skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<String>")]
     pub hold_out: Option<HoldOut>,
-    /// The reference of existing scans: a file, or "truth" for the one in the scan. Simulated scans are compared with their
-    /// truth.
+    /// The reference of existing scans: a file, or "truth" for the one in the scan. Simulated scans are compared with
+    /// their truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reference: Option<String>,
     /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].

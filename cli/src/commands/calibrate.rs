@@ -23,10 +23,11 @@ use std::time::Instant;
 
 /// Estimate the position of the detector from the views.
 ///
-/// A quick reconstruction of some views predicts the others; the geometry with the smallest error is the estimate. For offset-v,
-/// tilt, distance and step, pairs of views are compared without a reconstruction. No phantom is needed. SCAN is not changed; OUT is
-/// the same scan with the corrected geometry. Parameters that the views do not determine, or that are right within three standard
-/// deviations, stay unchanged. A warning reports if the views fit the opposite direction of rotation clearly better.
+/// A quick reconstruction of some views predicts the others; the geometry with the smallest error is the estimate. For
+/// offset-v, tilt, distance and step, pairs of views are compared without a reconstruction. No phantom is needed. SCAN
+/// is not changed; OUT is the same scan with the corrected geometry. Parameters that the views do not determine, or
+/// that are right within three standard deviations, stay unchanged. A warning reports if the views fit the opposite
+/// direction of rotation clearly better.
 #[derive(Args)]
 pub struct CalibrateArgs {
     /// The scan.

@@ -68,7 +68,8 @@ impl Cell<'_> {
         Ok(Start::Replacing)
     }
 
-    /// Runs unless the run is finished. Returns the error of a failed run. `part` names the work in the message of an interruption.
+    /// Runs unless the run is finished. Returns the error of a failed run. `part` names the work in the message of an
+    /// interruption.
     pub fn carry_out(&self, start: Start, part: String, general: &General) -> Result<Option<String>> {
         let mut more: Vec<String> = match start {
             Start::Done => return Ok(None),

@@ -24,9 +24,10 @@ use tracing::info;
 
 /// Reconstruct a scan with several methods under one protocol.
 ///
-/// FOLDER receives table.md, table.json, compare.png and, for every spec, a folder with the output of "conefield reconstruct".
-/// Each run is a separate process, so its peak memory is its own, and the others run even if one fails. Every --set applies to every spec.
-/// Ctrl-C stops the current run after its step; the same command with --resume continues and skips finished runs.
+/// FOLDER receives table.md, table.json, compare.png and, for every spec, a folder with the output of "conefield
+/// reconstruct". Each run is a separate process, so its peak memory is its own, and the others run even if one fails.
+/// Every --set applies to every spec. Ctrl-C stops the current run after its step; the same command with --resume
+/// continues and skips finished runs.
 #[derive(Args)]
 pub struct CompareArgs {
     /// The scan.

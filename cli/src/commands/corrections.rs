@@ -11,8 +11,8 @@ use std::path::Path;
 #[command(next_help_heading = "Corrections")]
 pub struct CorrectionOptions {
     /// Correct a fault: pixels, flux, rings, low-counts.photons=N, scatter.share=S, hardening.water.kvp=N,
-    /// hardening.polynomial=[1.0, ...] or truncation. Settings are written like rings.window=21; docs/guide/corrections.md lists them. May be
-    /// repeated; corrections run in the order of this list.
+    /// hardening.polynomial=[1.0, ...] or truncation. Settings are written like rings.window=21;
+    /// docs/guide/corrections.md lists them. May be repeated; corrections run in the order of this list.
     #[arg(long, value_name = "NAME")]
     correct: Vec<String>,
 }

@@ -21,9 +21,9 @@ use tracing::info;
 
 /// Simulate a small scan, reconstruct it with three methods and compare them.
 ///
-/// The scan is of a head phantom with the published noise. The methods are total variation on a smooth volume (spec "smooth-tv"), a
-/// neural field that starts from pre-trained weights (spec "fast" with MCI), and the same field without LayerNorm and MCI for the same
-/// time.
+/// The scan is of a head phantom with the published noise. The methods are total variation on a smooth volume (spec
+/// "smooth-tv"), a neural field that starts from pre-trained weights (spec "fast" with MCI), and the same field without
+/// LayerNorm and MCI for the same time.
 #[derive(Args)]
 pub struct DemoArgs {
     /// The folder for scan, volumes and picture.

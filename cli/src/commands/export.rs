@@ -13,8 +13,8 @@ use std::time::Instant;
 
 /// Evaluate the field of a finished run on another grid.
 ///
-/// The voxels fill the box that the run reconstructed. They are evaluated and written slab by slab, so a volume may be larger than
-/// memory.
+/// The voxels fill the box that the run reconstructed. They are evaluated and written slab by slab, so a volume may be
+/// larger than memory.
 #[derive(Args)]
 pub struct ExportArgs {
     #[command(flatten)]

@@ -31,8 +31,8 @@ pub struct ImportArgs {
     /// The folder for the scan.
     #[arg(short, long = "output", value_name = "SCAN")]
     output: PathBuf,
-    /// Counts of the open beam: a number, or air to take them from the border of each view [default: the flat field or i0 of
-    /// SCANNER.toml].
+    /// Counts of the open beam: a number, or air to take them from the border of each view [default: the flat field or
+    /// i0 of SCANNER.toml].
     #[arg(long, value_name = "N|air", value_parser = parse::i0)]
     i0: Option<I0>,
     /// Lowest count above dark; lower counts are raised to it [default: SCANNER.toml's, else 1 or a ten-thousandth of

@@ -26,7 +26,8 @@ use std::path::{Path, PathBuf};
 pub struct InfoArgs {
     /// A scan, a volume, the folder of a run or a weights file.
     file: PathBuf,
-    /// Also draw source path, detector, volume and the share of views that see each point; for a volume, its middle slices.
+    /// Also draw source path, detector, volume and the share of views that see each point; for a volume, its middle
+    /// slices.
     #[arg(long, value_name = "FILE")]
     png: Option<PathBuf>,
     /// Print one JSON object.

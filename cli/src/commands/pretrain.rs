@@ -16,7 +16,8 @@ use std::path::PathBuf;
 
 /// Train a field on known volumes, to start other scans from its weights (MCI).
 ///
-/// The weights file holds normalizers and field. The encoder is not kept: it belongs to the volume that it was trained on.
+/// The weights file holds normalizers and field. The encoder is not kept: it belongs to the volume that it was trained
+/// on.
 #[derive(Args)]
 pub struct PretrainArgs {
     /// The known volumes: files, or phantoms as in "conefield simulate".

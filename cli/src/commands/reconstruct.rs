@@ -38,9 +38,10 @@ use std::time::{Duration, Instant};
 
 /// Reconstruct a volume from a scan.
 ///
-/// RUN receives volume.nii.gz, metrics.jsonl, spec.toml (every setting), weights.safetensors, slices.png and, at the end,
-/// record.json. Ctrl-C stops the run after its step; the same command with --resume continues. With --budget the command first measures
-/// this machine for one to three seconds (less for a short budget) and then plans its work to fit the budget.
+/// RUN receives volume.nii.gz, metrics.jsonl, spec.toml (every setting), weights.safetensors, slices.png and, at the
+/// end, record.json. Ctrl-C stops the run after its step; the same command with --resume continues. With --budget the
+/// command first measures this machine for one to three seconds (less for a short budget) and then plans its work to
+/// fit the budget.
 #[derive(Args)]
 pub struct ReconstructArgs {
     /// The scan.
@@ -70,15 +71,15 @@ pub struct ReconstructArgs {
     /// Write events.out.tfevents.conefield in RUN, in which TensorBoard shows curves and pictures during the run.
     #[arg(long)]
     tensorboard: bool,
-    /// Serve the page of "conefield report" at http://127.0.0.1:PORT/ during the run, with live.png every 5 s unless --live says
-    /// otherwise [default: a free port].
+    /// Serve the page of "conefield report" at http://127.0.0.1:PORT/ during the run, with live.png every 5 s unless
+    /// --live says otherwise [default: a free port].
     #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0")]
     watch: Option<u16>,
     /// Print one JSON object: the content of record.json.
     #[arg(long)]
     json: bool,
-    /// The run is part of another command: its error also goes to standard output, and the end of standard input stops it like a
-    /// signal.
+    /// The run is part of another command: its error also goes to standard output, and the end of standard input stops
+    /// it like a signal.
     #[arg(long, hide = true)]
     as_part: bool,
 }
@@ -226,8 +227,8 @@ impl ReconstructArgs {
         if self.json { out::json(&record) } else { out::say(&summary(&record, &self.output)) }
     }
 
-    /// If held-out views are predicted badly, checks whether the geometry is the cause. The run is complete, so an interruption
-    /// only ends the check. Runs that are part of another command skip it.
+    /// If held-out views are predicted badly, checks whether the geometry is the cause. The run is complete, so an
+    /// interruption only ends the check. Runs that are part of another command skip it.
     fn doubt(&self, scan: &Scan, held_out: Option<f64>) {
         if held_out.is_some_and(|error| error > DOUBTFUL)
             && !self.as_part

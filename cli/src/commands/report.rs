@@ -18,10 +18,10 @@ use std::path::{Path, PathBuf};
 
 /// Show runs in one HTML page that any browser opens offline.
 ///
-/// The page has slices, a rendering and values of the volumes, differences to the reference and between runs, scores, times, memory, training
-/// curves, measured and predicted projections with residuals, the geometry, the spec and what it builds, and warnings. RUN is the folder of
-/// "conefield reconstruct", "conefield compare" or "conefield study". Scan and reference are read from where the run read them; missing
-/// ones are left out with a note.
+/// The page has slices, a rendering and values of the volumes, differences to the reference and between runs, scores,
+/// times, memory, training curves, measured and predicted projections with residuals, the geometry, the spec and what
+/// it builds, and warnings. RUN is the folder of "conefield reconstruct", "conefield compare" or "conefield study".
+/// Scan and reference are read from where the run read them; missing ones are left out with a note.
 #[derive(Args)]
 pub struct ReportArgs {
     /// The folder of a run, a comparison or a study; several are shown side by side.
@@ -130,7 +130,8 @@ impl ReportArgs {
     }
 }
 
-/// The page of an unfinished run: curves, spec and the live picture, without large files. Browsers renew it after `seconds`.
+/// The page of an unfinished run: curves, spec and the live picture, without large files. Browsers renew it after
+/// `seconds`.
 pub fn standing(folder: &Path, seconds: u64) -> Result<String> {
     let found = [RunOnDisk::read(folder)?];
     let mut page = Page { renewed: Some(seconds), ..Page::default() };

@@ -14,12 +14,12 @@ use tracing::warn;
 
 /// Make a scan of a known volume.
 ///
-/// Projections are line integrals of the trilinearly interpolated volume along a circular orbit. The scan keeps the volume as its
-/// truth.
+/// Projections are line integrals of the trilinearly interpolated volume along a circular orbit. The scan keeps the
+/// volume as its truth.
 #[derive(Args)]
 pub struct SimulateArgs {
-    /// The volume: a file, or phantom:head, phantom:abdomen or phantom:random:SEED, each optionally with :SIZE (8 to 1024 voxels per
-    /// side) [default: 128].
+    /// The volume: a file, or phantom:head, phantom:abdomen or phantom:random:SEED, each optionally with :SIZE (8 to
+    /// 1024 voxels per side) [default: 128].
     volume: String,
     /// The folder for the scan.
     #[arg(short, long = "output", value_name = "SCAN")]
@@ -46,8 +46,8 @@ pub struct SimulateArgs {
     /// Average blocks of N x N x N voxels first.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     downsample: u16,
-    /// Meaning of the voxel values: as-is (attenuation per unit of the protocol), hu:MU_WATER (HU, with the attenuation of water in
-    /// 1/mm) or clip:LO,HI (LO to HI becomes 0 to 1).
+    /// Meaning of the voxel values: as-is (attenuation per unit of the protocol), hu:MU_WATER (HU, with the attenuation
+    /// of water in 1/mm) or clip:LO,HI (LO to HI becomes 0 to 1).
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
     /// Seed of the noise [default: the protocol's; r2: 0].

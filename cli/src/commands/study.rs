@@ -25,11 +25,11 @@ use tracing::info;
 
 /// Reconstruct many scans with several methods and seeds.
 ///
-/// The table has means, standard deviations and paired differences. STUDY is a TOML file with volumes to simulate or scans, specs, seeds
-/// and numbers of views (docs/guide/many-scans.md; "conefield schema --study" has every key). FOLDER receives table.md, table.json, slices/,
-/// curves/, the simulated scans in scans/ and the output of each "conefield reconstruct" in runs/. Each run is a separate process; the
-/// others run even if one fails. Ctrl-C stops the current run after its step; the same command with --resume continues and skips
-/// finished runs.
+/// The table has means, standard deviations and paired differences. STUDY is a TOML file with volumes to simulate or
+/// scans, specs, seeds and numbers of views (docs/guide/many-scans.md; "conefield schema --study" has every key).
+/// FOLDER receives table.md, table.json, slices/, curves/, the simulated scans in scans/ and the output of each
+/// "conefield reconstruct" in runs/. Each run is a separate process; the others run even if one fails. Ctrl-C stops the
+/// current run after its step; the same command with --resume continues and skips finished runs.
 #[derive(Args)]
 pub struct StudyArgs {
     /// The study file.

@@ -22,10 +22,11 @@ use std::path::{Path, PathBuf};
 
 /// Search for the best methods under time budgets.
 ///
-/// Candidates are drawn from levers and tried under the smallest budget; the better ones advance to the next budget (neural fields and voxel
-/// methods separately). Each trial is a whole "conefield reconstruct --budget" in a separate process. FOLDER receives tradeoff.md,
-/// tradeoff.json, front.png, front.toml (for "reconstruct --front") and, in front/, a spec for every point that no other beats in time,
-/// memory and accuracy. Ctrl-C stops the current trial; the same command with --resume continues and skips finished trials.
+/// Candidates are drawn from levers and tried under the smallest budget; the better ones advance to the next budget
+/// (neural fields and voxel methods separately). Each trial is a whole "conefield reconstruct --budget" in a separate
+/// process. FOLDER receives tradeoff.md, tradeoff.json, front.png, front.toml (for "reconstruct --front") and, in
+/// front/, a spec for every point that no other beats in time, memory and accuracy. Ctrl-C stops the current trial; the
+/// same command with --resume continues and skips finished trials.
 #[derive(Args)]
 pub struct TradeoffArgs {
     /// Scans to tune on; results are averaged over them.
@@ -52,8 +53,8 @@ pub struct TradeoffArgs {
     /// Share of the candidates that advances to the next budget.
     #[arg(long, value_name = "SHARE", default_value_t = 0.5, value_parser = parse::share)]
     keep: f64,
-    /// The reference, to rank by PSNR instead of held-out views: a file for each scan in turn, or "truth" for the ones in the
-    /// scans.
+    /// The reference, to rank by PSNR instead of held-out views: a file for each scan in turn, or "truth" for the ones
+    /// in the scans.
     #[arg(long, value_name = "VOLUME")]
     reference: Vec<PathBuf>,
     /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].

@@ -1,4 +1,5 @@
-//! A data term for conefield: `c²·(√(1 + (r/c)²) − 1)` of a residual r, squares that grow like |r| from some times the noise on.
+//! A data term for conefield: `c²·(√(1 + (r/c)²) − 1)` of a residual r, squares that grow like |r| from some times the
+//! noise on.
 
 use conefield_plugin::prelude::*;
 

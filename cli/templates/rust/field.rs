@@ -1,4 +1,5 @@
-//! A field for conefield: features `[n, F]` to attenuation `[n, 1]`, `y = ln(1 + exp(w·x + b))`, which is never negative.
+//! A field for conefield: features `[n, F]` to attenuation `[n, 1]`, `y = ln(1 + exp(w·x + b))`, which is never
+//! negative.
 
 use conefield_plugin::prelude::*;
 

@@ -1,7 +1,7 @@
 //! A normalizer for conefield: features `[n, F]` to features `[n, F]`.
 //!
-//! This start scales and shifts every channel by numbers that are learned: `y = w·x + b`. Its backward pass is written by
-//! hand; `cargo test` compares it with finite differences.
+//! This start scales and shifts every channel by numbers that are learned: `y = w·x + b`. Its backward pass is written
+//! by hand; `cargo test` compares it with finite differences.
 
 use conefield_plugin::error::Result;
 use conefield_plugin::simd::Real;

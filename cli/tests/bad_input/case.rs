@@ -132,8 +132,8 @@ pub struct Outcome {
     pub faults: Vec<String>,
 }
 
-/// The relevant line: the error, or the warning with the words of `says`. `info` and `import` print warnings with their result,
-/// readers on standard error.
+/// The relevant line: the error, or the warning with the words of `says`. `info` and `import` print warnings with their
+/// result, readers on standard error.
 fn message(said: &str, printed: &str, end: End, says: &[&str]) -> String {
     match end {
         End::Refused | End::WrongUse => said.lines().find(|l| l.starts_with("error: ")).unwrap_or(said).to_owned(),

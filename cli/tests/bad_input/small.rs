@@ -1,5 +1,5 @@
-//! Small files that claim or unpack to much: what is taken is drawn from one allowance as it is taken, whatever a header, a
-//! packed size or an estimate says; work that grows faster than its input has a bound of its own.
+//! Small files that claim or unpack to much: what is taken is drawn from one allowance as it is taken, whatever a
+//! header, a packed size or an estimate says; work that grows faster than its input has a bound of its own.
 
 use crate::case::{Case, put, refused};
 use conefield_tests::hostile::seeds;

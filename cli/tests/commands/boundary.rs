@@ -1,5 +1,5 @@
-//! Nothing is lost at the boundary: what a command reads stays, what it replaces goes only when the new is there, a folder has
-//! one writer, and what files say does not reach the terminal as it is.
+//! Nothing is lost at the boundary: what a command reads stays, what it replaces goes only when the new is there, a
+//! folder has one writer, and what files say does not reach the terminal as it is.
 
 use crate::common::{conefield, done, json, refused, text};
 use std::fs;

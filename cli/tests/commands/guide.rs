@@ -1,7 +1,7 @@
 //! The guide's commands, run as the pages show them.
 //!
-//! The `sh` blocks of a page run in order, in a folder of their own, except those below `<!-- not run: REASON -->`. A `toml` block below
-//! a line that begins with a file name in backticks is written to that file first.
+//! The `sh` blocks of a page run in order, in a folder of their own, except those below `<!-- not run: REASON -->`. A
+//! `toml` block below a line that begins with a file name in backticks is written to that file first.
 
 use crate::common::{done, text};
 use std::fs;

@@ -110,7 +110,8 @@ fn the_estimate_is_near_the_peak_of_methods_on_voxels() {
         let held = 4 * (views * side * side + voxels * voxels * voxels) as u64;
         let more = run("fdk", views, side, voxels, &[]) - least;
         println!("  {:.3} of projections and volume, beside {} MiB", more as f64 / held as f64, least / MIB);
-        // A copy of the larger of both is at least 0.6 more; how many pages of the program itself are mapped varies by 10 MiB.
+        // A copy of the larger of both is at least 0.6 more; how many pages of the program itself are mapped varies by
+        // 10 MiB.
         assert!(more as f64 <= 1.2 * held as f64, "{more} bytes more for {held}");
     }
     let nonnegative = ["nonnegative=true"];

@@ -1,5 +1,5 @@
-//! Shipped neural specs make a volume that is worth something on the CPU: a head of 64³ voxels from 20 views, few steps on
-//! smaller tables and fewer samples than the specs ask for.
+//! Shipped neural specs make a volume that is worth something on the CPU: a head of 64³ voxels from 20 views, few steps
+//! on smaller tables and fewer samples than the specs ask for.
 
 use crate::common::{done, json, text};
 use conefield::specs::SHIPPED;

@@ -1,4 +1,5 @@
-//! Part of a scan, by `import` and by `convert`: as slicing the arrays gives it, to the bit, with the geometry of that part.
+//! Part of a scan, by `import` and by `convert`: as slicing the arrays gives it, to the bit, with the geometry of that
+//! part.
 
 use crate::common::{done, refused, text};
 use ndarray::{Array2, Array3, s};

@@ -1,5 +1,5 @@
-//! A pipeline with stages of plugins is the same as one with the same code built in: same bits of weights and volume, and
-//! after a kill the same bits again.
+//! A pipeline with stages of plugins is the same as one with the same code built in: same bits of weights and volume,
+//! and after a kill the same bits again.
 
 use crate::build::{cargo, example, library, sources};
 use crate::common::{conefield, done, json, refused, text};
@@ -114,8 +114,8 @@ fn as_built_in() {
     assert!(volume.data == built_in.data, "the volumes differ");
 }
 
-/// A regularizer of a plugin has the weight, the penalty and the map of one that is built in, and what it keeps goes into
-/// checkpoints.
+/// A regularizer of a plugin has the weight, the penalty and the map of one that is built in, and what it keeps goes
+/// into checkpoints.
 #[test]
 fn a_regularizer_as_built_in() {
     const SPEC: &str = "type = 'fista'\nprior = 'huber'\nsubsets = 2\nstop = { passes = 400 }\n";
@@ -232,7 +232,8 @@ fn mapping_consistency() {
     assert!(!output.status.success() && e.contains("field.0.weight"), "{e}");
 }
 
-/// What built-in initializers have, plugins' have too: weights that the host reads, a look at them before the run, a known volume.
+/// What built-in initializers have, plugins' have too: weights that the host reads, a look at them before the run, a
+/// known volume.
 #[test]
 fn initializers_of_plugins() {
     let place = place();

@@ -1,5 +1,5 @@
-//! Plugins that do one thing wrong each, and what becomes of them: refused when loaded, refused when tried out, found by
-//! the check, or an error of the run. `faulty.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
+//! Plugins that do one thing wrong each, and what becomes of them: refused when loaded, refused when tried out, found
+//! by the check, or an error of the run. `faulty.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
 
 use crate::build::{cargo, cc, library, sources};
 use crate::common::{conefield, done, text};
@@ -13,7 +13,8 @@ struct Fault {
     what: &'static str,
     /// How it is compiled.
     defines: &'static [&'static str],
-    /// What each of `plugins list`, `plugins check` and `reconstruct` says: a part of the message, or nothing if all is well.
+    /// What each of `plugins list`, `plugins check` and `reconstruct` says: a part of the message, or nothing if all is
+    /// well.
     list: &'static str,
     check: &'static str,
     reconstruct: &'static str,

@@ -48,8 +48,8 @@ pub enum SurroundRule {
     /// Nothing.
     #[default]
     None,
-    /// Coarse cells, if the object reaches the sides of views. Total variation reconstructs them over the whole field of view
-    /// first, and their line integrals are subtracted from the measured ones.
+    /// Coarse cells, if the object reaches the sides of views. Total variation reconstructs them over the whole field
+    /// of view first, and their line integrals are subtracted from the measured ones.
     Coarse(CoarseSurround),
 }
 
@@ -93,8 +93,8 @@ impl SurroundRule {
 pub enum LevelRule {
     /// All.
     All,
-    /// Without levels finer than the data: finer than a voxel, or than a pixel projected to the centre of the volume. The coarsest
-    /// sufficient level stays.
+    /// Without levels finer than the data: finer than a voxel, or than a pixel projected to the centre of the volume.
+    /// The coarsest sufficient level stays.
     Needed,
 }
 
@@ -104,9 +104,9 @@ pub enum LevelRule {
 pub enum SupportRule {
     /// Anywhere.
     Box,
-    /// Without air: cells through which several views see only air are left out. The unit cube is fitted to the rest, rays are
-    /// sampled between the first and the last remaining cell, and iterative methods keep other voxels at 0. Truncated views do
-    /// not count.
+    /// Without air: cells through which several views see only air are left out. The unit cube is fitted to the rest,
+    /// rays are sampled between the first and the last remaining cell, and iterative methods keep other voxels at 0.
+    /// Truncated views do not count.
     Carve,
 }
 

@@ -292,7 +292,8 @@ fn skip_lines(header: &Header, data: &mut Input) -> Result<()> {
     Ok(())
 }
 
-/// Skips bytes before the voxels, in the decompressed data; −1 means that the voxels are the last bytes of a plain file.
+/// Skips bytes before the voxels, in the decompressed data; −1 means that the voxels are the last bytes of a plain
+/// file.
 fn skip_bytes(header: &Header, data: &mut Input, want: u64) -> Result<()> {
     let Some((field, text)) = header.first(&["byte skip", "byteskip"])? else { return Ok(()) };
     let skip = match (text.parse::<i64>(), data.left()) {

@@ -91,8 +91,8 @@ fn window() -> [f32; TAPS] {
     raw.map(|x| (x / sum) as f32)
 }
 
-/// Blurs the product of two images, or one image if the other is empty, with the window. The window is symmetric, so that
-/// the blur is its own adjoint.
+/// Blurs the product of two images, or one image if the other is empty, with the window. The window is symmetric, so
+/// that the blur is its own adjoint.
 fn blur(
     taps: &[f32; TAPS],
     [image, times]: [&[f32]; 2],

@@ -272,8 +272,8 @@ struct Rows<R> {
 }
 
 impl<R: Real> Footprint<R> {
-    /// Its rows `rows` on a detector of `columns` columns. Whole groups of [`TOGETHER`] rows are filled; those after the
-    /// last row lie outside the footprint.
+    /// Its rows `rows` on a detector of `columns` columns. Whole groups of [`TOGETHER`] rows are filled; those after
+    /// the last row lie outside the footprint.
     #[inline(always)]
     fn rows<S: Simd>(&self, s: S, rows: Range<usize>, columns: usize, out: &mut Rows<R>) {
         let len = V::<S, R>::LEN;

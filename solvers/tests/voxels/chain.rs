@@ -116,7 +116,8 @@ fn an_interruption_of_any_goes_on_to_the_same_bits() {
     }
 }
 
-/// Methods two and three are one grid of 24 voxels: merged they are one method of seven passes, and the mean is its volume alone.
+/// Methods two and three are one grid of 24 voxels: merged they are one method of seven passes, and the mean is its
+/// volume alone.
 #[test]
 fn methods_on_one_grid_are_merged() {
     let scan = scan();

@@ -234,8 +234,8 @@ fn decibels(volume: &Volume) -> f64 {
     10.0 * (f64::from(peak).powi(2) / mean).log10()
 }
 
-/// Views as dense as those of a full turn give the same volume from part of one, or from a detector that sees little more than half: with the
-/// weights that the orbit asks for within 0.3 dB, without them 6 dB worse.
+/// Views as dense as those of a full turn give the same volume from part of one, or from a detector that sees little
+/// more than half: with the weights that the orbit asks for within 0.3 dB, without them 6 dB worse.
 #[test]
 fn part_of_a_turn_is_as_good_as_all_of_it() {
     let full = decibels(&fdk(&scan(CENTRED), "").0);
@@ -257,8 +257,8 @@ fn part_of_a_turn_is_as_good_as_all_of_it() {
     }
 }
 
-/// The detector about its own columns: its rays are others, and so is what they count. Measured over a short scan, in which no opposite ray
-/// makes up for it.
+/// The detector about its own columns: its rays are others, and so is what they count. Measured over a short scan, in
+/// which no opposite ray makes up for it.
 #[test]
 fn a_detector_need_not_face_the_axis() {
     for degrees in [-12.0f64, 12.0] {

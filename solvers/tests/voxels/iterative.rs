@@ -70,8 +70,8 @@ fn residuals_fall() {
     }
 }
 
-/// What few views leave to FDK in streaks, iterative methods find; total variation finds most. The voxels are finer than
-/// elsewhere here: how they round the bodies' edges off is part of every error.
+/// What few views leave to FDK in streaks, iterative methods find; total variation finds most. The voxels are finer
+/// than elsewhere here: how they round the bodies' edges off is part of every error.
 #[test]
 fn fewer_views_than_fdk_needs_are_enough() {
     let mut g = geometry(20);
@@ -261,7 +261,8 @@ fn passes_time_or_a_small_change_end_a_run() {
     }
 }
 
-/// Noise grows with the passes of conjugate gradients. The held-out views detect it, and the run returns the best volume.
+/// Noise grows with the passes of conjugate gradients. The held-out views detect it, and the run returns the best
+/// volume.
 #[test]
 fn patience_ends_a_run_at_the_best_volume() {
     let (scan, held) = noisy().split(&[3, 11, 19]).unwrap();

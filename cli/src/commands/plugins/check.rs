@@ -112,7 +112,8 @@ impl Check {
         self.apart("--here", self.time_limit, late)
     }
 
-    /// Runs a part of the check in a child process and reports how it ended; `late` if it takes longer than `limit` seconds.
+    /// Runs a part of the check in a child process and reports how it ended; `late` if it takes longer than `limit`
+    /// seconds.
     fn apart(&self, part: &str, limit: f64, late: String) -> Result<()> {
         let mut command = program::command()?;
         let io = |e| Error::io("conefield", e);

@@ -21,8 +21,8 @@ pub struct New {
     /// The parent folder.
     #[arg(long, value_name = "FOLDER", default_value = ".")]
     into: PathBuf,
-    /// conefield's sources for a Rust plugin [default: those that this program was built from if they still exist, else the
-    /// published crates].
+    /// conefield's sources for a Rust plugin [default: those that this program was built from if they still exist, else
+    /// the published crates].
     #[arg(long, value_name = "FOLDER")]
     sources: Option<PathBuf>,
 }

@@ -105,7 +105,8 @@ fn plan(run: &RunOnDisk) -> Result<String> {
     Ok(Explanation::new(&loaded, plan.as_ref(), None)?.text())
 }
 
-/// Names of the specs; if these are ambiguous, of the folders, of the folders in their parents as in a study, or else full paths.
+/// Names of the specs; if these are ambiguous, of the folders, of the folders in their parents as in a study, or else
+/// full paths.
 fn names(found: &[RunOnDisk]) -> Vec<String> {
     #[derive(Deserialize)]
     struct Named {

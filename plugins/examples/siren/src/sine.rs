@@ -1,6 +1,6 @@
 //! A multi-layer perceptron whose activation is a sine (Sitzmann et al., "Implicit neural representations with periodic
-//! activation functions", 2020): `h₁ = sin(ω·(W₁x + b₁))`, `hₖ = sin(ω·(Wₖhₖ₋₁ + bₖ))`, and `μ = softplus(w·h + b)`, which is
-//! never negative.
+//! activation functions", 2020): `h₁ = sin(ω·(W₁x + b₁))`, `hₖ = sin(ω·(Wₖhₖ₋₁ + bₖ))`, and `μ = softplus(w·h + b)`,
+//! which is never negative.
 
 use conefield_plugin::error::{Result, ensure};
 use conefield_plugin::random::{mix, unit};
