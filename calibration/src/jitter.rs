@@ -316,7 +316,7 @@ mod tests {
         }
     }
 
-    /// A moved object is no jitter.
+    /// A moved object does not count as jitter.
     #[test]
     fn a_motion_of_the_object_is_removed() {
         let scan = scan(20, 0.0);

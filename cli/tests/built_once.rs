@@ -1,4 +1,4 @@
-//! A command builds each stage of a spec once: to explain it, and to run it.
+//! A command builds each stage of a spec only once, both to explain it and to run it.
 
 use conefield_core::Result;
 use conefield_core::settings::{EncoderSpec, FieldSpec, ProjectorSpec};
@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// How often an encoder, a field and a projector were built.
+/// Numbers of encoders, fields and projectors built.
 static BUILT: [AtomicUsize; 3] = [const { AtomicUsize::new(0) }; 3];
 
 /// Settings of stages that count how often they are built.
@@ -47,7 +47,7 @@ impl ProjectorSpec for Counted {
     }
 }
 
-/// Runs a command in this process; how often each stage was built for it.
+/// Runs a command in this process; returns how often each stage was built.
 fn built(args: &[&str]) -> [usize; 3] {
     BUILT.iter().for_each(|n| n.store(0, Ordering::Relaxed));
     let args = std::iter::once("conefield").chain(args.iter().copied()).map(Into::into);
@@ -68,7 +68,7 @@ fn explain_and_reconstruct_build_each_stage_once() {
     assert_eq!(built(&["explain", &spec, "--scan", &scan]), [1; 3]);
     assert_eq!(built(&["reconstruct", &scan, "--spec", &spec, "-o", &at("run")]), [1; 3]);
     assert!(Path::new(&at("run")).join("volume.nii.gz").is_file());
-    // A budget measures the plan that it then runs.
+    // A budget measures the plan that then runs.
     assert_eq!(built(&["reconstruct", &scan, "--spec", &spec, "-o", &at("timed"), "--budget", "6s"]), [1; 3]);
     let chain = at("chain.toml");
     let text = format!(

@@ -31,9 +31,9 @@ pub enum Error {
     /// A request that this build or this pipeline cannot fulfil.
     #[error("{what}: {why}")]
     Unsupported {
-        /// What was asked for.
+        /// The request.
         what: String,
-        /// Why not, and what to do instead.
+        /// The reason, and the alternative.
         why: String,
     },
     /// The run was interrupted by the user.

@@ -50,7 +50,7 @@ impl CircularOrbit {
         let (s, c) = angles[0].sin_cos();
         // Along the circle's own axes the first view gives all lengths.
         let reach = sub(first.detector, first.source);
-        // Rounding errors are no shift.
+        // Rounding errors do not count as a shift.
         let shift = |x: f64| if x.abs() < 1e-12 * norm(reach) { 0.0 } else { x };
         let orbit = Self {
             dso,
@@ -108,7 +108,7 @@ mod tests {
             [&mut v.source, &mut v.detector, &mut v.u, &mut v.v][change][2] += 1e-4;
             assert_eq!(CircularOrbit::fit(&views), None);
         }
-        // Columns in the opposite direction are no such orbit either.
+        // Columns in the opposite direction do not give such an orbit either.
         let mut views = circle();
         views.iter_mut().for_each(|v| v.u = v.u.map(|x| -x));
         assert_eq!(CircularOrbit::fit(&views), None);

@@ -68,7 +68,7 @@ impl Pipeline {
         let normalizers = normalizers.into_iter().map(Arc::from).collect();
         let mut pipeline = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![], whole: None };
         pipeline.lay_out();
-        // For any scene: checks that the encoder knows the lengths that the projector counts in.
+        // Checks, for any scene, that the encoder reports the lengths that the projector's settings are relative to.
         pipeline.fitted(pipeline.lengths(1.0, 1.0))?;
         Ok(pipeline)
     }

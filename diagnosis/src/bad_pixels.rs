@@ -64,7 +64,7 @@ pub fn outliers(projections: ArrayView3<f32>, known: &Array2<bool>) -> Vec<[usiz
             let (Some(lower), Some(upper)) = (around.get(n.saturating_sub(1) / 2), around.get(n / 2)) else {
                 return 0.0;
             };
-            // A value between the two middle ones is no outlier: one bad neighbour on an edge must not matter.
+            // A value between the two middle ones is not an outlier: one bad neighbour on an edge must not matter.
             let x = view[[i, j]];
             (x - upper).max(lower - x).max(0.0)
         });

@@ -459,7 +459,7 @@ impl Encoder for PlanesStage {
 mod tests {
     use super::*;
 
-    /// Nodes are where the shape says, and planes use the axes in the formula.
+    /// Nodes are at the positions that the shape implies, and planes use the axes in the formula.
     #[test]
     fn planes_and_lines_follow_the_formula() {
         let x = [0.75, 0.5, 0.125f64];

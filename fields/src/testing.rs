@@ -1,8 +1,8 @@
-//! Checks that the tests of several fields share.
+//! Shared checks for tests of several fields.
 
 use conefield_core::stage::{Field, Stage, Tile, TileMut};
 
-/// A field of the inputs `keep` computes what the whole field makes of zeros in the others.
+/// Checks that a field of the inputs `keep` equals the whole field with zeros in the other inputs.
 pub(crate) fn left_out_inputs_are_zeros(field: &dyn Field, keep: &[usize]) {
     let mut params = vec![0.0; field.info().params];
     field.init(3, &mut params);

@@ -32,7 +32,7 @@ impl EventFile {
     }
 
     /// Opens the file `path` to continue after `step`, with the step of the last event kept. Events of later steps, and
-    /// whatever follows a damaged event, are removed. Creates the file if there is none, or if it is no event file.
+    /// anything after a damaged event are removed. Creates the file if it does not exist or is not an event file.
     pub fn resume(path: impl AsRef<Path>, step: u64) -> Result<(Self, Option<u64>)> {
         let path = path.as_ref();
         let error = |e| Error::io(path, e);
@@ -160,7 +160,7 @@ fn crc32c(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(!0, |crc, b| (0..8).fold(crc ^ u32::from(*b), |crc, _| step(crc)))
 }
 
-/// Masked as in TFRecords, so that data which contains a CRC still has a sound CRC.
+/// Masked as in TFRecords, so that data containing a CRC still has a valid CRC.
 fn masked(crc: u32) -> u32 {
     crc.rotate_right(15).wrapping_add(0xa282_ead8)
 }
@@ -221,7 +221,7 @@ mod tests {
         drop(file);
         let whole = std::fs::read(&path).unwrap();
         assert!(whole.starts_with(&kept) && whole.len() > kept.len());
-        // Half an event, a wrong check sum and a length beyond the file end what is kept.
+        // Half an event, a wrong checksum, or a length beyond the end of the file ends the events that are kept.
         for damaged in [whole[..whole.len() - 1].to_vec(), [&whole[..whole.len() - 1], b"x"].concat(), {
             let mut long = whole.clone();
             long[kept.len() + 3] ^= 1;

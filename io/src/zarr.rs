@@ -178,7 +178,7 @@ mod tests {
         assert_eq!([last[[1, 4, 5]], last[[0, 0, 0]]], [value(69, 4, 65), value(64, 0, 64)]);
         assert_eq!([last[[2, 0, 0]], last[[0, 5, 0]], last[[0, 0, 6]]], [0.0; 3]);
         let up = chunk(&path.join("1/0/0/0"));
-        // Along y the fifth row stands alone.
+        // Along y the fifth row is averaged alone.
         assert_eq!(up[[32, 2, 34]], (value(68, 4, 64) + value(69, 4, 65)) / 2.0);
         let text = fs::read_to_string(path.join(".zattrs")).unwrap();
         let v: Value = serde_json::from_str(&text).unwrap();

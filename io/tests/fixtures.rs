@@ -1,12 +1,12 @@
-//! The conventions of NAF's file and R2-Gaussian's folder, held against files that `fixtures/make.py` writes without
-//! this program: closed-form integrals through ellipsoids, in pickles of NumPy 1 and 2 and in `.npy` files.
+//! Tests the conventions of NAF's file and R2-Gaussian's folder with files that `fixtures/make.py` writes without this
+//! program: closed-form integrals through ellipsoids, in pickles of NumPy 1 and 2 and in `.npy` files.
 
 use conefield_core::geometry::Vec3;
 use conefield_core::scan::{Scan, Volume};
 use conefield_io::{DataSet, read_naf, read_r2};
 use std::path::{Path, PathBuf};
 
-/// Middle, half axes, turn about z, attenuation: as in `make.py`.
+/// Centre, half axes, rotation about z, attenuation, as in `make.py`.
 const ELLIPSOIDS: [(Vec3, Vec3, f64, f64); 3] = [
     ([2.0, -3.0, 1.0], [24.0, 18.0, 20.0], 0.4, 0.020),
     ([9.0, 4.0, -6.0], [7.0, 6.0, 8.0], 1.1, 0.015),
@@ -17,7 +17,7 @@ fn file(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
 }
 
-/// Into the frame in which ellipsoid `e` is the unit ball.
+/// Transforms to the frame in which ellipsoid `e` is the unit ball.
 fn turned(p: Vec3, e: usize) -> Vec3 {
     let (_, half, turn, _) = ELLIPSOIDS[e];
     let (s, c) = turn.sin_cos();
@@ -98,7 +98,7 @@ fn nafs_pickle_is_read_as_it_is_meant() {
         let found = data.train.provenance["unit_from"].as_str().unwrap();
         assert!(found.contains("1/mm"), "{found}");
     }
-    // The two differ where NumPy 2 renamed its modules.
+    // The two differ because NumPy 2 renamed its modules.
     let bytes = |name: &str| std::fs::read(file(name)).unwrap();
     let holds = |name: &str, part: &[u8]| bytes(name).windows(part.len()).any(|w| w == part);
     assert!(holds("ellipsoids_numpy2.pickle", b"numpy._core") && !holds("ellipsoids_numpy1.pickle", b"numpy._core"));
@@ -112,7 +112,7 @@ fn r2s_folder_is_read_as_it_is_meant() {
     assert!(found.contains("lengths in m"), "{found}");
 }
 
-/// What is held against these files can fail.
+/// Verifies that the comparison can fail.
 #[test]
 fn another_convention_is_found_out() {
     let data = read_r2(file("ellipsoids_r2")).unwrap();

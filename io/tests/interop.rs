@@ -1,6 +1,7 @@
-//! Volumes to and from SimpleITK and nibabel.
+//! Exchanges volumes with SimpleITK and nibabel.
 //!
-//! `CONEFIELD_PYTHON` names the interpreter, `python3` if it is not set. Without the modules a test says that it skips.
+//! `CONEFIELD_PYTHON` names the interpreter; the default is `python3`. Tests are skipped with a note if a module is
+//! missing.
 
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
@@ -21,7 +22,7 @@ fn python(modules: &[&str]) -> Option<String> {
     None
 }
 
-/// Runs `script` in `folder` and gives what it printed.
+/// Runs `script` in `folder` and returns its output.
 fn run(python: &str, folder: &Path, script: &str) -> String {
     let out = Command::new(python).args(["-c", script]).current_dir(folder).output().unwrap();
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
@@ -32,7 +33,7 @@ fn numbers(text: &str) -> Vec<f64> {
     text.split_whitespace().map(|t| t.parse().unwrap()).collect()
 }
 
-/// 4×3×2 voxels, turned about two axes, off the origin.
+/// 4×3×2 voxels, rotated about two axes, off the origin.
 fn turned() -> Volume {
     let (s, c) = 0.3f64.sin_cos();
     let affine = [
@@ -72,7 +73,7 @@ def show(image):
     print(*[float(x) for x in a.ravel()], *[float(x) for x in sitk.GetArrayFromImage(image).ravel()])
 ";
 
-/// What [`SHOW`] prints of `volume`.
+/// The output of [`SHOW`] for `volume`.
 fn assert_shown(text: &str, volume: &Volume, tolerance: f64, what: &str) {
     let found = numbers(text);
     assert_affine(&found[..16], volume, tolerance, what);
@@ -224,7 +225,7 @@ fn long() -> Volume {
     Volume::centered(data, [0.5, 0.75, 2.0])
 }
 
-/// Writes [`long`] as `name`, and compares what `script` prints of it: its sizes along z, y and x, then its values, x
+/// Writes [`long`] as `name`, and compares the output of `script`: the sizes along z, y and x, then the values, x
 /// fastest.
 fn assert_read_by(modules: &[&str], name: &str, script: &str) {
     let Some(python) = python(modules) else { return };
@@ -263,7 +264,7 @@ print(*m['datasets'][0]['coordinateTransformations'][0]['scale'], *g['0'][:].rav
     assert_read_by(&["zarr"], "a.zarr", zarr);
 }
 
-/// Lets `script` write [`long`], which lies in `a.npy`, into `names`, and reads them.
+/// Lets `script` write [`long`] from `a.npy` to `names`, and reads them.
 fn assert_written_by(modules: &[&str], names: &[&str], script: &str) {
     let Some(python) = python(modules) else { return };
     let dir = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! The metrics against values that `golden.py` computed with other code, and against what can be said by hand.
+//! Compares the metrics with values that `golden.py` computed with other code, and with values computed by hand.
 
 use conefield_metrics::{Scores, evaluate, psnr, rmse, ssim_2d, ssim_3d, ssim_skimage, worst_slices};
 use ndarray::{Array3, ArrayView3, ShapeBuilder};
@@ -141,7 +141,7 @@ fn what_cannot_be_compared_is_refused_in_words() {
     }
 }
 
-/// Time and scores on a pair of the size that figures are published for.
+/// Time and scores on a pair of the size used in publications.
 #[test]
 #[ignore = "a measurement: run with --ignored --nocapture"]
 fn a_pair_of_256_cubed_takes_seconds() {

@@ -1,5 +1,5 @@
-//! Draws the conventions of docs/guide/geometry.md, with every place taken from the library:
-//! `cargo run -p conefield-report --example draw_geometry` writes docs/images/geometry-*.svg. A test here compares.
+//! Draws the conventions of docs/guide/geometry.md, with all positions computed by the library: `cargo run -p
+//! conefield-report --example draw_geometry` writes docs/images/geometry-*.svg. A test here compares.
 
 use conefield_core::geometry::{Geometry, Millimetres, Radians, Vec3, View, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;
@@ -14,13 +14,13 @@ const FAINT: &str = "#9a9a9a";
 
 type Point = (f64, f64);
 
-/// A drawing in SVG; points are pixels, y down.
+/// An SVG drawing; points are in pixels, y down.
 struct Svg {
     size: Point,
     body: String,
 }
 
-/// How a line looks.
+/// Style of a line.
 #[derive(Clone, Copy)]
 struct Line {
     colour: &'static str,
@@ -81,7 +81,7 @@ impl Svg {
         self.element(format_args!("<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"{radius}\" fill=\"{colour}\"/>", at.0, at.1));
     }
 
-    /// A text whose `anchor` is start, middle or end.
+    /// A text; `anchor` is start, middle or end.
     fn text(&mut self, at: Point, anchor: &str, colour: &str, text: &str) {
         self.element(format_args!(
             "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"{anchor}\" fill=\"{colour}\">{text}</text>",
@@ -115,7 +115,7 @@ impl Svg {
     }
 }
 
-/// What is drawn: a view at `angle` with a detector that stands aside.
+/// The geometry to draw: a view at `angle` with a shifted detector.
 fn geometry(angle_deg: f64, offset: [f64; 2]) -> Geometry {
     let mm = Millimetres;
     let view =
@@ -179,7 +179,7 @@ fn from_above(s: &mut Svg) {
     s.path(&ring(184.0, angle + 3.0, angle + 20.0), line(SOURCE).arrow());
     s.path(&ring(90.0, 0.0, angle - 2.0), line(INK).arrow());
     s.text(flat([102.0, 28.0, 0.0]), "start", INK, "a");
-    // The detector's own direction, and how far its middle is from where the axis falls.
+    // The detector's own direction, and the distance of its centre from the projection of the axis.
     let beside = |c: f64, away: f64| {
         let p = view.pixel(g.detector, 1.5, c);
         let n = view.normal().0;
@@ -242,7 +242,7 @@ fn from_side(s: &mut Svg) {
     s.text((590.0, 490.0), "start", INK, "+z; along u all have the same sign.");
 }
 
-/// The array of a view as the source sees it, and what the flips of an import mean.
+/// The array of a view as seen from the source, and the meaning of an import's flips.
 fn detector() -> String {
     let mut s = Svg::new(980.0, 400.0);
     s.title((20.0, 28.0), "projections[view, row, column], seen from the source");
@@ -292,7 +292,7 @@ fn detector() -> String {
             (corner.0 + x, corner.1 + y)
         };
         s.path(&[at(0.0, 0.0), at(90.0, 0.0), at(90.0, 90.0), at(0.0, 90.0), at(0.0, 0.0)], line(FAINT));
-        // A letter that looks different in each.
+        // A letter that looks different in each orientation.
         s.path(&[at(62.0, 20.0), at(30.0, 20.0), at(30.0, 74.0)], line(DETECTOR).wide(6.0));
         s.path(&[at(30.0, 46.0), at(54.0, 46.0)], line(DETECTOR).wide(6.0));
         s.dot(at(6.0, 6.0), SOURCE, 5.0);
@@ -385,7 +385,7 @@ fn axes(s: &mut Svg, flat: &dyn Fn(Vec3) -> Point, length: f64, names: [&str; 3]
     }
 }
 
-/// Files and what they should hold.
+/// Files and their required content.
 fn drawings() -> Vec<(PathBuf, String)> {
     let docs = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../docs/images");
     [("world", world()), ("detector", detector()), ("space", space())]

@@ -1,4 +1,4 @@
-//! Carving the volume by the air in the views: what it saves, and that nothing real disappears.
+//! Carving the volume by the air in the views: how much it removes, and that nothing real disappears.
 
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::support::Support;
@@ -8,7 +8,7 @@ use ndarray::Array3;
 
 const N: usize = 48;
 
-/// A body of attenuation 1 (per half cube side) off the middle, and what `more` adds.
+/// A body of attenuation 1 (per half cube side), off centre, plus `more`.
 fn volume(more: impl Fn([usize; 3]) -> Option<f32>) -> Volume {
     let data = Array3::from_shape_fn((N, N, N), |(x, y, z)| {
         let d = [x as f64 - 20.0, y as f64 - 26.0, (z as f64 - 24.0) * 0.7];
@@ -27,14 +27,14 @@ fn noisy() -> DetectorNoise {
     "tigre:1e4,10".parse().unwrap()
 }
 
-/// Voxels with something in them that the support leaves out.
+/// Nonzero voxels outside the support.
 fn lost(volume: &Volume, support: &Support) -> usize {
     let there =
         |((x, y, z), v): ((usize, usize, usize), &f32)| *v > 0.0 && !support.holds(volume.grid.voxel([x, y, z]));
     volume.data.indexed_iter().filter(|v| there(*v)).count()
 }
 
-/// Carves a scan of `volume` and finds everything that is real still there. Returns the share that is left.
+/// Carves a scan of `volume` and checks that the support contains everything real. Returns the remaining share.
 fn keeps(name: &str, volume: &Volume, views: usize, noise: DetectorNoise) -> f64 {
     let found = carve(&scan(volume, views, noise));
     println!("{name}: {}", found.said);
@@ -66,11 +66,11 @@ fn thin_and_faint_things_stay() {
     let voxel = volume(|at| (at == [47, 24, 40]).then_some(8.0));
     keeps("bright voxel at the rim", &voxel, 50, DetectorNoise::None);
     keeps("bright voxel at the rim, noise", &voxel, 50, noisy());
-    // Four voxels a side of a tenth of the body's attenuation, in the air beside it.
+    // Four voxels per side with a tenth of the body's attenuation, in the air beside it.
     let faint =
         volume(|[x, y, z]| ((40..44).contains(&x) && (8..12).contains(&y) && (30..34).contains(&z)).then_some(0.1));
     keeps("faint block", &faint, 50, DetectorNoise::None);
-    // Some 30 photons through the body, 300 beside it.
+    // About 30 photons through the body, 300 beside it.
     keeps("body, 10 views, heavy noise", &volume(|_| None), 10, "poisson:300".parse().unwrap());
 }
 
@@ -80,14 +80,14 @@ fn few_views_and_cut_off_objects_carve_little_or_nothing() {
         keeps(&format!("{views} views"), &volume(|_| None), views, noisy());
     }
     assert!(carve(&scan(&volume(|_| None), 1, DetectorNoise::None)).support.is_none());
-    // The detector is too narrow: what it shows beside the object, if anything, is not air that one can trust.
+    // The detector is too narrow: values beside the object are not reliable air.
     let body = volume(|_| None);
     let narrow =
         |grid, side| Protocol { extent: DetectorExtent::Side(side), ..Protocol::r2(grid).with_detector([64, 64]) };
     let protocol = narrow(&body.grid, [4.0, 0.9]);
     let found = carve(&simulate(&body, &protocol).unwrap());
     assert!(found.support.is_none() && found.said.contains("sides of the views"), "{}", found.said);
-    // Nothing but object in every view.
+    // Every view shows only the object.
     let full = Volume::centered(Array3::from_elem((N, N, N), 0.5), [2.0 / N as f64; 3]);
     let protocol = narrow(&full.grid, [1.0, 1.0]);
     let found = carve(&simulate(&full, &protocol).unwrap());
@@ -97,7 +97,7 @@ fn few_views_and_cut_off_objects_carve_little_or_nothing() {
     assert!(carve(&scan(&nothing, 20, DetectorNoise::None)).support.is_none());
 }
 
-/// Negative control: a threshold that is met by chance alone would lose a wire. Here the wire is hidden on purpose.
+/// Negative control: a threshold reached by chance would lose a wire. Here the wire is hidden on purpose.
 #[test]
 fn a_wire_that_no_view_shows_is_lost() {
     let wire = volume(|[x, y, _]| (x == 43 && y == 6).then_some(0.6));

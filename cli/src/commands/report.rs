@@ -91,7 +91,7 @@ impl ReportArgs {
         self.summarize(&page, coarser, bytes)
     }
 
-    /// Refuses a page that does not fit into memory: one volume at a time beside its scan, and the data of the page.
+    /// Refuses a page that does not fit into memory: one volume at a time with its scan, and the data of the page.
     fn check_memory(&self, groups: &[Group], options: &Options) -> Result<()> {
         let all: u64 = groups.iter().flat_map(Group::voxels).sum::<u64>() * 2;
         // Worst case: incompressible data as text, and before that its two halves.

@@ -1,4 +1,4 @@
-//! One bad input: how it is made, what is done with it, and how that must end.
+//! One bad input: how it is made, the command, and its required outcome.
 
 use assert_cmd::Command;
 use std::collections::BTreeMap;
@@ -6,25 +6,25 @@ use std::fs;
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime};
 
-/// Address space that the command gets, in KiB: what it takes for a small input is far below.
+/// Address space of the command in KiB; small inputs need far less.
 const MEMORY_KIB: u64 = 1 << 20;
-/// What `--memory` is, where a case does not say otherwise.
+/// Default value of `--memory`.
 const USUAL: &str = "1GiB";
-/// More than any header claims, so that a reader comes to look at what a file holds.
+/// More than any header claims, so that a reader checks the actual content of a file.
 pub const AMPLE: Option<&str> = Some("1000TiB");
-/// Processor seconds that it gets.
+/// Processor seconds for the command.
 const SECONDS: u64 = 20;
-/// When it is killed, if it only waits.
+/// Wall time after which a waiting command is killed.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// How a command must end.
+/// Required outcome of a command.
 #[derive(Clone, Copy)]
 pub enum End {
     /// With status 1 and one line that starts with `error:`.
     Refused,
     /// With status 2: wrong use of the command line.
     WrongUse,
-    /// With status 0 and a warning: what is suspicious, not impossible.
+    /// With status 0 and a warning: suspicious but possible.
     Warned,
 }
 
@@ -35,12 +35,12 @@ pub struct Case {
     args: &'static str,
     end: End,
     says: &'static [&'static str],
-    /// What `--memory` is, if it is given.
+    /// Value of `--memory`, if given.
     memory: Option<&'static str>,
 }
 
-/// An input that must be refused: what it is, how it is made in an empty folder, the command's words (split at spaces,
-/// or as a shell does where there are single quotes; it runs in that folder), and what the message must hold.
+/// An input that must be refused: its description, how it is made in an empty folder, the words of the command (split
+/// at spaces, or as in a shell if there are single quotes; it runs in that folder), and parts of the message.
 pub fn refused(
     what: &'static str,
     make: impl Fn(&Path) + Sync + Send + 'static,
@@ -51,12 +51,12 @@ pub fn refused(
 }
 
 impl Case {
-    /// The same with another end.
+    /// The same with another outcome.
     pub fn ends(self, end: End) -> Self {
         Self { end, ..self }
     }
 
-    /// The same with another `--memory`, or none, so that the limit of address space is all that there is.
+    /// The same with another `--memory`, or none, so that only the address space is limited.
     pub fn memory(self, memory: Option<&'static str>) -> Self {
         Self { memory, ..self }
     }
@@ -67,7 +67,7 @@ impl Case {
         (self.make)(dir.path());
         let before = standing(dir.path());
         let program = assert_cmd::cargo::cargo_bin("conefield");
-        // Two threads, as each takes address space of its own.
+        // Two threads, because each one takes address space.
         let memory = self.memory.map_or(String::new(), |m| format!("--memory {m} "));
         let limited =
             format!("ulimit -v {MEMORY_KIB}; ulimit -t {SECONDS}; ulimit -c 0; exec \"$0\" --threads 2 {memory}\"$@\"");
@@ -123,7 +123,7 @@ impl Case {
     }
 }
 
-/// What a command did.
+/// Outcome of a command.
 pub struct Outcome {
     pub what: &'static str,
     pub command: String,
@@ -148,7 +148,7 @@ fn message(said: &str, printed: &str, end: End, says: &[&str]) -> String {
     }
 }
 
-/// The message without sizes that differ from machine to machine: of what there is, and of what the program holds.
+/// The message without sizes that differ between machines: available memory, and memory held by the program.
 fn without_figures(text: String) -> String {
     let marks = [" are available", " that are held", " in all, as --memory"];
     marks.iter().fold(text, |text, mark| {
@@ -158,7 +158,7 @@ fn without_figures(text: String) -> String {
     })
 }
 
-/// Everything below `folder`: length and time of change by path.
+/// Everything below `folder`: length and modification time by path.
 fn standing(folder: &Path) -> BTreeMap<String, (u64, Option<SystemTime>)> {
     let mut all = BTreeMap::new();
     for entry in fs::read_dir(folder).unwrap() {
@@ -179,7 +179,7 @@ pub fn put(path: impl AsRef<Path>, bytes: impl AsRef<[u8]>) {
     fs::write(path, bytes).unwrap();
 }
 
-/// Makes `seed`, then changes the bytes of `file`.
+/// Creates `seed`, then changes the bytes of `file`.
 pub fn changed(
     seed: fn(&Path),
     file: &'static str,
@@ -195,7 +195,7 @@ pub fn changed(
     }
 }
 
-/// Makes `seed`, then replaces `from` in the text of `file`, which must hold it, by `to`.
+/// Creates `seed`, then replaces `from` by `to` in the text of `file`, which must contain it.
 pub fn replaced(
     seed: fn(&Path),
     file: &'static str,

@@ -1,4 +1,4 @@
-//! Values on the command line, and the small files that it may name.
+//! Values on the command line, and the small files that they may name.
 
 use crate::case::{Case, End, put, refused};
 use conefield_tests::hostile::seeds::{nifti, npy_bytes, scan_toml};
@@ -6,7 +6,7 @@ use std::path::Path;
 
 fn none(_: &Path) {}
 
-/// A volume of 4 x 3 x 2 voxels, label maps of it that are none, and a program of `sh` that gets `{in}` and `{out}`.
+/// A volume of 4 x 3 x 2 voxels, invalid label maps of it, and an `sh` program that gets `{in}` and `{out}`.
 fn segmenter(text: &'static str) -> impl Fn(&Path) + Sync + Send {
     move |d| {
         nifti(d);

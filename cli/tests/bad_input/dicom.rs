@@ -7,12 +7,12 @@ use std::path::Path;
 const INFO: &str = "info series";
 const FILE: &str = "series/0.dcm";
 
-/// Where the element `tag` starts.
+/// Offset of the element `tag`.
 fn find(bytes: &[u8], tag: [u8; 4]) -> usize {
     bytes.windows(4).position(|w| w == tag).expect("an element of the seed")
 }
 
-/// With the value (behind eight bytes of head) of an element replaced.
+/// Replaces the value of an element, which follows a head of eight bytes.
 fn value(tag: [u8; 4], value: &'static [u8]) -> impl Fn(&Path) + Sync + Send {
     changed(dicom, FILE, move |b| {
         let start = find(b, tag) + 8;
@@ -20,7 +20,7 @@ fn value(tag: [u8; 4], value: &'static [u8]) -> impl Fn(&Path) + Sync + Send {
     })
 }
 
-/// With bytes put before `BitsAllocated`.
+/// Inserts bytes before `BitsAllocated`.
 fn inserted(bytes: Vec<u8>) -> impl Fn(&Path) + Sync + Send {
     changed(dicom, FILE, move |b| {
         let start = find(b, [0x28, 0, 0, 1]);

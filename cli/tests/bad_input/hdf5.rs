@@ -8,7 +8,7 @@ const IMPORT: &str = "import scanner.toml -o scan";
 const NIKON: &str = "import bone.xtekct -o scan";
 const FILE: &str = "counts.h5";
 
-/// NXtomo with `to` in place of the first `from`: its headers have no checksums.
+/// The NXtomo file with the first `from` replaced by `to`: its headers have no checksums.
 fn keyed<const N: usize>(from: [u8; N], to: [u8; N]) -> impl Fn(&Path) + Sync + Send {
     changed(scanner_nxtomo, FILE, move |b| {
         let at = b.windows(N).position(|w| w == from).expect("bytes of the seed");

@@ -1,8 +1,8 @@
-//! Bad input of every kind, as a user would meet it: the real command ends in time, in bounded memory, with the
-//! documented status and one message that says where, what and what instead; it leaves nothing behind.
+//! Bad input of every kind through the real command: it ends in time, in bounded memory, with the documented status and
+//! one message that names the place, the problem and the expectation; it leaves nothing behind.
 //!
-//! The outcome is kept in `cases.md`: `CONEFIELD_BLESS=1 cargo test -p conefield --test bad_input` writes it there, and
-//! without that variable the table must be what the command does now.
+//! The outcome is recorded in `cases.md`. `CONEFIELD_BLESS=1 cargo test -p conefield --test bad_input` writes it;
+//! without that variable the table must match the current behaviour.
 
 #![cfg(target_os = "linux")]
 

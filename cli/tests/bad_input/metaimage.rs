@@ -6,7 +6,7 @@ use std::path::Path;
 
 const INFO: &str = "info a.mhd";
 
-/// A header with zlib data of `size` zeros beside it.
+/// A header with zlib data of `size` zeros in a second file.
 fn packed(dir: &Path, shape: &str, size: usize) {
     let text =
         metaimage_lines("a.zraw").replace("4 3 2\n", shape).replace("CompressedData = False", "CompressedData = True");

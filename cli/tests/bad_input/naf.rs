@@ -1,4 +1,4 @@
-//! NAF's pickle, which in Python may run anything.
+//! NAF's pickle, which could run anything in Python.
 
 use crate::case::{Case, End, changed, cut_end, put, refused};
 use conefield_tests::hostile::seeds::{SHAPE, naf, scan, volume};
@@ -10,7 +10,7 @@ fn pickle(bytes: impl AsRef<[u8]> + Sync + Send) -> impl Fn(&Path) + Sync + Send
     move |d| put(d.join("scan.pickle"), bytes.as_ref())
 }
 
-/// With the key `from` renamed to one of the same length.
+/// Renames the key `from` to one of the same length.
 fn key(from: &'static str, to: &'static str) -> impl Fn(&Path) + Sync + Send {
     changed(naf, "scan.pickle", move |b| {
         let start = b.windows(from.len()).position(|w| w == from.as_bytes()).expect("a key of the seed");
@@ -18,7 +18,7 @@ fn key(from: &'static str, to: &'static str) -> impl Fn(&Path) + Sync + Send {
     })
 }
 
-/// With a float replaced wherever it stands.
+/// Replaces every occurrence of a float.
 fn float(from: f64, to: f64) -> impl Fn(&Path) + Sync + Send {
     changed(naf, "scan.pickle", move |b| {
         let start = b.windows(8).position(|w| w == from.to_be_bytes()).expect("a number of the seed");
@@ -26,7 +26,7 @@ fn float(from: f64, to: f64) -> impl Fn(&Path) + Sync + Send {
     })
 }
 
-/// With the first of the projections replaced.
+/// Replaces the first projection value.
 fn projection(to: f32) -> impl Fn(&Path) + Sync + Send {
     move |d| {
         naf(d);
@@ -39,7 +39,7 @@ fn projection(to: f32) -> impl Fn(&Path) + Sync + Send {
     }
 }
 
-/// Angles in degrees, as if they were radians.
+/// Angles in degrees, labelled as radians.
 fn degrees(d: &Path) {
     let mut scan = scan();
     for (i, view) in scan.geometry.views.iter_mut().enumerate() {

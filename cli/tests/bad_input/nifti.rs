@@ -1,4 +1,4 @@
-//! NIfTI, packed or not.
+//! NIfTI, compressed or not.
 
 use crate::case::{AMPLE, Case, End, at, changed, cut, cut_end, put, refused};
 use conefield_tests::hostile::seeds::{gzip, nifti, nifti_gz};
@@ -18,7 +18,7 @@ fn header(dir: &Path, shape: [i16; 3]) -> Vec<u8> {
     bytes
 }
 
-/// The header of the seed as bytes (2) of `shape`, then `zeros` of them, in gzip.
+/// The header of the seed, as bytes (type 2) of `shape`, followed by `zeros` of them, in gzip.
 fn bomb(dir: &Path, shape: [i16; 3], zeros: usize) {
     let mut bytes = header(dir, shape);
     at(70, [2, 0, 8, 0])(&mut bytes);

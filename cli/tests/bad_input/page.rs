@@ -6,7 +6,7 @@ use std::path::Path;
 
 const HEAD: &str = "# Bad inputs and what conefield says\n\nWritten by `CONEFIELD_BLESS=1 cargo test -p conefield --test bad_input`.\n";
 
-/// Compares the table with what was seen, or writes it there.
+/// Compares the table with the outcomes, or writes it.
 pub fn check(run: &[(&str, Vec<Outcome>)]) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/bad_input/cases.md");
     let wanted = format!("{HEAD}{}", table(run));
@@ -32,7 +32,7 @@ fn table(run: &[(&str, Vec<Outcome>)]) -> String {
     text
 }
 
-/// As Markdown shows it unchanged.
+/// Escapes text for Markdown.
 fn escaped(text: &str) -> String {
     text.replace('<', "&lt;").replace('*', "\\*").replace('_', "\\_").replace('[', "\\[")
 }

@@ -15,7 +15,7 @@ fn toml(from: &'static str, to: &'static str) -> impl Fn(&Path) + Sync + Send {
     replaced(scan_toml, TOML, from, to)
 }
 
-/// With every projection mapped.
+/// Maps every projection value.
 fn mapped(map: fn(f32) -> f32) -> impl Fn(&Path) + Sync + Send {
     move |d| {
         scan_toml(d);

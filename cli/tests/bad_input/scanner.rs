@@ -18,7 +18,7 @@ fn rtk(from: &'static str, to: &'static str) -> impl Fn(&Path) + Sync + Send {
     replaced(scanner_rtk, "geometry.xml", from, to)
 }
 
-/// An XML file whose entity of ten entities, nine deep, would be 10⁹ words.
+/// An XML file with ten entities nested nine deep, which expand to 10⁹ words.
 fn laughs(dir: &Path) {
     scanner_rtk(dir);
     let mut text = "<?xml version=\"1.0\"?>\n<!DOCTYPE RTKGEOMETRY [\n<!ENTITY a0 \"ha\">\n".to_owned();

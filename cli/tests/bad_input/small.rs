@@ -1,5 +1,5 @@
-//! Small files that claim or unpack to much: what is taken is drawn from one allowance as it is taken, whatever a
-//! header, a packed size or an estimate says; work that grows faster than its input has a bound of its own.
+//! Small files that claim or unpack to much. Memory is drawn from one allowance as it is allocated, whatever a header,
+//! a packed size or an estimate says; work that grows faster than its input has its own limit.
 
 use crate::case::{Case, put, refused};
 use conefield_tests::hostile::seeds;
@@ -53,7 +53,7 @@ fn packed_nifti(d: &Path) {
     for axis in 0..3 {
         bytes[42 + 2 * axis..44 + 2 * axis].copy_from_slice(&400i16.to_le_bytes());
     }
-    // Unsigned bytes, so that they grow once more when they are read.
+    // Unsigned bytes, so that they grow again when read.
     bytes[70..74].copy_from_slice(&[2, 0, 8, 0]);
     bytes.resize(352 + 400 * 400 * 400, 0);
     put(d.join("b.nii.gz"), seeds::gzip(bytes));
@@ -86,14 +86,14 @@ fn many_views(d: &Path, count: usize) {
     let first = "<Projection><SourceToIsocenterDistance>500</SourceToIsocenterDistance>\
                  <SourceToDetectorDistance>800</SourceToDetectorDistance></Projection>\n";
     let rest = "<Projection/>\n".repeat(count - 1);
-    // The last one cannot be used.
+    // The last one is invalid.
     let last = "<Projection><SourceToDetectorDistance>0</SourceToDetectorDistance></Projection>";
     let text =
         format!("<RTKThreeDCircularGeometry version=\"3\">\n{first}{rest}{last}\n</RTKThreeDCircularGeometry>\n");
     put(d.join("geometry.xml"), text);
 }
 
-/// Chains that extend two others each, 20 files deep: 2^20 to read.
+/// Chains that each extend two others, 20 files deep: 2^20 files to read.
 fn doubling(d: &Path) {
     for i in 0..20 {
         let next = i + 1;
@@ -105,7 +105,7 @@ fn doubling(d: &Path) {
     put(d.join("20.toml"), "type = \"fdk\"\nname = \"x\"\n");
 }
 
-/// 10 000 specs, each over the next.
+/// 10 000 specs, each extending the next.
 fn long_chain(d: &Path) {
     for i in 0..10_000 {
         put(d.join(format!("{i}.toml")), format!("extends = \"{}.toml\"\nname = \"x\"\n", i + 1));
@@ -113,7 +113,7 @@ fn long_chain(d: &Path) {
     put(d.join("10000.toml"), "type = \"fdk\"\nname = \"x\"\n");
 }
 
-/// A scan with one line integral at the end of single precision.
+/// A scan with one line integral near the limit of single precision.
 fn extreme(d: &Path) {
     seeds::scan_toml(d);
     let path = d.join("scan/projections.npy");

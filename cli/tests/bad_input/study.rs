@@ -10,7 +10,7 @@ fn study(text: &'static str) -> impl Fn(&Path) + Sync + Send {
     move |d| put(d.join("study.toml"), text)
 }
 
-/// A study in which all else is right.
+/// A study that is otherwise valid.
 fn with(text: &'static str) -> impl Fn(&Path) + Sync + Send {
     move |d| put(d.join("study.toml"), format!("{REST}{text}"))
 }

@@ -1,4 +1,4 @@
-//! TIFF stacks, by way of a scanner's description.
+//! TIFF stacks, through a scanner's description.
 
 use crate::case::{Case, changed, cut, cut_end, put, refused};
 use conefield_tests::hostile::seeds::{
@@ -11,7 +11,7 @@ use tiff::encoder::{Compression, TiffEncoder, colortype};
 const IMPORT: &str = "import scanner.toml -o scan";
 const FILE: &str = "counts.tif";
 
-/// With `change` made to the entry `tag` of the first page: its kind, number of values and value.
+/// Changes the entry `tag` of the first page: its type, number of values and value.
 fn entry(tag: u16, change: impl Fn(&mut [u8]) + Sync + Send + 'static) -> impl Fn(&Path) + Sync + Send {
     changed(scanner_tiff, FILE, move |b| {
         let start = u32::from_le_bytes(b[4..8].try_into().unwrap()) as usize;

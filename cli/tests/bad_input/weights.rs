@@ -21,7 +21,7 @@ fn with_scan(make: impl Fn(&Path) + Sync + Send) -> impl Fn(&Path) + Sync + Send
     }
 }
 
-/// A run that was interrupted, with this checkpoint.
+/// An interrupted run with this checkpoint.
 fn run(make: impl Fn(&Path) + Sync + Send) -> impl Fn(&Path) + Sync + Send {
     with_scan(move |d| {
         make(d);

@@ -1,4 +1,4 @@
-//! The wgpu backend as a user meets it: listed, explained, and running what the CPU runs.
+//! The wgpu backend in the command: listed, explained, and used for runs.
 
 use crate::common::{done, refused, text};
 use serde_json::Value;
@@ -8,7 +8,7 @@ fn listed() -> Value {
     serde_json::from_str(&done(&["backends", "--json"])).unwrap()
 }
 
-/// Whether there is an adapter, a software one included; said on stderr where there is none.
+/// Whether there is an adapter, including a software one; reports a missing one on stderr.
 fn adapter(what: &str) -> bool {
     let there = !listed()["backends"][1]["adapters"].as_array().unwrap().is_empty();
     if !there {
@@ -65,7 +65,7 @@ fn explain_says_what_a_gpu_makes_of_a_spec() {
     assert!(e.contains("auto, cpu, wgpu"), "{e}");
 }
 
-/// The published method, its mask decided on the way (after 250 steps), ends at the same PSNR.
+/// The published method, including its mask (after 250 steps), ends at the same PSNR.
 #[test]
 fn ni_naf_ends_where_the_cpu_ends() {
     if !adapter("a run of ni-naf") {
@@ -96,7 +96,7 @@ const TINY: [&str; 5] = [
     "--set=field.width=8",
 ];
 
-/// A checkpoint of one backend is one of the other, and so are a finished run's weights.
+/// Checkpoints and weights of finished runs can be exchanged between backends.
 #[cfg(unix)]
 #[test]
 fn an_interrupted_run_goes_on_on_the_other_backend() {
@@ -135,6 +135,6 @@ fn an_interrupted_run_goes_on_on_the_other_backend() {
         path
     });
     let scores: Value = serde_json::from_str(&done(&["evaluate", &volumes[0], &volumes[1], "--json"])).unwrap();
-    // Of the volume's own largest value: single precision, through 400 steps.
+    // Relative to the volume's largest value: single precision, over 400 steps.
     assert!(scores["psnr"].as_f64().unwrap() > 80.0, "{scores}");
 }

@@ -1,5 +1,5 @@
-//! Nothing is lost at the boundary: what a command reads stays, what it replaces goes only when the new is there, a
-//! folder has one writer, and what files say does not reach the terminal as it is.
+//! Inputs are preserved, outputs are replaced only when the new result is complete, a folder has one writer, and text
+//! from files does not reach the terminal unescaped.
 
 use crate::common::{conefield, done, json, refused, text};
 use std::fs;
@@ -25,7 +25,7 @@ fn words(all: &[String]) -> Vec<&str> {
     all.iter().map(String::as_str).collect()
 }
 
-/// Every file below `folder` with what it holds.
+/// Every file below `folder` with its content.
 fn standing(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut all = vec![];
     let mut entries: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
@@ -41,12 +41,12 @@ fn standing(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     all
 }
 
-/// That the command is refused with all of `says`, and changes nothing in `dir`.
+/// Checks that the command is refused with all of `says` and changes nothing in `dir`.
 fn refused_whole(dir: &Path, args: &[&str], says: &[&str]) -> String {
     let before = standing(dir);
     let said = refused(1, args);
     assert!(says.iter().all(|s| said.contains(s)), "{args:?}: {says:?} are not all in: {said}");
-    // A comparison also passes on what its runs say.
+    // A comparison also prints messages of its runs.
     assert!(args[0] == "compare" || said.trim_end().lines().count() == 1, "{said}");
     let after = standing(dir);
     let names = |all: &[(PathBuf, Vec<u8>)]| all.iter().map(|(p, _)| p.display().to_string()).collect::<Vec<_>>();
@@ -103,7 +103,7 @@ fn an_output_is_no_input() {
     refused_whole(dir.path(), &["info", &scan, "--png", &projections], &["projections.npy", ".png"]);
     let [a, b] = [at("run/volume.nii.gz"), at("fdk/volume.nii.gz")];
     refused_whole(dir.path(), &["evaluate", &a, &b, "--png", &a], &["volume.nii.gz", ".png"]);
-    // The same file under a name that would do.
+    // The same file under a valid name.
     std::os::unix::fs::symlink(&a, at("a.png")).unwrap();
     refused_whole(dir.path(), &["evaluate", &a, &b, "--png", &at("a.png")], &["a.png", "this command reads"]);
     let pretrain = ["pretrain", "phantom:head:16", "--spec", "fast", "--steps", "1", "-o"];
@@ -120,7 +120,7 @@ fn an_input_that_is_unfit_leaves_the_earlier_run() {
     let (run, all, zero) = (at("run"), at("all"), at("zero"));
     done(&words(&fast(&scan, &run, &[])));
     done(&["compare", &scan, "--specs", "fdk,sirt", "-o", &all]);
-    // A volume of which half is missing is read when the run has begun.
+    // A truncated volume is read only after the run has begun.
     done(&["convert", &at("scan/truth.nii.gz"), &at("v.npy")]);
     let whole = fs::read(at("v.npy")).unwrap();
     fs::write(at("half.npy"), &whole[..whole.len() / 2]).unwrap();
@@ -130,11 +130,11 @@ fn an_input_that_is_unfit_leaves_the_earlier_run() {
     refused_whole(dir.path(), &words(&fast(&scan, &run, &["--init", &at("half.npy"), "--force"])), &["half.npy"]);
     refused_whole(dir.path(), &words(&fast(&zero, &run, &["--force"])), &[]);
     refused_whole(dir.path(), &["compare", &zero, "--specs", "fast", "-o", &all, "--force"], &["fast"]);
-    // Without --force a refusal leaves nothing, so that the next try needs none.
+    // Without --force a refusal leaves nothing behind, so that the next attempt does not need it.
     let new = at("new");
     refused_whole(dir.path(), &words(&fast(&zero, &new, &[])), &[]);
     done(&words(&fast(&scan, &new, &[])));
-    // What is fit replaces, and leaves nothing beside it.
+    // A valid result replaces the earlier one and leaves nothing else behind.
     done(&words(&fast(&scan, &run, &["--force"])));
     done(&["compare", &scan, "--specs", "fdk", "-o", &all, "--force"]);
     assert!(!Path::new(&all).join("sirt").exists());
@@ -142,7 +142,7 @@ fn an_input_that_is_unfit_leaves_the_earlier_run() {
     assert!(!hidden(dir.path()) && !hidden(Path::new(&run)) && !hidden(Path::new(&all)));
 }
 
-/// The command, not quiet, with its standard error where the shell's words put it.
+/// The command, not quiet, in a shell that redirects its standard error.
 fn shell(script: &str, args: &[String]) -> Output {
     let program = assert_cmd::cargo::cargo_bin("conefield");
     Command::new("sh").args(["-c", script]).arg(program).args(args).output().unwrap()
@@ -169,7 +169,7 @@ fn a_log_that_nobody_reads_ends_no_run() {
     }
 }
 
-/// A run of very many steps.
+/// A run with very many steps.
 fn long(scan: &str, run: &str, more: &[&str]) -> Child {
     let args = ["reconstruct", scan, "--spec", "fast", "--steps", "4000000", "--set", "training.rays=16", "-o", run];
     let program = assert_cmd::cargo::cargo_bin("conefield");
@@ -234,7 +234,7 @@ fn a_killed_replacement_gives_back_what_it_replaced() {
     kill(&child, "KILL");
     child.wait().unwrap();
     assert!(!run.join("record.json").exists(), "the new run had begun");
-    // The next command, which is refused, finds the earlier run again.
+    // The next command, though refused, restores the earlier run.
     let said = refused(1, &words(&fast(&scan, &text(&run), &[])));
     assert!(said.contains("an earlier run"), "{said}");
     assert!(standing(&run) == before);
@@ -260,7 +260,7 @@ fn a_checkpoint_of_which_a_bit_is_changed_is_refused() {
     bad[at] ^= 2;
     fs::write(&path, bad).unwrap();
     refused_whole(dir.path(), &args, &["checkpoint.safetensors", "crc32"]);
-    // Nor is a number a step because the checksum fits.
+    // A valid checksum does not make a number a step.
     fs::write(&path, &good).unwrap();
     let mut file = conefield_io::read_checkpoint(&path).unwrap();
     let mut standing: serde_json::Value = serde_json::from_str(&file.notes["standing"]).unwrap();
@@ -278,16 +278,16 @@ fn what_files_say_does_not_reach_the_terminal_as_it_is() {
     fs::write(at("evil.toml"), "extends = 'fast'\n\"a\\u001b[2Jb\\nerror: forged\" = 1\n").unwrap();
     let said = refused_whole(dir.path(), &["explain", &at("evil.toml")], &["evil.toml:2:1", "an unknown key"]);
     assert!(!said.contains('\u{1b}') && said.contains("\\u{1b}[2Jb\\nerror: forged"), "{said}");
-    // A name of a file, too.
+    // The name of a file, too.
     let name = dir.path().join("a\u{1b}]0;b\nerror: c");
     let said = refused_whole(dir.path(), &["info", &text(&name)], &["No such file"]);
     assert!(!said.contains('\u{1b}'), "{said}");
-    // A long one is cut in its middle: what is expected still stands at the end.
+    // A long message loses its middle: the expectation at its end remains.
     let long = format!("extends = 'fast'\n{} = 1\n", "k".repeat(200_000));
     fs::write(at("long.toml"), long).unwrap();
     let said = refused_whole(dir.path(), &["explain", &at("long.toml")], &["long.toml:2:1", "characters left out"]);
     assert!(said.len() < 10_000 && said.contains("an unknown key"), "{}", said.len());
-    // What is printed as a result, for people and for programs.
+    // Printed results, as text and as JSON.
     let provenance =
         fs::read_to_string(at("scan/scan.toml")).unwrap().replacen("phantom:head:16", "a\\u001b[2J\\u009bb", 1);
     fs::write(at("scan/scan.toml"), provenance).unwrap();
@@ -405,7 +405,7 @@ fn the_log_has_times_and_hears_its_variable() {
 fn what_a_killed_comparison_had_started_is_waited_for() {
     let (dir, scan) = with_scan();
     let all = dir.path().join("all");
-    // Steps of a second, so that the run outlives its comparison.
+    // Steps of about a second, so that the run outlives its comparison.
     let sets = ["--set", "training.rays=5000", "--set", "projector.samples=800", "--steps", "3"];
     let begin = ["compare", &scan, "--specs", "fast", "-o", &text(&all), "--checkpoint-every", "0.05s"];
     let args = [&begin[..], &sets].concat();

@@ -1,4 +1,4 @@
-//! `reconstruct --budget`: what is planned, what is refused, and what the record says of it.
+//! `reconstruct --budget`: the plan, refusals, and the record.
 
 use crate::common::{done, json, refused, text};
 use serde_json::Value;
@@ -21,7 +21,7 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
         let run = dir.path().join(spec);
         let all = ["reconstruct", &scan, "--spec", spec, "-o", &text(&run), "--reference", "truth", "--json"];
         let small = ["encoder.log2_table_size=10", "training.rays=64", "projector.samples=16", "priors.0.blocks=4"];
-        // Of a chain the field's settings stand one deeper.
+        // In a chain the field's settings are one level deeper.
         let deeper: Vec<String> = small.iter().map(|s| format!("methods.0.{s}")).collect();
         let small: Vec<&str> = match spec {
             "fast" => small.to_vec(),
@@ -42,19 +42,19 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
         let then = plan["expected"]["then_s"].as_f64().unwrap();
         assert_eq!(then > 0.0, spec == "field-tv", "{spec}: {then}");
         if spec == "field-tv" {
-            // Five passes more than the minimum take longer than the report of a pass.
+            // Five passes more than the minimum take longer than the reporting interval of a pass.
             let least = plan["expected"]["then_least_s"].as_f64().unwrap();
             assert!(then - least > 1e-4, "{then} after {least}");
         }
-        // A tenth more is what a quiet machine keeps to; tests run beside others.
+        // A quiet machine stays within a tenth; tests run in parallel.
         assert!(total < 4.0, "{spec}: {total}");
         let steps = record["steps"].as_u64().unwrap();
-        // FDK has one pass whatever time there is.
+        // FDK makes one pass, whatever the time.
         assert!(if spec == "fdk" { steps == 1 } else { steps > 1 }, "{spec}: {steps}");
     }
 }
 
-/// More steps than a spec of Gaussians has would fit the noise.
+/// More steps than the spec of Gaussians allows would fit the noise.
 #[test]
 fn gaussians_end_after_their_own_steps_with_time_left() {
     let (dir, scan) = scan();
@@ -65,7 +65,7 @@ fn gaussians_end_after_their_own_steps_with_time_left() {
     assert!(record["total_s"].as_f64().unwrap() < 15.0, "{record}");
 }
 
-/// Gaussians that start from the volume of the method before cannot be measured from an empty one.
+/// Gaussians that start from the previous method's volume cannot be measured from an empty one.
 #[test]
 fn a_chain_that_ends_with_gaussians_has_a_plan() {
     let (dir, scan) = scan();
@@ -75,7 +75,7 @@ fn a_chain_that_ends_with_gaussians_has_a_plan() {
     let small: Vec<&str> = small.into_iter().flat_map(|s| ["--set", s]).collect();
     let record = json(&[&all[..], &small, &["--budget", "20s"]].concat());
     assert!(record["plan"]["expected"]["then_s"].as_f64().unwrap() > 0.0, "{record}");
-    // The three methods before make some passes more.
+    // The three methods before make a few more passes.
     assert!((30..60).contains(&record["steps"].as_u64().unwrap()), "{record}");
     assert!(record["total_s"].as_f64().unwrap() < 20.0, "{record}");
 }
@@ -87,7 +87,7 @@ fn without_a_spec_the_best_of_the_shipped_front_is_taken() {
     let record = json(&["reconstruct", &text(&scan), "-o", &run, "--budget", "4s", "--json"]);
     let plan = &record["plan"];
     assert!(plan["point"].is_string() && plan["why"].as_str().unwrap().contains("front"), "{plan}");
-    // It can be repeated alone.
+    // The run can be repeated from its spec.
     assert!(dir.path().join("run/spec.toml").is_file());
 }
 

@@ -64,23 +64,23 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
     let held_out = &found["held_out"];
     assert!(number(&held_out["after"]) < 0.5 * number(&held_out["before"]), "{held_out}");
     assert!(image::open(at("curves.png")).unwrap().width() > 1000);
-    // The curve has its lowest point where the parameter was found.
+    // The curve has its minimum at the estimate.
     let curve = u["curve"].as_array().unwrap();
     let lowest = curve.iter().min_by(|a, b| number(&a[1]).total_cmp(&number(&b[1]))).unwrap();
     assert!((number(&lowest[0]) - change).abs() < 1e-9, "{lowest} {change}");
 
-    // The scan is what it was, and the new one has the geometry that was found.
+    // The input scan is unchanged, and the new one has the estimated geometry.
     assert_eq!(fs::read(at("wrong/scan.toml")).unwrap(), before);
     let corrected = conefield_io::read_scan(at("out")).unwrap();
     let right = conefield_io::read_scan(at("right")).unwrap();
     assert_eq!(corrected.projections, right.projections);
-    // The first source stands on the axis x: along y lies what u has.
+    // The first source is on the axis x, so u is along y.
     let moved = corrected.geometry.views[0].detector[1] - right.geometry.views[0].detector[1];
     assert!(moved.abs() < 0.1 * norm(right.geometry.views[0].u), "{moved}");
     let note = &corrected.provenance["calibrated"]["corrected"]["offset-u"];
     assert!((number(&note["change"]) - change).abs() < 1e-9, "{note}");
 
-    // Seen again there is nothing left to correct along u, nor in the scan whose geometry was right from the start.
+    // Calibrated again, nothing is left to correct along u, nor in the scan whose geometry was right from the start.
     for scan in [&out, &text(&at("right"))] {
         let again = json(&["calibrate", scan, "--pixels", "24", "--parameters", "offset-u", "--json"]);
         assert_eq!(of(&again, "offset-u")["verdict"], "kept", "{again}");
@@ -89,13 +89,13 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
     let said = done(&["calibrate", &text(&at("right")), "--pixels", "24", "--parameters", "offset-u"]);
     assert!(said.contains("right: unchanged") && said.contains("held-out error"), "{said}");
 
-    // `info` says that something is off, and does not where nothing is.
+    // `info` warns about the wrong geometry and not about the right one.
     let warned = done(&["info", &wrong]);
     assert!(warned.contains("conefield calibrate"), "{warned}");
     assert!(!done(&["info", &text(&at("right"))]).contains("conefield calibrate"));
 }
 
-/// Views that are shifted along u and v in turn.
+/// Views that are shifted alternately along u and v.
 #[test]
 fn shifts_of_single_views_are_corrected_and_steady_views_are_unchanged() {
     let dir = tempdir().unwrap();
@@ -146,7 +146,7 @@ fn a_wrong_direction_of_rotation_is_reported() {
     assert!(reversed < 0.7 * given, "{found}");
 }
 
-/// A ball on the axis: turned in its plane or stepped on wider, every view is the same.
+/// A ball on the axis: with a detector rotated in its plane or a wider step, every view is the same.
 #[test]
 fn undetermined_parameters_are_unchanged() {
     let dir = tempdir().unwrap();

@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use tempfile::{TempDir, tempdir};
 
-/// Settings small enough for a few steps to take no time.
+/// Settings so small that a few steps take no time.
 const SMALL: [&str; 8] = [
     "--set",
     "encoder.levels=3",
@@ -26,7 +26,7 @@ fn scan() -> (TempDir, PathBuf) {
     (dir, path)
 }
 
-/// Reconstructs by `spec`; the record.
+/// Reconstructs with `spec`; returns the record.
 fn reconstruct(scan: &Path, run: &Path, spec: &str, more: &[&str]) -> Value {
     let (scan, run) = (text(scan), text(run));
     let mut args = vec!["reconstruct", &scan, "--spec", spec, "-o", &run, "--json"];
@@ -55,7 +55,7 @@ fn a_scan_becomes_a_volume_and_its_scores() {
     let last: Value = serde_json::from_str(lines.lines().last().expect("a record")).unwrap();
     assert_eq!(last["step"], 12);
 
-    // `evaluate` finds the same, to what NIfTI keeps of a float.
+    // `evaluate` finds the same, up to NIfTI's precision.
     let truth = dir.path().join("truth.nii.gz");
     let info = json(&["info", &text(&scan), "--json"]);
     assert_eq!(info["truth"], true);
@@ -123,7 +123,7 @@ fn threads_do_not_change_a_bit() {
 fn every_shipped_spec_reconstructs() {
     let (dir, scan) = scan();
     let single = ["naf", "ni-naf", "ni-naf-published", "nerf", "sax-nerf", "dense", "accurate", "balanced", "fast"];
-    // The passes of a second method count on from there.
+    // The passes of a second method continue the count.
     let chains = [("field-tv", 4), ("accurate-tv", 6)];
     for (spec, passes) in single.map(|spec| (spec, 0)).into_iter().chain(chains) {
         let run = text(&dir.path().join(spec));
@@ -145,7 +145,7 @@ fn every_shipped_spec_reconstructs() {
     }
 }
 
-/// A volume that one method made is what another one starts from and is held to.
+/// One method starts from the volume of another and is pulled towards it.
 #[test]
 fn a_volume_starts_another_run() {
     let (dir, scan) = scan();

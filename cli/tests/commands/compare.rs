@@ -1,4 +1,4 @@
-//! `compare`: one table in three forms, one picture, and runs that stand for themselves.
+//! `compare`: one table in three forms, one picture, and runs that can be used alone.
 
 use crate::common::{conefield, done, json, refused, text};
 use serde_json::Value;
@@ -32,7 +32,7 @@ fn read(path: &Path) -> Value {
     serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap()
 }
 
-/// Cells of the Markdown table, one row a method.
+/// Cells of the Markdown table, one row per method.
 fn markdown(folder: &Path) -> Vec<Vec<String>> {
     let text = fs::read_to_string(folder.join("table.md")).unwrap();
     let rows = text
@@ -42,7 +42,7 @@ fn markdown(folder: &Path) -> Vec<Vec<String>> {
     rows.filter(|r| !r[0].starts_with("---")).collect()
 }
 
-/// When every file below `folder` was last written.
+/// Modification time of every file below `folder`.
 fn times(folder: &Path) -> Vec<(PathBuf, SystemTime)> {
     let mut all: Vec<_> = fs::read_dir(folder)
         .unwrap()
@@ -103,19 +103,19 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
         }
         assert_eq!(row[6], record["steps"].to_string());
         assert!(record["total_s"].as_f64() >= record["train_s"].as_f64());
-        // The terminal has the same cells.
+        // The terminal shows the same cells.
         let printed = shown.lines().find(|l| l.split("  ").next() == Some(name)).unwrap();
         let printed: Vec<&str> = printed.split("  ").map(str::trim).filter(|c| !c.is_empty()).collect();
         assert_eq!(printed, *row);
     }
-    // No step of FDK takes samples or has a loss: nothing is made up for it. Views that it has not seen it predicts.
+    // FDK takes no samples and has no loss: both are missing. It predicts held-out views.
     assert_eq!([&methods[0]["samples_per_s"], &methods[0]["loss"]], [&Value::Null; 2]);
     assert!(methods[0]["held_out"].as_f64().is_some_and(|e| e > 0.0) && rows[1][5] != "-");
     assert_eq!([&methods[1]["steps"], &methods[2]["steps"]], [3, 3]);
     let picture = image::open(out.join("compare.png")).unwrap();
     assert!((1000..3000).contains(&picture.width()) && (600..3000).contains(&picture.height()));
 
-    // A run that was interrupted before its first checkpoint, and one that is added; the others stay as they are.
+    // A run that was interrupted before its first checkpoint, and an added one; the others stay unchanged.
     let before = times(&out.join("fdk"));
     fs::remove_file(out.join("sirt/record.json")).unwrap();
     let line = arguments(&scan, "fdk,sirt,fast,cgls", &out, &[&all[..], &["--resume", "--json"]].concat());
@@ -126,7 +126,7 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
     assert_eq!(again["methods"][1]["scores"], table["methods"][1]["scores"]);
     assert_eq!(again["methods"].as_array().unwrap().len(), 4);
 
-    // What is done belongs to its protocol.
+    // Existing runs must match the protocol.
     for (more, want) in [
         (&["--reference", "truth", "--hold-out", "every:4", "--seed", "4"][..], "seed"),
         (&["--reference", "truth", "--seed", "3"], "held_out_views"),
@@ -143,7 +143,7 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
     assert!(said.contains("an earlier comparison") && said.contains("--resume"), "{said}");
     done(&words(&arguments(&scan, "sirt", &out, &["--force"])));
     assert!(!out.join("fdk").exists() && out.join("sirt/record.json").exists());
-    // Without reference and held-out views there is the loss.
+    // Without reference and held-out views the loss is shown.
     assert_eq!(markdown(&out)[0][1], "loss");
     assert!(read(&out.join("table.json"))["methods"][0]["scores"].is_null());
 }
@@ -154,7 +154,7 @@ fn a_method_that_fails_leaves_the_others_their_rows() {
     let out = dir.path().join("out");
     let (spec, off) = (dir.path().join("wild.toml"), dir.path().join("off.toml"));
     fs::write(&spec, "extends = \"fast\"\nname = \"wild\"\n[optimizer]\nlr = 1e30\n").unwrap();
-    // Found when it is read by the method: a volume to start from that is not there.
+    // Detected only when the method reads it: a missing start volume.
     fs::write(&off, "extends = \"sirt\"\nname = \"off\"\nstart = \"none.nii\"\n").unwrap();
     let specs = format!("{},fdk,{}", text(&spec), text(&off));
     let line = arguments(&scan, &specs, &out, &["--reference", "truth"]);
@@ -170,7 +170,7 @@ fn a_method_that_fails_leaves_the_others_their_rows() {
     assert!(shown.contains(&format!("off failed: {why}")), "{shown}");
     assert!(said.contains("methods failed: ") && said.contains("off"), "{said}");
     assert!(image::open(out.join("compare.png")).is_ok());
-    // What failed is tried again, what is done is not.
+    // Failed runs are repeated, finished ones are not.
     let before = times(&out.join("fdk"));
     let line = arguments(&scan, &specs, &out, &["--reference", "truth", "--resume"]);
     conefield(&words(&line)).assert().code(1);
@@ -209,7 +209,7 @@ fn bad_input_makes_no_folder() {
     }
     let said = refused(1, &words(&arguments(Path::new("no-scan"), "fdk", &out, &[])));
     assert!(said.contains("no-scan") && !out.exists(), "{said}");
-    // A folder with anything else in it stays as it is, whatever is asked for.
+    // A folder with anything else in it stays unchanged, whatever the options.
     let said = refused(1, &words(&arguments(&scan, "fdk", dir.path(), &["--force"])));
     assert!(said.contains("in it, expected a new or empty folder"), "{said}");
     assert!(scan.join("scan.toml").exists());
@@ -238,7 +238,7 @@ fn a_signal_stops_it_and_resume_goes_on_to_the_same_bits() {
         while fs::metadata(&metrics).map_or(0, |m| m.len()) == 0 && Instant::now() < until {
             std::thread::sleep(Duration::from_millis(2));
         }
-        // To the one process alone: its child learns of it from its input.
+        // Only to this process: the child notices the end of its input.
         assert!(Command::new("sh").arg("-c").arg(format!("kill -{signal} {}", child.id())).status().unwrap().success());
         let output = child.wait_with_output().unwrap();
         let said = String::from_utf8(output.stderr).unwrap();

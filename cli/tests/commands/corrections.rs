@@ -1,4 +1,4 @@
-//! Corrections that `import` and `convert` are asked for.
+//! Corrections requested of `import` and `convert`.
 
 use crate::common::{done, json, refused, text};
 use ndarray::Array3;
@@ -9,7 +9,7 @@ const SCANNER: &str = "format = \"conefield-scanner\"\nversion = 1\nfiles.projec
     volume = { shape = [8, 8, 8], spacing = [2.0, 2.0, 2.0] }\n[circle]\ndso = 100.0\ndsd = 150.0\n\
     pixel = { u = 2.0, v = 2.0 }\nrange_deg = 360.0\ndirection = \"counterclockwise\"\n";
 
-/// Counts through a block, of a tube that is brighter in each view, on pixels with gains of their own.
+/// Counts behind a block, from a tube that is brighter in each view, on pixels with different gains.
 fn counts() -> Array3<u16> {
     Array3::from_shape_fn((18, 16, 24), |(v, r, c)| {
         let block = if (4..12).contains(&r) && (6..18).contains(&c) { 0.5 } else { 1.0 };
@@ -27,7 +27,7 @@ fn both_commands_mend_alike_and_keep_what_they_did() {
     let [scanner, whole, here, there] = ["s.toml", "whole", "here", "there"].map(|n| text(&at(n)));
     done(&["import", &scanner, "-o", &whole]);
     let asked = ["--correct", "rings.window=5", "--correct", "flux"];
-    // Before a part is taken, whose border need not show air.
+    // Corrections run before a part is selected, because the part's border need not show air.
     let part = ["--rows", "5:11", "--columns", "8:16"];
     let found = json(&[&["import", &scanner, "-o", &here, "--json"], &asked[..], &part].concat());
     done(&[&["convert", &whole, &there], &asked[..], &part].concat());

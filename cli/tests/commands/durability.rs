@@ -1,5 +1,5 @@
-//! What stands under a name is whole: a writer that may not write, has no room or is killed leaves the earlier file as
-//! it was, nothing half-written, and says which file it was.
+//! Files appear complete or not at all: a writer that may not write, has no room or is killed leaves the earlier file
+//! unchanged and no partial file, and names the file.
 
 use crate::common::{done, text};
 use std::fs;
@@ -20,13 +20,13 @@ fn names(folder: &Path) -> Vec<String> {
     all
 }
 
-/// The command in a shell that has run `before`.
+/// The command in a shell after the commands `before`.
 fn after(before: &str, args: &[&str]) -> Output {
     let script = format!("{before}; exec \"$0\" --quiet --threads 2 \"$@\"");
     Command::new("sh").args(["-c", &script]).arg(program()).args(args).output().unwrap()
 }
 
-/// That `output` is a failure in one line that holds `words`.
+/// Checks that `output` is a failure with one line that contains `words`.
 fn failed(output: &Output, words: &[&str]) {
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{said}");
@@ -34,7 +34,7 @@ fn failed(output: &Output, words: &[&str]) {
     assert!(words.iter().all(|w| said.contains(w)), "{words:?} are not all in: {said}");
 }
 
-/// Every format that is written, by the arguments before the output's name, and that name.
+/// Every output format: the arguments before the output's name, and that name.
 fn writers(dir: &Path) -> Vec<(Vec<String>, &'static str)> {
     let at = |n: &str| text(&dir.join(n));
     done(&["simulate", "phantom:head:24", "-o", &at("scan"), "--views", "4", "--detector", "24x24"]);
@@ -79,7 +79,7 @@ fn a_disk_without_room_leaves_the_earlier_file_whole() {
         fs::create_dir(&folder).unwrap();
         let path = text(&folder.join(name));
         let args: Vec<&str> = args.iter().map(String::as_str).chain([path.as_str()]).collect();
-        // The limit on a file's length (512 or 1024 bytes a block), as a full disk, lets a write fail half-way. Its
+        // The limit on a file's length (512 or 1024 bytes per block) lets a write fail half-way, like a full disk. Its
         // signal is ignored, so that the write itself fails.
         let no_room = "trap '' XFSZ; ulimit -f 2";
         failed(&after(no_room, &args), &["File too large"]);
@@ -101,7 +101,7 @@ fn a_run_without_room_says_so() {
         ["reconstruct", &scan, "--spec", "naf", "--set", "encoder.log2_table_size=12", "--steps", "2", "-o", &to];
     failed(&after("trap '' XFSZ; ulimit -f 16", &args), &["run/", "File too large"]);
     assert!(!run.exists(), "what came to nothing leaves nothing");
-    // Standard output that is full, as well.
+    // Standard output that is full.
     failed(&after("exec >/dev/full", &["info", &scan]), &["standard output", "No space left"]);
 }
 
@@ -114,7 +114,7 @@ fn a_folder_that_may_not_be_written_is_named() {
     for path in [dir.path(), &locked] {
         fs::set_permissions(path, fs::Permissions::from_mode(0o555)).unwrap();
     }
-    // To the superuser nothing is locked: the command runs as another user then.
+    // The superuser ignores permissions: the command then runs as another user.
     let mut other = vec![];
     if fs::write(locked.join("probe"), "").is_ok() {
         fs::remove_file(locked.join("probe")).unwrap();
@@ -149,7 +149,7 @@ fn a_killed_writer_leaves_the_earlier_file_whole() {
             .stdout(Stdio::null())
             .spawn()
             .unwrap();
-        // Killed as soon as the unfinished file stands there.
+        // Killed as soon as the unfinished file exists.
         let start = Instant::now();
         let begun = || names(dir.path()).iter().any(|n| n.starts_with(".conefield-"));
         while !begun() && writer.try_wait().unwrap().is_none() && start.elapsed() < Duration::from_secs(20) {
@@ -167,7 +167,7 @@ fn a_killed_writer_leaves_the_earlier_file_whole() {
     assert!(caught > 0, "no writer was killed while it wrote");
 }
 
-/// A volume that takes a while to pack, as `v.npy`.
+/// A volume that takes a while to compress, as `v.npy`.
 fn at_phantom(dir: &Path) -> String {
     let data = ndarray::Array3::from_shape_fn((96, 96, 96), |(x, y, z)| ((x * 7 + y * 13 + z * 31) % 101) as f32);
     let path = dir.join("v.npy");

@@ -1,4 +1,4 @@
-//! The method's own experiments: drift, features as colours, label maps, an end by held-out views, live slices.
+//! Further analyses: drift, features as colours, label maps, an end by held-out views, live slices.
 
 use crate::common::{done, json, refused, text};
 use ndarray::Array3;
@@ -35,14 +35,14 @@ fn drift_stands_in_the_metrics_where_it_is_asked_for() {
     assert_eq!(all.iter().map(|d| d["step"].as_u64().unwrap()).collect::<Vec<_>>(), [16, 32, 48]);
     assert!(all.iter().all(|d| d["mean_l1"].as_f64().unwrap() > 0.0), "{all:?}");
     assert_eq!(all[0]["epoch"], 2.0);
-    // The training is the same with and without.
+    // Drift does not change the training.
     let volume = |run: &Path| fs::read(run.join("volume.nii.gz")).unwrap();
     assert!(volume(&plain) == volume(&run));
 }
 
 #[test]
 fn the_state_of_the_best_record_is_returned_and_reported() {
-    // Every step is evaluated, and steps are so long that some of them increase the error.
+    // Every step is evaluated, and steps are so long that some increase the error.
     let more = [
         "--hold-out",
         "every:4",
@@ -92,26 +92,26 @@ fn features_are_drawn_and_their_variance_reported() {
     let image = image::open(&picture).unwrap().to_rgb8();
     let coloured = image.pixels().filter(|p| p.0.iter().max().unwrap() - p.0.iter().min().unwrap() > 60).count();
     assert!(coloured > 10_000, "{coloured}");
-    // What stands there is kept unless it is said otherwise.
+    // Existing output is kept unless --force is given.
     assert!(refused(1, &["features", &run, "--out", &out]).contains("--force"));
     let normalized = json(&["features", &run, "--out", &out, "--json", "--after", "normalizers", "--force"]);
     assert_ne!(normalized["explained"], found["explained"]);
     let said = done(&["features", &format!("{run}/weights.safetensors"), "--out", &out, "--voxels", "12", "--force"]);
     assert!(said.contains("red") && said.contains("432 points"), "{said}");
-    // The same bits again.
+    // A repetition gives the same bits.
     let again = text(&dir.path().join("again.png"));
     done(&["features", &run, "--out", &again]);
     let first = text(&dir.path().join("first.png"));
     done(&["features", &run, "--out", &first, "--threads", "1"]);
     assert_eq!(fs::read(again).unwrap(), fs::read(first).unwrap());
-    // Pre-trained weights have no field to look at.
+    // Pre-trained weights have no field to show.
     let weights = text(&dir.path().join("w.safetensors"));
     done(&["pretrain", "phantom:head:16", "--spec", "fast", "-o", &weights, "--steps", "1"]);
     let said = refused(1, &["features", &weights, "--out", &out, "--force"]);
     assert!(said.contains("w.safetensors") && said.contains("reconstruct"), "{said}");
 }
 
-/// A label map with bars of two labels, the first one `from` where.
+/// A label map with bars of two labels, the first one starting at `from`.
 fn labels(path: &Path, from: usize) -> String {
     let map = Array3::from_shape_fn((12, 12, 12), |(x, y, _)| match (x, y) {
         (x, 0..4) if (from..from + 4).contains(&x) => 1.0f32,
@@ -127,7 +127,7 @@ fn label_maps_are_scored_by_dice() {
     let dir = tempdir().unwrap();
     let (a, b) = (labels(&dir.path().join("a.npy"), 2), labels(&dir.path().join("b.npy"), 4));
     let found = json(&["evaluate", "--labels", &a, &b, "--json"]);
-    // Two of four planes in common, and the other label the same in both.
+    // The first label shares two of four planes; the other label is equal in both.
     assert_eq!(
         found["dice"]["labels"][0],
         serde_json::json!({
@@ -139,7 +139,7 @@ fn label_maps_are_scored_by_dice() {
     assert!(found.get("psnr").is_none());
     let said = done(&["evaluate", "--labels", &a, &b]);
     assert!(said.contains("mean dice of 2 labels  0.7500"), "{said}");
-    // A label that the other lacks.
+    // A label missing in the other map.
     let empty = dir.path().join("empty.npy");
     ndarray_npy::write_npy(&empty, &Array3::<f32>::zeros((12, 12, 12))).unwrap();
     let empty = text(&empty);
@@ -152,7 +152,7 @@ fn label_maps_are_scored_by_dice() {
     assert!(done(&["evaluate", "--labels", &empty, &empty]).contains("not defined"));
 }
 
-/// The file `name` of the data sets, where they are; tests that need it say that they are skipped.
+/// The file `name` of the shared data, if it exists; otherwise a test is skipped with a note.
 fn data(name: &str) -> Option<PathBuf> {
     let folder = std::env::var_os("CONEFIELD_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"), PathBuf::from);
@@ -182,7 +182,7 @@ fn clinical_labels_agree_with_themselves_and_less_when_shifted() {
     assert!(mean > 0.3 && mean < 0.98, "{mean}");
 }
 
-/// A program of `sh` in `dir`.
+/// An `sh` program in `dir`.
 #[cfg(unix)]
 fn program(dir: &Path, name: &str, text: &str) -> String {
     use std::os::unix::fs::PermissionsExt;
@@ -192,7 +192,7 @@ fn program(dir: &Path, name: &str, text: &str) -> String {
     path.display().to_string()
 }
 
-/// A segmenter by threshold: this test's own program, started again with files instead of test names.
+/// A segmenter by threshold: this test's own program, started with files instead of test names.
 const THRESHOLD: &str = "CONEFIELD_TEST_THRESHOLD";
 
 /// Does nothing as a test; as a segmenter it reads `IN OUT LEVEL` and writes 1 where values are above the level.
@@ -210,7 +210,7 @@ fn threshold() {
 fn a_segmenter_sees_both_volumes_and_leaves_nothing() {
     let dir = tempdir().unwrap();
     let place = |name: &str| text(&dir.path().join(name));
-    // A ball of 0.8 in one of 0.4, and the same with the inner one larger.
+    // A ball of 0.8 in one of 0.4, and the same with a larger inner ball.
     let ball = |name: &str, inner: f64| {
         let v = Array3::from_shape_fn((24, 24, 24), |(x, y, z)| {
             let r = [x, y, z].iter().map(|&i| (i as f64 - 11.5).powi(2)).sum::<f64>().sqrt();

@@ -1,9 +1,9 @@
-//! What `explain` says.
+//! Output of `explain`.
 
 use crate::common::{done, json, refused, text};
 use tempfile::tempdir;
 
-/// Words of the line that begins with `head`.
+/// The words of the line that begins with `head`.
 fn line(all: &str, head: &str) -> String {
     let found = all.lines().find(|l| l.split_whitespace().next() == Some(head));
     found.unwrap_or_else(|| panic!("no line {head} in\n{all}")).split_whitespace().collect::<Vec<_>>().join(" ")
@@ -34,7 +34,7 @@ fn sets_and_json() {
     assert!(e["compiled"]["backend"].as_str().unwrap().starts_with("cpu"));
 }
 
-/// A key that excludes another one takes its place in nested stages, too.
+/// A key that excludes another one replaces it in nested stages, too.
 #[test]
 fn the_uppermost_layer_decides_in_stages_of_stages() {
     let said = done(&["explain", "field-tv", "--set", "methods.0.optimizer.decay={ exponential = 0.1 }"]);
@@ -54,13 +54,13 @@ fn a_scan_adds_its_memory() {
     let e = json(&["explain", "naf", "--scan", &scan, "--json"]);
     let m = &e["scan"]["memory"];
     assert_eq!(m["scan"], 4 * 4 * 8 * 12);
-    // Of 16 bytes a parameter half are moments; beside them stand 12 of the last good state.
+    // Half of the 16 bytes per parameter are moments; the last good state takes 12 more.
     let all = e["model_bytes"].as_u64().unwrap();
     assert_eq!([&m["model"], &m["optimizer"]].map(|n| n.as_u64().unwrap()), [all / 2, all / 2 + 12 * all / 16]);
-    // The volume is written as it is evaluated.
+    // The volume is written while it is evaluated.
     assert_eq!(m["volume"], 0);
     assert_eq!(e["scan"]["samples"], 320);
-    // Training that ends by held-out views keeps the parameters that predicted them best.
+    // Training that ends by held-out views also keeps the best parameters.
     let patient = "callbacks=['rollback', {type='patience', records=3}]";
     let e = json(&["explain", "naf", "--scan", &scan, "--set", patient, "--json"]);
     assert_eq!(e["scan"]["memory"]["optimizer"].as_u64().unwrap(), all / 2 + 16 * all / 16);
@@ -75,7 +75,7 @@ fn a_scan_adds_its_memory() {
 fn the_surround_of_the_volume_is_reported_and_removed() {
     let dir = tempdir().unwrap();
     let (scan, protocol) = (text(&dir.path().join("scan")), dir.path().join("protocol.toml"));
-    // A detector of a quarter of the published width.
+    // A detector with a quarter of the published width.
     let narrow = "dso = 5.0\ndsd = 7.0\ndetector = [32, 8]\nextent = { side = [4.0, 1.0] }\nangles = { even = { views = 12 } }\n";
     std::fs::write(&protocol, format!("{narrow}unit = {{ name = \"half side\", mm = 128.0 }}\n")).unwrap();
     done(&["simulate", "phantom:head:16", "-o", &scan, "--protocol", &text(&protocol)]);

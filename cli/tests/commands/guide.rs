@@ -1,4 +1,4 @@
-//! The guide's commands, run as the pages show them.
+//! Runs the guide's commands as shown on its pages.
 //!
 //! The `sh` blocks of a page run in order, in a folder of their own, except those below `<!-- not run: REASON -->`. A
 //! `toml` block below a line that begins with a file name in backticks is written to that file first.
@@ -15,7 +15,7 @@ const DARK: u16 = 120;
 /// A fenced block of a page.
 struct Block<'a> {
     language: &'a str,
-    /// The last line with text above it.
+    /// The last non-empty line above it.
     above: &'a str,
     text: String,
 }
@@ -57,7 +57,7 @@ fn pages() -> Vec<(String, String)> {
     pages
 }
 
-/// Writes the files and runs the commands of a page in `dir`; how many blocks ran.
+/// Writes the files and runs the commands of a page in `dir`; returns the number of blocks run.
 fn run(name: &str, page: &str, dir: &Path) -> usize {
     let program = Path::new(env!("CARGO_BIN_EXE_conefield"));
     let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
@@ -98,7 +98,7 @@ fn every_command_of_the_guide_works() {
     }
 }
 
-/// What a scanner would give: counts of the projections of a phantom, in the geometry of the page.
+/// Files of a scanner: counts of the projections of a phantom, in the geometry of the page.
 fn scanner_files(dir: &Path) {
     let simulated = text(&dir.join("simulated"));
     let [n, size] = ["24", "32x32"];
@@ -129,7 +129,7 @@ fn a_scan_comes_in_as_the_guide_says() {
     assert_eq!(run("scan-in", &page, dir.path()), 5);
     assert!(at("volume.mha").exists());
 
-    // The first look predicts the views that it has not seen, and a wrong direction does so worse.
+    // The quick test predicts held-out views; with a wrong direction it predicts them worse.
     let held_out = |run: &Path| -> f64 {
         let record = fs::read_to_string(run.join("record.json")).unwrap();
         serde_json::from_str::<serde_json::Value>(&record).unwrap()["held_out"].as_f64().unwrap()

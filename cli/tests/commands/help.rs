@@ -35,7 +35,7 @@ fn every_subcommand_has_help() {
         assert!(help.contains(&format!("Usage: conefield {c}")), "{help}");
         assert!(!help.contains("[OPTIONS]") || help.contains("--help"));
     }
-    // What a command leaves where stands in its help, not only in one line.
+    // The help of a command describes its output, in more than one line.
     for (command, words) in [
         ("tradeoff", "Candidates are drawn from levers"),
         ("reconstruct", "RUN receives volume.nii.gz"),
@@ -45,7 +45,7 @@ fn every_subcommand_has_help() {
         let help = done(&[command, "--help"]).split_whitespace().collect::<Vec<_>>().join(" ");
         assert!(help.contains(words), "{command}: {help}");
     }
-    // One line for every subcommand and for `help` itself: nothing is listed that is not tested here.
+    // One line per subcommand and for `help` itself: only tested commands are listed.
     let listed = all.lines().skip_while(|l| *l != "Commands:").skip(1).take_while(|l| !l.is_empty()).count();
     assert_eq!(listed, COMMANDS.len() + 1);
 }
@@ -59,7 +59,7 @@ fn lists_of_specs_and_stage_types_are_whole() {
         let help = done(&[command, "--help"]).split_whitespace().collect::<Vec<_>>().join(" ");
         assert!(help.contains(&format!("shipped spec ({}) or a file", names.join(", "))), "{command}: {help}");
     }
-    // Both tables are made by a command.
+    // A command generates both tables.
     for table in done(&["schema", "--tables"]).trim().split("\n\n") {
         let wanted = "docs/reference/methods-and-stages.md: put in what `conefield schema --tables` prints";
         assert!(page.contains(table), "{wanted}:\n{table}");
@@ -123,6 +123,6 @@ fn wrong_use_exits_with_2() {
         let said = refused(2, args);
         assert!(said.contains(want), "{args:?}: {said}");
     }
-    // Without a subcommand there is help instead.
+    // Without a subcommand the help is printed.
     conefield(&[]).assert().code(2);
 }

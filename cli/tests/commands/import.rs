@@ -1,4 +1,4 @@
-//! `conefield import` from files to a scan that the other commands read.
+//! `conefield import`: from files to a scan for the other commands.
 
 use crate::common::{done, json, refused, text};
 use ndarray::Array3;
@@ -19,7 +19,7 @@ fn counts_become_a_scan_that_the_other_commands_read() {
     fs::write(at("s.toml"), toml).unwrap();
     let (scanner, out) = (text(&at("s.toml")), text(&at("scan")));
 
-    // Without an open beam there is nothing to compare with, and nothing is left behind.
+    // Without an open beam the import is refused, and nothing is left behind.
     let said = refused(1, &["import", &scanner, "-o", &out]);
     assert!(said.contains("files.flat") && said.contains("--i0"), "{said}");
     assert!(!at("scan").exists());
@@ -34,7 +34,7 @@ fn counts_become_a_scan_that_the_other_commands_read() {
     let info = json(&["info", &out, "--json"]);
     assert_eq!((&info["views"], &info["detector"]), (&found["views"], &found["detector"]));
 
-    // A scan that stands there is not replaced unasked; air says the same as the number.
+    // An existing scan is replaced only with --force; air gives the same open beam as the number.
     assert!(refused(1, &["import", &scanner, "-o", &out, "--i0", "air"]).contains("--force"));
     let again = ["import", &scanner, "-o", &out, "--i0", "air", "--force"];
     let said = done(&again);
@@ -47,14 +47,14 @@ fn counts_become_a_scan_that_the_other_commands_read() {
         "{said}"
     );
     assert!(written.contains(&out), "{said}");
-    // The rest comes on request.
+    // The rest is printed with -v.
     let all = done(&[&again[..], &["-v"]].concat());
     assert!(
         all.starts_with(said.trim()) && all.contains("source_to_detector_mm") && all.contains("counts.bad"),
         "{all}"
     );
 
-    // Counts that are taken for line integrals get a warning, also when the scan is read later.
+    // Counts imported as line integrals cause a warning, also when the scan is read later.
     fs::write(at("s.toml"), format!("{toml}[values]\nkind = \"line-integrals\"\n")).unwrap();
     done(&["import", &scanner, "-o", &out, "--force"]);
     let complaint = "looks like intensities, not line integrals: pass --i0 or flat/dark";

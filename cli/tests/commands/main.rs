@@ -1,4 +1,4 @@
-//! Every command as a user runs it. One program for all: each program that is linked costs seconds.
+//! Tests of every command in one program, because linking each one costs seconds.
 
 #[path = "../common/mod.rs"]
 mod common;

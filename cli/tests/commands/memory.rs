@@ -1,4 +1,4 @@
-//! Memory: the estimate against what a run takes, refusal before anything is taken, and export beyond it.
+//! Memory: estimates compared with peaks, refusals before any allocation, and exports larger than memory.
 
 use crate::common::{done, json, refused, text};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
@@ -10,7 +10,7 @@ use std::time::Instant;
 
 const MIB: u64 = 1 << 20;
 
-/// A scan of `views` × `side` × `side` pixels, a box's shadow in each, for 32³ voxels.
+/// A scan of `views` × `side` × `side` pixels, each view with the shadow of a box, for 32³ voxels.
 fn scan(folder: &Path, views: usize, side: usize) -> PathBuf {
     scan_of(folder, views, side, 32)
 }
@@ -33,7 +33,7 @@ fn scan_of(folder: &Path, views: usize, side: usize, voxels: usize) -> PathBuf {
     path
 }
 
-/// What a run was estimated to take and what it took, in bytes.
+/// Estimate and peak of a run in bytes.
 fn measured(scan: &Path, run: &Path, spec: &str, sets: &[&str]) -> [u64; 2] {
     let (scan, run) = (text(scan), text(run));
     let mut args = vec!["reconstruct", &scan, "--spec", spec, "-o", &run, "--json", "--steps", "1"];
@@ -42,7 +42,7 @@ fn measured(scan: &Path, run: &Path, spec: &str, sets: &[&str]) -> [u64; 2] {
     [&record["memory"]["total"], &record["peak_bytes"]].map(|n| n.as_u64().unwrap())
 }
 
-/// The estimate is within 0.8 and 1.35 of the peak where the scan takes most and where the model does.
+/// The estimate is within 0.8 and 1.35 of the peak, both if the scan dominates and if the model does.
 #[test]
 #[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]
 fn the_estimate_is_near_the_measured_peak() {
@@ -74,7 +74,7 @@ fn the_estimate_is_near_the_peak_with_a_surround() {
     let dir = tempfile::tempdir().unwrap();
     let path = scan(dir.path(), 8, 64);
     let mut cut = conefield_io::read_scan(&path).unwrap();
-    // Without noise there is no prior, whose dual is much of what is held.
+    // Without noise there would be no prior, whose dual is a large part of the memory.
     cut.projections.iter_mut().enumerate().for_each(|(i, p)| *p = 1.5 + 1e-3 * f32::from((i * 7919 % 101) as u8));
     std::fs::remove_dir_all(&path).unwrap();
     conefield_io::write_scan(&path, &cut, None).unwrap();
@@ -85,7 +85,7 @@ fn the_estimate_is_near_the_peak_with_a_surround() {
     assert!((0.8..1.35).contains(&(estimate as f64 / peak as f64)), "{estimate} and {peak}");
 }
 
-/// Of methods on voxels as well, where the scan, the volume or both take most; FDK takes little but these two.
+/// The same for methods on voxels, where the scan, the volume or both dominate; FDK takes little else.
 #[test]
 #[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]
 fn the_estimate_is_near_the_peak_of_methods_on_voxels() {
@@ -100,7 +100,7 @@ fn the_estimate_is_near_the_peak_of_methods_on_voxels() {
             mib(estimate),
             mib(peak)
         );
-        // Of next to nothing the estimate is above the program's own size.
+        // For tiny problems the estimate exceeds the program's own size.
         let says = peak > 100 * MIB;
         assert!(!says || (0.8..1.35).contains(&ratio), "{spec}, {views} x {side}², {voxels}³: {estimate} and {peak}");
         peak
@@ -139,7 +139,7 @@ fn what_does_not_fit_is_refused_with_figures_before_anything_is_made() {
     }
     assert!(!dir.path().join("run").exists());
     assert!(start.elapsed().as_secs() < 20, "it was refused before work");
-    // What is offered does fit.
+    // The suggested reduction fits.
     let bits = said.split("tables of 2^").nth(1).unwrap().split(' ').next().unwrap();
     let fits = format!("encoder.log2_table_size={bits}");
     let more = ["--steps", "1", "--set", "encoder.levels=4"];
@@ -161,7 +161,7 @@ fn what_does_not_fit_is_refused_with_figures_before_anything_is_made() {
         assert!(said.contains("memory: needs ") && said.contains("--memory allows 20.0 MiB"), "{args:?}: {said}");
         assert!(!Path::new(&out).exists(), "{args:?}");
     }
-    // The detector is what is too large here.
+    // Here the detector is too large.
     let args = ["simulate", "phantom:head:16", "-o", &out, "--detector", "2048x2048", "--memory", "100MiB"];
     let said = refused(1, &args);
     assert!(said.contains(" views") && said.contains("a detector of 512x512 would fit"), "{said}");
@@ -176,7 +176,7 @@ fn an_export_of_large_layers_stays_within_its_memory() {
     let sets = ["--set", "encoder.levels=2", "--set", "field.width=8", "--set", "field.depth=2", "--steps", "2"];
     let (scan, run) = (text(&dir.path().join("scan")), text(&dir.path().join("run")));
     done(&[&["reconstruct", &scan, "--spec", "fast", "-o", &run, "--set", "field.skips=[]"], &sets[..]].concat());
-    // A gigabyte of address space, files of at most 20 MB.
+    // One GiB of address space, files of at most 20 MB.
     let limited = "ulimit -v 1048576; ulimit -f 20000; trap '' XFSZ; exec \"$0\" \"$@\"";
     let program = assert_cmd::cargo::cargo_bin("conefield");
     for name in ["x.npy", "x.nii"] {
@@ -193,7 +193,7 @@ fn an_export_of_large_layers_stays_within_its_memory() {
     }
 }
 
-/// A volume is written in less memory than half of it takes.
+/// Writing a volume takes less memory than half of the volume.
 #[test]
 #[cfg_attr(not(target_os = "linux"), ignore = "the peak is read from /proc")]
 fn an_export_does_not_hold_its_volume() {
@@ -215,7 +215,7 @@ fn an_export_does_not_hold_its_volume() {
     println!("volume {} MiB, {} MiB more than for a small one", volume / MIB, more / MIB);
     assert!(more < volume / 2, "{more} bytes more for {volume}");
     assert!(peak(&large) <= large["memory"]["total"].as_u64().unwrap());
-    // At the resolution of the run the voxels are those that the run wrote.
+    // At the resolution of the run, the voxels equal those that the run wrote.
     let run = conefield_io::read_volume(dir.path().join("run/volume.nii.gz")).unwrap();
     assert!(conefield_io::read_volume(dir.path().join("small.nii")).unwrap().data == run.data);
     let said = refused(1, &["export", &at("run"), "-o", &at("large.nii")]);

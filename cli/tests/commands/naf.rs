@@ -1,4 +1,4 @@
-//! NAF's pickle in and out of the whole program.
+//! NAF's pickle as input and output of the command.
 
 use crate::common::{done, json, refused, text};
 use std::fs;
@@ -27,7 +27,7 @@ fn a_pickle_is_recognized_by_its_content_and_converted_both_ways() {
     let r2 = json(&["info", &folder, "--json"]);
     assert_eq!((&r2["line_integrals"], &r2["truth"]), (&own["line_integrals"], &own["truth"]));
 
-    // Cut short, it is refused with the place in the file.
+    // A truncated file is refused with the position in the file.
     let bytes = fs::read(&pickle).unwrap();
     fs::write(&pickle, &bytes[..bytes.len() / 2]).unwrap();
     let said = refused(1, &["info", &pickle]);

@@ -1,11 +1,11 @@
-//! The data range that scores refer to: from the reference, where none is given, and said.
+//! The data range of scores: derived from the reference if not given, and reported.
 
 use crate::common::{conefield, json, text};
 use conefield_projectors::simulate::phantom;
 use serde_json::Value;
 use std::path::Path;
 
-/// A phantom in `[0, 1]` with an error that is the same everywhere but for its sign, both times `scale`.
+/// A phantom in `[0, 1]`, and the same with an error of constant size and varying sign, both times `scale`.
 fn pair(dir: &Path, scale: f32) -> [String; 2] {
     let truth = phantom(24).mapped(|x| scale * x);
     let mut found = truth.clone();
@@ -31,7 +31,7 @@ fn a_volume_scores_the_same_in_any_unit() {
     for scale in [0.02, 3000.0] {
         let [truth, found] = pair(dir.path(), scale);
         let [p, s, range] = scores(&found, &truth);
-        // The phantom does not reach 1: its own range is a little less.
+        // The phantom does not reach 1: its own range is slightly smaller.
         let share = range / f64::from(scale);
         assert!((0.5..=1.0).contains(&share), "x {scale}: {range}");
         let want = psnr + 20.0 * share.log10();
@@ -49,7 +49,7 @@ fn a_reference_in_another_unit_is_reported() {
     let ([truth, found], [_, other]) = (pair(dir.path(), 1.0), pair(dir.path(), 0.02));
     let said = |volume: &str| {
         let mut command = conefield(&[]);
-        // Without `--quiet`, which leaves warnings out.
+        // Without `--quiet`, which suppresses warnings.
         let program = command.get_program().to_owned();
         command = assert_cmd::Command::new(program);
         let output = command.args(["evaluate", volume, &truth]).output().unwrap();

@@ -1,4 +1,4 @@
-//! `conefield project`: the views that a scanner takes of a volume, and what measured ones have beside them.
+//! `conefield project`: predicted views of a volume, and their residuals.
 
 use crate::common::{done, json, refused, text};
 use conefield_core::geometry::View;
@@ -14,7 +14,7 @@ fn simulate(folder: &Path) -> String {
     scan
 }
 
-/// Whether the views are the same but for rounding: a file has an orbit's numbers.
+/// Whether the views are equal up to rounding: a file stores the numbers of an orbit.
 fn alike(a: &[View], b: &[View]) -> bool {
     let numbers = |v: &View| [v.source, v.detector, v.u, v.v].concat();
     let near = |(a, b): (&View, &View)| numbers(a).iter().zip(numbers(b)).all(|(a, b)| (a - b).abs() < 1e-9);
@@ -33,7 +33,7 @@ fn the_truth_explains_its_scan_and_nothing_else_does() {
     let truth = format!("{scan}/truth.nii.gz");
     let found = project(&truth, "true");
     let left = found["residual_relative"].as_f64().unwrap();
-    // Simulation samples twice a voxel, Joseph goes from plane to plane.
+    // The simulation samples twice per voxel; Joseph interpolates from plane to plane.
     assert!(left > 0.0 && left < 0.02, "{found}");
     assert_eq!(found["views"], 7);
     assert_eq!(found["residual_rms_of_views"].as_array().unwrap().len(), 7);
@@ -48,7 +48,7 @@ fn the_truth_explains_its_scan_and_nothing_else_does() {
         .sqrt();
     assert!((rms / found["residual_rms"].as_f64().unwrap() - 1.0).abs() < 1e-6);
 
-    // Half as dense leaves half of it, all but exactly.
+    // Half the density leaves half of the line integrals, almost exactly.
     let mut half = read_volume(&truth).unwrap();
     half.data.mapv_inplace(|x| 0.5 * x);
     write_volume(at("half.nii.gz"), &half).unwrap();
@@ -101,7 +101,7 @@ fn bad_input_is_refused_before_anything_is_written() {
         let said = run(volume, like, more);
         assert!(said.contains(want), "{more:?}: {said}");
     }
-    // What is read is not replaced, whatever is forced.
+    // An input is never replaced, even with --force.
     let said = refused(1, &["project", &truth, "--like", &scan, "-o", &scan, "--force"]);
     assert!(said.contains("this command reads"), "{said}");
     let said = refused(1, &["--memory", "1MiB", "project", &truth, "--like", &scan, "-o", &out]);

@@ -1,10 +1,10 @@
-//! Shipped neural specs make a volume that is worth something on the CPU: a head of 64³ voxels from 20 views, few steps
-//! on smaller tables and fewer samples than the specs ask for.
+//! Shipped neural specs give a useful volume on the CPU: a head of 64³ voxels from 20 views, with fewer steps, smaller
+//! tables and fewer samples than in the specs.
 
 use crate::common::{done, json, text};
 use conefield::specs::SHIPPED;
 
-/// A volume of zeros has this PSNR.
+/// PSNR of a volume of zeros.
 const EMPTY: f64 = 13.04;
 
 const FEW: &[&str] = &["training.rays=256"];
@@ -19,10 +19,10 @@ const WINDOW: &[&str] = &[
     "optimizer.lr=5e-3",
     "encoder.log2_table_size=14",
 ];
-/// The wide network of `nerf` takes many minutes for a volume better than an empty one.
+/// The wide network of `nerf` takes many minutes to get better than an empty volume.
 const TOO_SLOW: [&str; 1] = ["nerf"];
 
-/// Steps, settings, and the least PSNR in dB, at least one below what was measured.
+/// Steps, settings, and the required PSNR in dB, at least 1 dB below the measured one.
 const RUNS: [(&str, u32, &[&str], f64); 10] = [
     ("fast", 150, FEW, 20.0),
     ("balanced", 150, FEW, 17.5),
@@ -41,7 +41,7 @@ fn every_shipped_field_makes_a_volume() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| text(&dir.path().join(name));
     done(&["simulate", "phantom:head:64", "-o", &at("scan"), "--views", "20", "--detector", "64x64"]);
-    // A chain's field is that of a spec of its own.
+    // The field of a chain has its own spec.
     let has_field =
         |name: &str| json(&["explain", name, "--json"])["stages"].as_array().is_some_and(|stages| !stages.is_empty());
     let untried =

@@ -1,10 +1,10 @@
-//! Bad input ends with status 1 and one message that names the file, the field, what is there and what should be.
+//! Bad input ends with status 1 and one message that names the file, the field, the value found and the value expected.
 
 use crate::common::{refused, text};
 use std::fs;
 use tempfile::tempdir;
 
-/// Explaining a spec of this text is refused with this message.
+/// Explaining this spec is refused with this message.
 fn refused_spec(spec: &str, want: &str) {
     let dir = tempdir().unwrap();
     let path = dir.path().join("mine.toml");
@@ -78,7 +78,7 @@ fn settings_out_of_range_are_reported_with_their_line() {
 
 #[test]
 fn impossible_widths_are_refused() {
-    // A skip layer past the last one.
+    // A skip layer after the last layer.
     refused_spec("extends = \"naf\"\n[field]\nskips = [9]\n", "field.skips");
 }
 

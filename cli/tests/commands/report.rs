@@ -1,4 +1,4 @@
-//! `conefield report`: the page holds what the runs' files have, and a browser shows it.
+//! `conefield report`: the page contains the data of the runs' files, and a browser shows it.
 
 use crate::common::{done, json, refused, text};
 use base64::Engine as _;
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use tempfile::{TempDir, tempdir};
 
-/// A scan, and a run of it that knows its reference.
+/// A scan, and a run with a reference.
 fn run(spec: &str, more: &[&str]) -> (TempDir, String, String) {
     let dir = tempdir().unwrap();
     let [scan, run] = ["scan", "run"].map(|name| text(&dir.path().join(name)));
@@ -26,7 +26,7 @@ fn reconstruct(scan: &str, spec: &str, run: &str, more: &[&str]) {
     done(&[&all[..], more].concat());
 }
 
-/// The parts of a page that is in the file `path`.
+/// Parts of the page in the file `path`.
 struct Page {
     html: String,
     data: Value,
@@ -44,7 +44,7 @@ impl Page {
         rest.split_once("</script>").unwrap().0
     }
 
-    /// The values of a volume, [x, y, z], and the step that they have.
+    /// The values of a volume, [x, y, z], and their quantization step.
     fn volume(&self, index: usize) -> (Array3<f64>, f64) {
         let volume = &self.data["volumes"][index];
         let number = |key: &str| volume[key].as_f64().unwrap();
@@ -64,7 +64,7 @@ impl Page {
     }
 }
 
-/// Whether the volume in the page is the one in the file.
+/// Checks that the volume in the page is the one in the file.
 fn holds(page: &Page, index: usize, file: &str) {
     let (found, step) = page.volume(index);
     let want = read_volume(file).unwrap().data;
@@ -102,7 +102,7 @@ fn the_page_holds_what_the_files_have_and_fetches_nothing() {
     let lines = fs::read_to_string(format!("{run}/metrics.jsonl")).unwrap();
     assert_eq!(shown["curves"].as_array().unwrap().len(), lines.lines().count());
 
-    // Projections: those of `project`, and which view was held out.
+    // Projections: those of `project`, and the held-out view.
     let views = &page.data["scans"][0]["views"];
     let numbers: Vec<u64> = views.as_array().unwrap().iter().map(|v| v["view"].as_u64().unwrap()).collect();
     assert_eq!(numbers, [0, 1, 3, 4, 6, 7]);
@@ -128,7 +128,7 @@ fn the_page_holds_what_the_files_have_and_fetches_nothing() {
     }
     assert!(page.data["scans"][0]["geometry"].as_str().unwrap().starts_with("data:image/png;base64,"));
 
-    // Nothing of it is fetched: the policy forbids it, and no element asks for it.
+    // The page fetches nothing: the policy forbids it, and no element requests it.
     assert!(page.html.contains("content=\"default-src 'none'; script-src 'unsafe-inline'"));
     let (mut rest, mut scripts) = (&page.html[..], 0);
     loop {
@@ -148,12 +148,12 @@ fn runs_stand_beside_each_other() {
     let (dir, scan, first) = run("fdk", &[]);
     let at = |name: &str| text(&dir.path().join(name));
     let out = at("page.html");
-    // Two of one name are distinguished by their folders.
+    // Runs with the same name are distinguished by their folders.
     reconstruct(&scan, "fdk", &at("again"), &[]);
     done(&["report", &first, &at("again"), "-o", &out]);
     assert_eq!(Page::read(out.as_ref()).names("runs"), ["run", "again"]);
 
-    // A comparison has all its runs; what takes too much room is coarsened, also the reference.
+    // A comparison adds all its runs; volumes that are too large are coarsened, including the reference.
     done(&["compare", &scan, "--specs", "fdk,cgls", "-o", &at("compared"), "--steps", "2", "--reference", "truth"]);
     let said = done(&["report", &at("compared"), "-o", &out, "--force", "--embed", "40KiB", "--views", "2"]);
     assert!(said.contains("means of 2 x 2 x 2 voxels") && said.contains("2 runs, 3 volumes, 1 view "), "{said}");
@@ -165,7 +165,7 @@ fn runs_stand_beside_each_other() {
         let block = truth.slice(ndarray::s![2 * x..2 * x + 2, 2 * y..2 * y + 2, 2 * z..2 * z + 2]);
         assert!((block.mean().map(f64::from).unwrap() - mean).abs() <= step, "{x} {y} {z}");
     }
-    // Without its scan a run still shows its volume; with another one it is refused.
+    // Without its scan a run still shows its volume; another scan is refused.
     fs::rename(&scan, at("moved")).unwrap();
     let said = done(&["report", &first, "-o", &out, "--force"]);
     assert!(said.contains("no longer at") && said.contains("the reference truth is not there"), "{said}");
@@ -234,33 +234,33 @@ fn bad_input_is_refused_before_anything_is_written() {
         let said = refused(1, args);
         assert!(said.contains(want) && !Path::new(&out).exists(), "{args:?}: {said}");
     }
-    // A reference of another shape is no reference.
+    // A volume of another shape is not accepted as a reference.
     let mut small = read_volume(format!("{scan}/truth.nii.gz")).unwrap();
     small.data = Array3::zeros((8, 8, 8));
     small.grid.shape = [8; 3];
     write_volume(at("small.nii"), &small).unwrap();
     let said = refused(1, &["report", &run, "-o", &out, "--reference", &at("small.nii")]);
     assert!(said.contains("[24, 24, 24]"), "{said}");
-    // What is there stays, and what is read stays whatever is forced.
+    // Existing files stay; inputs stay even with --force.
     fs::write(&out, "mine").unwrap();
     assert!(refused(1, &["report", &run, "-o", &out]).contains("--force"));
     assert_eq!(fs::read_to_string(&out).unwrap(), "mine");
     let link = format!("{run}/page.html");
     fs::write(&link, "within").unwrap();
     assert!(refused(1, &["report", &run, "-o", &link, "--force"]).contains("which this command reads"));
-    // A record of something else.
+    // An invalid record.
     fs::write(format!("{run}/record.json"), "{\"version\": 1}").unwrap();
     assert!(refused(1, &["report", &run, "-o", &out, "--force"]).contains("record.json: JSON"));
 }
 
-/// A browser without a window.
+/// A headless browser.
 fn browser() -> Option<PathBuf> {
     let paths = std::env::var_os("PATH")?;
     let names = ["chromium", "chromium-browser", "google-chrome", "chrome"];
     std::env::split_paths(&paths).flat_map(|folder| names.map(|n| folder.join(n))).find(|p| p.is_file())
 }
 
-/// The document once its scripts have run, opened at `address`.
+/// The document after its scripts have run, opened at `address`.
 fn shown(browser: &Path, profile: &Path, address: &str) -> String {
     let out = Command::new(browser)
         .args(["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"])

@@ -1,4 +1,4 @@
-//! A run that is killed or interrupted goes on to the same bits.
+//! A killed or interrupted run resumes to the same bits.
 use crate::common::{done, refused, text};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 const SETTINGS: [&str; 4] =
     ["encoder.levels=2", "encoder.log2_table_size=10", "training.rays=48", "training.report_every=7"];
 
-/// A scan of 8 views, made once a test.
+/// A scan of 8 views, made once per test.
 fn scan(dir: &Path) -> PathBuf {
     let path = dir.join("scan");
     done(&["simulate", "phantom:head:16", "-o", &text(&path), "--views", "8", "--detector", "16x16"]);
@@ -17,7 +17,7 @@ fn scan(dir: &Path) -> PathBuf {
 fn arguments(scan: &Path, run: &Path, steps: u64, more: &[&str]) -> Vec<String> {
     let mut all: Vec<String> =
         ["reconstruct", &text(scan), "--spec", "ni-naf", "-o", &text(run)].map(Into::into).into();
-    // The mask removes channels on the way: what it decided must come back too.
+    // The mask removes channels during the run: its decision must be restored too.
     all.extend(["--steps".into(), steps.to_string(), "--set".into(), "projector.samples=16".into()]);
     all.extend(["--set".into(), "callbacks.1.epoch=3".into()]);
     for s in SETTINGS {
@@ -77,7 +77,7 @@ fn ten_kills_at_random_moments_change_nothing() {
         child.kill().unwrap();
         let ended = child.wait().unwrap();
         if ended.success() {
-            // It was done before the blow fell: once more from the start.
+            // The run finished before the kill: repeat from the start.
             same_results(&whole, &killed);
         } else {
             kills += 1;
@@ -117,7 +117,7 @@ fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
     }
 }
 
-/// Three methods, whose last two volumes make the mean: a field of 140 steps with 20 records, and 300 passes twice.
+/// Three methods with the mean of the last two volumes: a field with 140 steps and 20 records, then twice 300 passes.
 const THREE: &str = r#"
 type = "chain"
 name = "three"
@@ -144,7 +144,7 @@ pull = 0.01
 stop = { passes = 300 }
 "#;
 
-/// Passes over voxels too, in a run of their own and in each method of a chain: no record is lost and none comes twice.
+/// The same for passes over voxels, alone and in each method of a chain: no record is lost or repeated.
 #[test]
 fn interrupted_passes_lose_no_record() {
     let dir = tempfile::tempdir().unwrap();
@@ -179,7 +179,7 @@ fn interrupted_passes_lose_no_record() {
                 assert!(read(&whole) == read(&run), "{name} after {after} records: {file} differs");
             }
             assert_eq!(losses(&whole), losses(&run), "{name} after {after} records");
-            // It went on where it stood: what was there already was not made again.
+            // The run continued where it stopped: existing records were not made again.
             assert!(before >= after && lines() > before, "{before} records, then {}", lines());
             let record = |run: &Path| -> serde_json::Value {
                 serde_json::from_str(&std::fs::read_to_string(run.join("record.json")).unwrap()).unwrap()
@@ -216,7 +216,7 @@ fn another_run_s_checkpoint_and_none_are_refused_in_words() {
     assert!(said.contains("spec") && said.contains("lr = 0.5"), "{said}");
     let said = resume(9, &[]);
     assert!(said.contains("limits"), "{said}");
-    // The same projections, taken elsewhere.
+    // The same projections in another geometry.
     let place = scan.join("scan.toml");
     let original = std::fs::read_to_string(&place).unwrap();
     let moved = original.replace("\ndso = ", "\ndso = 1");

@@ -1,4 +1,4 @@
-//! The schema for editors is what the program knows now.
+//! The schema files for editors are current.
 
 use crate::common::done;
 use serde_json::Value;

@@ -1,5 +1,4 @@
-//! Part of a scan, by `import` and by `convert`: as slicing the arrays gives it, to the bit, with the geometry of that
-//! part.
+//! Part of a scan, by `import` and by `convert`: bit-identical to slicing the arrays, with the geometry of that part.
 
 use crate::common::{done, refused, text};
 use ndarray::{Array2, Array3, s};
@@ -11,7 +10,7 @@ const SCANNER: &str = "format = \"conefield-scanner\"\nversion = 1\nfiles.projec
     volume = { shape = [8, 8, 8], spacing = [2.0, 2.0, 2.0] }\n[circle]\ndso = 100.0\ndsd = 150.0\n\
     pixel = { u = 2.0, v = 3.0 }\noffset = { u = 1.0, v = 0.5 }\nrange_deg = 360.0\ndirection = \"clockwise\"\n";
 
-/// Counts of 12 views of 10 rows and 16 columns, each pixel with a number of its own.
+/// Counts of 12 views of 10 rows and 16 columns, each pixel with its own number.
 fn described(dir: &Path) {
     let counts = Array3::from_shape_fn((12, 10, 16), |(v, r, c)| (2000 + 131 * v + 17 * r + 3 * c * c) as u16);
     ndarray_npy::write_npy(dir.join("counts.npy"), &counts).unwrap();
@@ -41,11 +40,11 @@ fn import_and_convert_take_the_same_part() {
             let there = b.views[6].pixel(b.detector, row + 1.0, column + 2.0);
             assert!((0..3).all(|k| (here[k] - there[k]).abs() < 1e-9), "{name}: {here:?} {there:?}");
         }
-        // Still a circle about the axis: the piece is an offset of its detector.
+        // Still a circle about the axis: the crop is an offset of the detector.
         assert!(fs::read_to_string(at(name).join("scan.toml")).unwrap().contains("[orbit]"), "{name}");
     }
 
-    // Larger pixels: of counts the mean of the light, of line integrals their mean.
+    // Larger pixels: for counts the mean light, for line integrals their mean.
     let (light, mean) = (text(&at("light")), text(&at("mean")));
     done(&["import", &scanner, "-o", &light, "--bin", "2"]);
     done(&["convert", &whole, &mean, "--bin", "2"]);
@@ -56,7 +55,7 @@ fn import_and_convert_take_the_same_part() {
     assert!((light.projections[[3, 2, 3]] - want).abs() < 1e-6);
     assert_eq!(mean.projections[[3, 2, 3]], block.sum() / 4.0);
 
-    // Turned images: twice a quarter is both flips.
+    // Rotated images: two quarter turns equal both flips.
     let (half, flips) = (text(&at("half")), text(&at("flips")));
     done(&["convert", &whole, &half, "--turns", "2"]);
     done(&["import", &scanner, "-o", &flips, "--flip-rows", "--flip-columns"]);
@@ -136,7 +135,7 @@ fn angles_and_vectors_come_from_files() {
     refuse(&angles("../angles.txt"), &["circle.angles_deg", "without \"..\""]);
     refuse(&vectors("angles.npy"), &["angles.npy", "shape", "[12]", "[views, 12]"]);
 
-    // A detector that is tilted: by the description as by the library.
+    // A tilted detector: the description matches the library.
     fs::write(at("f.toml"), SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { u = 0.5, normal = -2.0 }"))
         .unwrap();
     done(&["import", &text(&at("f.toml")), "-o", &text(&at("out")), "--force"]);

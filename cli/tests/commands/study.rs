@@ -1,4 +1,4 @@
-//! `study`: methods on scans with seeds, interrupted, shared and made again.
+//! `study`: methods on scans with several seeds, interrupted, shared and repeated.
 
 use crate::common::{conefield, done, json, refused, text};
 use serde_json::Value;
@@ -23,7 +23,7 @@ noise = 'poisson:1e4'
 steps = 3
 ";
 
-/// A study's file in a folder of its own.
+/// A study's file in its own folder.
 fn study(text: &str) -> (TempDir, PathBuf) {
     let dir = tempdir().unwrap();
     let path = dir.path().join("tiny.toml");
@@ -35,7 +35,7 @@ fn read(path: &Path) -> Value {
     serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap()
 }
 
-/// When every file below `folder` was last written.
+/// Modification time of every file below `folder`.
 fn times(folder: &Path) -> Vec<(PathBuf, SystemTime)> {
     let mut all = vec![];
     for entry in fs::read_dir(folder).unwrap().map(|e| e.unwrap()) {
@@ -48,7 +48,7 @@ fn times(folder: &Path) -> Vec<(PathBuf, SystemTime)> {
     all
 }
 
-/// What a table says but for seconds, memory and places.
+/// The content of a table except times, memory and paths.
 fn results(table: &Value) -> Value {
     let mut table = table.clone();
     let timed = ["train_s", "export_s", "total_s", "samples_per_s", "peak_bytes", "run"];
@@ -80,19 +80,19 @@ fn tables_pictures_and_records_agree_and_resume_repeats_nothing() {
             assert_eq!(run[key], record[key], "{key}");
         }
         assert_eq!((&run["status"], &record["reference"]), (&"done".into(), &"truth".into()));
-        // Noise and start are of the cell's seed, the scan has its number of views.
+        // Noise and method use the cell's seed; the scan has the requested number of views.
         let case = run["case"].as_str().unwrap();
         let scan = fs::read_to_string(out.join(format!("scans/{case}-seed{}/scan.toml", run["seed"]))).unwrap();
         assert!(scan.contains(&format!("seed = {}", run["seed"])), "{scan}");
         assert_eq!(record["scan"]["views"], case["head-".len()..].trim_end_matches("views").parse::<u64>().unwrap());
     }
-    // Another seed is another noise.
+    // Another seed gives other noise.
     let psnr = |case: &str, seed: u64, method: &str| {
         let same = |r: &&Value| r["case"] == case && r["seed"] == seed && r["method"] == method;
         runs.iter().find(same).unwrap()["scores"]["psnr"].as_f64().unwrap()
     };
     assert_ne!(psnr("head-6views", 0, "fdk"), psnr("head-6views", 1, "fdk"));
-    // Mean, deviation and paired difference, by hand.
+    // Mean, deviation and paired difference, computed by hand.
     let line = |case: &str, method: &str| {
         let all = table["summary"].as_array().unwrap();
         all.iter().find(|l| l["case"] == case && l["method"] == method).unwrap().clone()
@@ -117,7 +117,8 @@ fn tables_pictures_and_records_agree_and_resume_repeats_nothing() {
         assert!(image::open(out.join(picture)).unwrap().width() > 500, "{picture}");
     }
 
-    // A run that was interrupted before its first checkpoint, a seed and a method more; the rest stays as it is.
+    // A run that was interrupted before its first checkpoint, an added seed and an added method; the rest stays
+    // unchanged.
     let before = times(&out.join("runs/head-6views-seed0"));
     let scans = times(&out.join("scans"));
     fs::remove_dir_all(out.join("runs/head-8views-seed1/SIRT")).unwrap();
@@ -135,7 +136,7 @@ fn tables_pictures_and_records_agree_and_resume_repeats_nothing() {
         .find(|r| r["case"] == "head-8views" && r["method"] == "SIRT" && r["seed"] == 1);
     assert_eq!(found.unwrap()["scores"]["psnr"], psnr("head-8views", 1, "SIRT"));
 
-    // What is there belongs to its study.
+    // Existing content must belong to the study.
     let before = times(&out);
     for (from, to, want) in [
         ("steps = 3", "steps = 4", "--resume: limits"),
@@ -162,7 +163,7 @@ fn scans_are_taken_as_they_are_and_a_failed_run_is_a_row() {
     fs::create_dir(dir.path().join("a")).unwrap();
     done(&["simulate", "phantom:head:16", "-o", &text(&scan), "--views", "8", "--detector", "16x16"]);
     fs::write(dir.path().join("a/off.toml"), "extends = 'sirt'\nname = 'off'\nstart = 'none.nii'\n").unwrap();
-    // Paths are relative to the file, not to where the command runs.
+    // Paths are relative to the file, not to the working directory.
     let whole = "scans = ['a/scan']\nspecs = ['fdk', 'a/off.toml']\nseeds = [4, 5]\n[protocol]\nsteps = 2\nreference = 'truth'\nhold_out = 'every:4'\n";
     fs::write(&file, whole).unwrap();
     let out = dir.path().join("out");
@@ -178,7 +179,7 @@ fn scans_are_taken_as_they_are_and_a_failed_run_is_a_row() {
     assert!(table["summary"][0]["figures"]["held_out"]["mean"].as_f64().unwrap() > 0.0);
     let markdown = fs::read_to_string(out.join("table.md")).unwrap();
     assert!(markdown.contains("| off | 0 of 2 |") && markdown.contains("| scan-seed5/off | failed |"), "{markdown}");
-    // What failed is tried again and what is done is not.
+    // Failed runs are repeated; finished ones are not.
     let before = times(&out.join("runs/scan-seed4/fdk"));
     fs::write(dir.path().join("a/off.toml"), "extends = 'sirt'\nname = 'off'\n").unwrap();
     let mended = json(&["study", &text(&file), "-o", &text(&out), "--resume", "--json"]);
@@ -209,7 +210,7 @@ fn bad_studies_make_no_folder() {
     }
     let said = refused(2, &["study", "s", "-o", "r", "--shard", "3/2"]);
     assert!(said.contains("K from 1 to N"), "{said}");
-    // A folder in which the study's file lies is no place for its results.
+    // A folder that contains the study's file is refused for its results.
     fs::write(&file, TINY).unwrap();
     let said = refused(1, &["study", &text(&file), "-o", &text(dir.path())]);
     assert!(said.contains("in it"), "{said}");
@@ -221,7 +222,7 @@ fn start(file: &Path, out: &Path, more: &[&str]) -> Child {
     command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
-/// Waits until `path` holds something.
+/// Waits until `path` has content.
 fn await_file(path: &Path) {
     let until = Instant::now() + Duration::from_secs(60);
     while fs::metadata(path).map_or(0, |m| m.len()) == 0 {
@@ -243,7 +244,7 @@ fn shards_come_to_the_serial_table_whatever_kills_them() {
     let kill = |signal: &str, child: &Child| {
         assert!(Command::new("sh").arg("-c").arg(format!("kill -{signal} {}", child.id())).status().unwrap().success());
     };
-    // Interrupted by Ctrl-C and gone on with.
+    // Interrupted by Ctrl-C and resumed.
     let serial = dir.path().join("serial");
     let first = start(file, &serial, &[]);
     await_file(&serial.join("runs/head-6views-seed0/SIRT/metrics.jsonl"));
@@ -259,11 +260,11 @@ fn shards_come_to_the_serial_table_whatever_kills_them() {
     done(&["study", &text(file), "-o", &text(&serial), "--resume"]);
     assert_eq!(times(&serial.join("runs/head-6views-seed0/fdk")), before);
 
-    // Two at a time in one folder, one of them killed and begun again.
+    // Two processes at a time in one folder; one is killed and restarted.
     let shared = dir.path().join("shared");
     let shares = ["1/2", "2/2"].map(|s| start(file, &shared, &["--shard", s]));
     await_file(&shared.join("runs/head-6views-seed0/SIRT/metrics.jsonl"));
-    // Who works alone keeps out while others share.
+    // An exclusive user is refused while others share.
     let said = refused(1, &["study", &text(file), "-o", &text(&shared), "--resume"]);
     assert!(said.contains("another conefield is writing"), "{said}");
     let [one, two] = shares;
@@ -288,7 +289,7 @@ fn a_script_for_slurm_names_every_share() {
     done(&["study", &text(&file), "-o", &text(&out), "--slurm", &text(&script), "--jobs", "3"]);
     let written = fs::read_to_string(&script).unwrap();
     assert!(written.contains("#SBATCH --array=1-3\n"), "{written}");
-    // The shell of a cluster runs it as it stands.
+    // The script runs unchanged in a shell.
     for k in 1..=3 {
         let status = Command::new("bash").arg(&script).env("SLURM_ARRAY_TASK_ID", k.to_string()).output().unwrap();
         assert!(status.status.success(), "{}", String::from_utf8_lossy(&status.stderr));

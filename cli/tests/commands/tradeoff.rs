@@ -1,4 +1,4 @@
-//! `tradeoff`: halving, a front that nothing dominates, specs that run, and `--resume` that repeats nothing.
+//! `tradeoff`: halving, a front without dominated points, specs that run, and `--resume` without repetition.
 
 use crate::common::{conefield, done, json, refused, text};
 use serde_json::Value;
@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use tempfile::{TempDir, tempdir};
 
-/// Three bases on voxels and one field, small enough for a budget of seconds.
+/// Three voxel bases and one field, small enough for budgets of seconds.
 const LEVERS: &str = r#"
 [[base]]
 spec = "fdk"
@@ -21,7 +21,7 @@ spec = "tiny.toml"
 "#;
 const TINY: &str = "extends = \"fast\"\nname = \"tiny\"\n[encoder]\nlevels = 3\nlog2_table_size = 10\n[projector]\nsamples = 24\n[training]\nrays = 64\n[[priors]]\ntype = \"total-variation\"\nweight = 0.02\nblocks = 4\n";
 
-/// A small scan and levers in a folder of their own.
+/// A small scan and levers in a folder.
 fn made() -> (TempDir, PathBuf, PathBuf) {
     let dir = tempdir().unwrap();
     let (scan, levers) = (dir.path().join("scan"), dir.path().join("levers.toml"));
@@ -58,7 +58,7 @@ fn halving_front_and_specs_agree() {
     let candidates: Vec<_> = found["search"]["candidates"].as_array().unwrap().iter().map(|c| &c["name"]).collect();
     assert_eq!(candidates, ["fdk", "os-sart", "tiny", "fdk-1", "os-sart-1"]);
 
-    // Of four methods on voxels two go on, and the one field; what had too little time goes on as well.
+    // Two of four voxel methods and the one field advance, and so do candidates that had too little time.
     let trials = found["trials"].as_array().unwrap();
     let rungs = found["rungs"].as_array().unwrap();
     let at = |budget: f64| trials.iter().filter(move |t| t["budget_s"] == budget);
@@ -81,7 +81,7 @@ fn halving_front_and_specs_agree() {
     assert_eq!(rungs[1]["tried"], rungs[0]["kept"]);
     assert!(names(&rungs[1]["kept"]).is_empty());
 
-    // No point dominates one of the front, in the reported figures.
+    // No point dominates one of the front, by the reported figures.
     let points = found["points"].as_array().unwrap();
     let number = |p: &Value, key: &str| p[key].as_f64().unwrap();
     for name in names(&found["front"]) {
@@ -93,7 +93,7 @@ fn halving_front_and_specs_agree() {
             assert!(!no_worse || (same && costs.iter().all(|(q, p)| q == p)), "{p} is dominated by {q}");
         }
     }
-    // One rank correlation a budget, over what has both figures.
+    // One rank correlation per budget, over trials with both figures.
     let ranking = found["ranking"].as_array().unwrap();
     assert_eq!(ranking.len(), 2);
     for r in ranking {
@@ -106,7 +106,7 @@ fn halving_front_and_specs_agree() {
     let table = fs::read_to_string(out.join("tradeoff.md")).unwrap();
     assert!(table.starts_with("| front | budget | PSNR dB |") && table.contains("rank correlation"), "{table}");
 
-    // Every spec reads back whole, and one runs for as many steps as its trial did.
+    // Every spec can be read back, and one runs for as many steps as its trial.
     let mut specs = 0;
     for entry in fs::read_dir(out.join("front")).unwrap() {
         let path = entry.unwrap().path();
@@ -122,7 +122,7 @@ fn halving_front_and_specs_agree() {
     let again = json(&["reconstruct", &text(&scan), "--spec", &spec, "-o", &text(&dir.path().join("again")), "--json"]);
     assert_eq!(again["steps"].as_f64(), point["steps"].as_f64());
 
-    // The front is picked from.
+    // A method is chosen from the front.
     let run = dir.path().join("picked");
     let front = text(&out.join("front.toml"));
     let picked = json(&["reconstruct", &text(&scan), "--budget", "4s", "--front", &front, "-o", &text(&run), "--json"]);
@@ -179,7 +179,7 @@ fn a_search_that_was_interrupted_repeats_no_finished_trial() {
     let said = refused(1, &words(&first));
     assert!(said.contains("an earlier search"), "{said}");
     let found = json(&words(&line(&scan, &levers, &out, &["--reference", "truth", "--resume", "--json"])));
-    // Times of every finished trial are those that were measured then.
+    // Finished trials keep their measured times.
     assert_eq!(found["trials"].as_array().unwrap()[..before.len()], before[..]);
     assert!(found["trials"].as_array().unwrap().len() >= 8 && out.join("front.png").exists());
     // The search is complete: nothing runs again, and the front is the same.

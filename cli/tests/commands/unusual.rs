@@ -22,10 +22,10 @@ const SMALL: [&str; 10] = [
     "2",
 ];
 
-/// A short scan in uneven steps, in degrees.
+/// A short scan with uneven steps, in degrees.
 const ANGLES: [f64; 13] = [-20.0, -2.5, 10.0, 31.0, 40.0, 62.0, 75.0, 94.0, 110.0, 126.0, 149.0, 170.0, 188.0];
 
-/// 12 × 9 × 7 voxels of 4 × 6 × 5 mm, an ellipsoid off the middle.
+/// 12 × 9 × 7 voxels of 4 × 6 × 5 mm, with an off-centre ellipsoid.
 fn volume() -> Volume {
     let grid = VoxelGrid { shape: [12, 9, 7], spacing: [4.0, 6.0, 5.0], center: [0.0; 3] };
     let data = Array3::from_shape_fn((12, 9, 7), |(x, y, z)| {
@@ -41,7 +41,7 @@ struct Bench {
 }
 
 impl Bench {
-    /// The volume and a scan of it by a shifted detector of 14 × 22.
+    /// The volume and a scan of it with a shifted detector of 14 × 22 pixels.
     fn new() -> Self {
         let bench = Self { dir: tempdir().unwrap() };
         write_volume(bench.at("truth.mha"), &volume()).unwrap();
@@ -65,7 +65,7 @@ impl Bench {
     }
 }
 
-/// Numbers that agree to a relative 1e-6.
+/// Checks that numbers agree to a relative 1e-6.
 fn near(a: &Value, b: &Value, what: &str) {
     match (a, b) {
         (Value::Array(x), Value::Array(y)) if x.len() == y.len() => x.iter().zip(y).for_each(|(a, b)| near(a, b, what)),
@@ -79,7 +79,7 @@ fn near(a: &Value, b: &Value, what: &str) {
     }
 }
 
-/// What every format keeps.
+/// Facts that every format preserves.
 const KEPT: [&str; 13] = [
     "views",
     "detector",
@@ -180,7 +180,7 @@ fn reconstruction_pretraining_and_scores_take_it() {
     near(&found["spacing_mm"], &json!([4.0, 6.0, 5.0]), "spacing");
     let scores = json(&["evaluate", &b.at("run/volume.nii.gz"), &truth, "--json", "--png", &b.at("e.png")]);
     near(&scores["psnr"], &record["scores"]["psnr"], "psnr");
-    // A scan that comes by way of RTK is the same scan.
+    // A scan converted through RTK is the same scan.
     let volumes = ["scan", "rtk"].map(|name| {
         let (scan, run) = (b.at(name), b.at(&format!("run-{name}")));
         let mut args = vec!["reconstruct", &scan, "--spec", "fast", "-o", &run];
@@ -188,7 +188,7 @@ fn reconstruction_pretraining_and_scores_take_it() {
         done(&args);
         read_volume(b.at(&format!("run-{name}/volume.nii.gz"))).unwrap()
     });
-    // The one goes out in the data set's own unit, the other in 1/mm.
+    // One is written in the data set's own unit, the other in 1/mm.
     let unit = b.info("scan")["unit"]["mm"].as_f64().unwrap() as f32;
     let highest = volumes[0].data.iter().copied().fold(0.0, f32::max);
     for (a, b) in volumes[0].data.iter().zip(&volumes[1].data) {
@@ -201,7 +201,7 @@ fn views_that_are_no_circle_are_read_drawn_and_reconstructed() {
     let b = Bench::new();
     let mut scan = read_scan(b.at("scan")).unwrap();
     for (i, view) in scan.geometry.views.iter_mut().enumerate() {
-        // Rising, further away from view to view, and the detector turned in its plane.
+        // Rising, more distant from view to view, with the detector rotated in its plane.
         let rise = 0.4 * i as f64 - 2.4;
         (view.source[2], view.detector[2]) = (view.source[2] + rise, view.detector[2] + rise);
         (0..2).for_each(|k| view.source[k] *= 1.0 + 0.005 * i as f64);
@@ -217,7 +217,7 @@ fn views_that_are_no_circle_are_read_drawn_and_reconstructed() {
     done(&["info", &b.at("free"), "--png", &b.at("free.png")]);
     done(&["convert", &b.at("free"), &b.at("rtk"), "--to", "rtk"]);
     let found = b.info("rtk");
-    // Rows run up there: the same pixels, counted from below.
+    // RTK's rows run up: the same pixels, counted from below.
     for key in KEPT.iter().filter(|k| **k != "offset_mm") {
         near(&found[key], &want[key], key);
     }

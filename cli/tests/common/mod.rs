@@ -1,10 +1,10 @@
-//! What the whole-program tests share.
+//! Helpers shared by the whole-program tests.
 
 use assert_cmd::Command;
 use serde_json::Value;
 use std::path::Path;
 
-/// The command with `args`, quiet, without the plugins of whoever runs the tests.
+/// The command with `args`, quiet, without the plugins of the user who runs the tests.
 pub fn conefield(args: &[&str]) -> Command {
     let mut c = Command::cargo_bin("conefield").expect("the command is built with its tests");
     c.env_remove("CONEFIELD_PLUGIN_PATH").env("XDG_DATA_HOME", env!("CARGO_TARGET_TMPDIR"));
@@ -12,20 +12,20 @@ pub fn conefield(args: &[&str]) -> Command {
     c
 }
 
-/// Runs to success; what it printed.
+/// Runs to success; returns the output.
 #[allow(dead_code)]
 pub fn done(args: &[&str]) -> String {
     let out = conefield(args).assert().success().get_output().stdout.clone();
     String::from_utf8(out).expect("UTF-8")
 }
 
-/// Runs to success; the one JSON object that it printed.
+/// Runs to success; returns the printed JSON object.
 #[allow(dead_code)]
 pub fn json(args: &[&str]) -> Value {
     serde_json::from_str(&done(args)).expect("one JSON object on standard output")
 }
 
-/// Runs to the exit status `code`; what it said. Nothing stands on standard output.
+/// Runs to the exit status `code`; returns standard error. Standard output must be empty.
 #[allow(dead_code)]
 pub fn refused(code: i32, args: &[&str]) -> String {
     let output = conefield(args).assert().code(code).get_output().clone();

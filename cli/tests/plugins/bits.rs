@@ -1,5 +1,5 @@
-//! A pipeline with stages of plugins is the same as one with the same code built in: same bits of weights and volume,
-//! and after a kill the same bits again.
+//! A pipeline with stages of plugins gives the same bits as the same code built in, for weights and volume, also after
+//! a kill.
 
 use crate::build::{cargo, example, library, sources};
 use crate::common::{conefield, done, json, refused, text};
@@ -13,7 +13,7 @@ use conefield_core::spec::stage::read;
 use conefield_core::stage::UnitRay;
 use std::path::{Path, PathBuf};
 
-// Stage types register themselves where their crate is linked.
+// Stage types register themselves when their crate is linked.
 use conefield_encoders as _;
 use conefield_fields as _;
 use conefield_initializers as _;
@@ -23,7 +23,7 @@ use conefield_solvers as _;
 use conefield_solvers::losses::L2;
 use conefield_solvers::priors::TotalVariation;
 
-// The plugins' own files, built into this test.
+// The plugins' own source files, compiled into this test.
 #[path = "../../../plugins/examples/huber/src/huber.rs"]
 mod huber;
 #[path = "../../../plugins/examples/triplane/src/planes.rs"]
@@ -114,8 +114,8 @@ fn as_built_in() {
     assert!(volume.data == built_in.data, "the volumes differ");
 }
 
-/// A regularizer of a plugin has the weight, the penalty and the map of one that is built in, and what it keeps goes
-/// into checkpoints.
+/// A plugin's regularizer has the same weight, penalty and proximal map as a built-in one, and its state is saved in
+/// checkpoints.
 #[test]
 fn a_regularizer_as_built_in() {
     const SPEC: &str = "type = 'fista'\nprior = 'huber'\nsubsets = 2\nstop = { passes = 400 }\n";
@@ -175,7 +175,7 @@ fn killed_and_resumed() {
     child.wait().unwrap();
     assert!(checkpoint.exists(), "it was over before it could be killed");
 
-    // Without the plugins the spec means nothing.
+    // Without the plugins the spec is refused.
     let mut bare = arguments[4..].to_vec();
     bare.push("--resume");
     let e = refused(1, &bare);
@@ -232,7 +232,7 @@ fn mapping_consistency() {
     assert!(!output.status.success() && e.contains("field.0.weight"), "{e}");
 }
 
-/// What built-in initializers have, plugins' have too: weights that the host reads, a look at them before the run, a
+/// Plugin initializers support everything that built-in ones do: weights read by the host, a check before the run, a
 /// known volume.
 #[test]
 fn initializers_of_plugins() {
@@ -267,7 +267,7 @@ fn initializers_of_plugins() {
         });
         assert!(of[0] == of[1], "{kind}: the weights differ");
     }
-    // What does not fit is refused before there is a run.
+    // A misfit is refused before a run begins.
     let run = text(&place.dir.path().join("other"));
     let mut other = args("reconstruct", &format!("{{type=\"again-mci\", weights={weights:?}}}"));
     other.extend(["-o", &run, "--set", "field.width=13"].map(String::from));
@@ -302,8 +302,8 @@ fn masks_of_plugins() {
     assert!(runs[0] == runs[1], "the weights differ");
 }
 
-/// A point off any ray is a ray of one sample: there a stage that looks along rays changes nothing, neither values nor
-/// gradients, while along rays it does.
+/// A point off any ray is a ray of one sample: there a stage that depends on rays changes neither values nor gradients;
+/// along rays it does.
 #[test]
 fn points_off_any_ray_stand_alone() {
     let build = |smooth: bool| {
@@ -321,7 +321,7 @@ fn points_off_any_ray_stand_alone() {
         (model, exe)
     };
     let ((mut plain, mut exe), (mut smoothed, mut smoothed_exe)) = (build(false), build(true));
-    // Large features, so that smoothing them shows.
+    // Large features, so that smoothing has a visible effect.
     for (i, p) in plain.arena.params.iter_mut().enumerate() {
         *p += 0.3 * (i as f32 * 0.7).sin();
     }

@@ -9,27 +9,27 @@ pub fn sources() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the package stands in the workspace")
 }
 
-/// Where plugins are built; what they share is compiled once.
+/// The build folder of plugins; shared dependencies are compiled once.
 pub fn target() -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join("plugins")
 }
 
-/// One cargo at a time, so that each finds what the other has compiled.
+/// One cargo process at a time, so that each reuses what the other has compiled.
 static CARGO: Mutex<()> = Mutex::new(());
 
-/// Runs cargo in `folder`, to success.
+/// Runs cargo in `folder`; it must succeed.
 pub fn cargo(folder: &Path, args: &[&str]) {
     let _one = CARGO.lock().unwrap_or_else(|e| e.into_inner());
     let mut command = Command::new(env!("CARGO"));
     command.current_dir(folder).args(args).env("CARGO_TARGET_DIR", target());
-    // Compilation takes longer than what the plugins compute here.
+    // Compiling takes longer than the plugins' computations here.
     command.env("CARGO_PROFILE_RELEASE_OPT_LEVEL", "1");
     let output = command.output().expect("cargo starts");
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "cargo {args:?} in {}: {said}", folder.display());
 }
 
-/// The library that the package `name` was built to.
+/// The library built from the package `name`.
 pub fn library(name: &str) -> PathBuf {
     let name = name.replace('-', "_");
     target().join("release").join(format!("{}{name}{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX))

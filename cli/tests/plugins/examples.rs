@@ -1,4 +1,4 @@
-//! The example plugins: their own tests, the check, and a reconstruction with each.
+//! The example plugins: their own tests, the conformance check, and a reconstruction with each.
 
 use crate::build::{cargo, cc, example, sources};
 use crate::common::{done, json, text};
@@ -25,7 +25,7 @@ fn every_example_is_checked_and_reconstructs() {
         (dense, &["encoder.type=one-grid"]),
     ] {
         let library = text(&library);
-        // Grids in single precision: positions near a node are rounded to another cell.
+        // Grids in single precision: positions near a node are rounded into another cell.
         let report = json(&["plugins", "check", &library, "--single", "5e-5", "--json"]);
         assert_eq!(report["passed"], true, "{report:#}");
         let run = text(&dir.path().join(sets[0]));
@@ -42,7 +42,7 @@ fn every_example_is_checked_and_reconstructs() {
     }
 }
 
-/// The regularizer runs in `fista`, and is nearer to the truth than no prior.
+/// The regularizer runs in `fista` and gives a better volume than no prior.
 #[test]
 fn huber_denoises() {
     let dir = tempfile::tempdir().unwrap();
@@ -64,13 +64,14 @@ fn huber_denoises() {
     assert!(huber > none + 1.0, "{huber} dB, without a prior {none} dB");
 }
 
-/// The shipped specs that train a field and stop there.
+/// The shipped specs that train a field and stop.
 const FIELDS: [&str; 9] =
     ["naf", "ni-naf", "ni-naf-published", "nerf", "sax-nerf", "dense", "fast", "balanced", "accurate"];
-/// Those that go on from its volume.
+/// Specs that continue from the field's volume.
 const CHAINS: [&str; 2] = ["field-tv", "accurate-tv"];
 
-/// A plugin's encoder stands in for the built-in one in every spec that has one, with all that specs ask of an encoder.
+/// A plugin's encoder replaces the built-in one in every spec that has one, with everything that specs require of an
+/// encoder.
 #[test]
 fn the_planes_run_in_every_shipped_spec() {
     let dir = tempfile::tempdir().unwrap();
@@ -105,7 +106,7 @@ fn the_planes_run_in_every_shipped_spec() {
         let weights = conefield_io::read_weights(run.join("weights.safetensors")).unwrap();
         weights.tensors.into_keys().filter(|name| name.starts_with("encoder.")).collect::<Vec<_>>()
     };
-    // 16 voxels a side need no level of 64 nodes, and none of 32.
+    // 16 voxels per side need no level of 64 nodes, and none of 32.
     let needed = weights(&run("needed", "balanced", &["scene.levels=needed"]));
     assert_eq!(needed.len(), 6, "{needed:?}");
     let masked = weights(&run("masked", "ni-naf", &["callbacks=[{type=\"fft-mask\",keep=[0,1,2,12]}]"]));

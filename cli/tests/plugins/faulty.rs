@@ -1,5 +1,5 @@
-//! Plugins that do one thing wrong each, and what becomes of them: refused when loaded, refused when tried out, found
-//! by the check, or an error of the run. `faulty.md` is made from this; `CONEFIELD_BLESS=1` writes it anew.
+//! Plugins with one fault each, and the outcome: refused when loaded, refused in the trial, found by the check, or an
+//! error of the run. `faulty.md` is generated from this; `CONEFIELD_BLESS=1` writes it.
 
 use crate::build::{cargo, cc, library, sources};
 use crate::common::{conefield, done, text};
@@ -7,14 +7,13 @@ use rayon::prelude::*;
 use std::fmt::Write as _;
 use std::path::Path;
 
-/// What a plugin does wrong.
+/// A plugin with one fault.
 struct Fault {
-    /// For the page.
+    /// Description for the page.
     what: &'static str,
-    /// How it is compiled.
+    /// Compiler defines.
     defines: &'static [&'static str],
-    /// What each of `plugins list`, `plugins check` and `reconstruct` says: a part of the message, or nothing if all is
-    /// well.
+    /// Part of the message of each of `plugins list`, `plugins check` and `reconstruct`; empty for success.
     list: &'static str,
     check: &'static str,
     reconstruct: &'static str,
@@ -28,12 +27,12 @@ const fn fault(
     Fault { what, defines, list, check, reconstruct }
 }
 
-/// Refused alike wherever it is loaded.
+/// Refused in the same way wherever it is loaded.
 const fn refused(what: &'static str, defines: &'static [&'static str], why: &'static str) -> Fault {
     fault(what, defines, [why; 3])
 }
 
-/// Loads, but no stage can be made of it.
+/// Loads, but its stage fails the trial.
 const fn untried(what: &'static str, defines: &'static [&'static str], why: &'static str) -> Fault {
     fault(what, defines, ["", why, why])
 }
@@ -172,7 +171,7 @@ const PRIOR_FAULTS: &[Fault] = &[
     fault("a prior's gradient that overwrites", &["FAULT=OVERWRITES"], ["", "gradients add", ""]),
 ];
 
-/// Faults of pieces of iterative methods and of line fields: `faulty_pieces.c`, and what a spec has of it.
+/// Faults of parts of iterative methods and of line fields: `faulty_pieces.c`, with the spec that uses them.
 const PIECE_FAULTS: &[(&str, &[Fault])] = &[
     (
         "prior.type=faulty",
@@ -281,7 +280,7 @@ const PIECE_FAULTS: &[(&str, &[Fault])] = &[
     ),
 ];
 
-/// No process survives this.
+/// No process survives this fault.
 const ABORTED: &str = "(the process is gone)";
 
 /// The same with panics in a Rust plugin.
@@ -304,7 +303,7 @@ const PANICS: &[(&str, &str, [&str; 2])] = &[
     ("panics after a hundred calls", "later", ["no fault", "forward panicked: as ordered, in call"]),
 ];
 
-/// The last line that a command says, or nothing if all is well. Folders of this test are left out.
+/// The last line of a command's output; empty for success. Omits folders of this test.
 fn said(args: &[&str], hide: &[&Path]) -> String {
     let output = conefield(args).output().unwrap();
     if output.status.success() {
@@ -333,7 +332,7 @@ fn refusal(library: &str, hide: &[&Path]) -> String {
     why
 }
 
-/// A line of the page: the message of each command, or nothing if all is well.
+/// A line of the page: the message of each command; empty for success.
 struct Row {
     what: String,
     list: String,
@@ -363,7 +362,7 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         let mut args = vec!["--plugin", library, "reconstruct", &scan, "-o", &run];
         args.extend(spec);
         let found = said(&args, hide);
-        // What has failed leaves no volume.
+        // A failed run leaves no volume.
         let volume = dir.path().join(format!("run-{number}/volume.nii.gz"));
         assert!(found.is_empty() || !volume.exists(), "{library}");
         found
@@ -393,7 +392,7 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         .chain(PRIOR_FAULTS.iter().map(|f| (f, "faulty_prior.c", prior.clone())))
         .chain(pieces);
     let all: Vec<_> = all.enumerate().collect();
-    // Some of them sleep, and most of what they run has one thread.
+    // Some of them sleep, and most of their work has one thread.
     let rows = all.into_par_iter().map(|(i, (fault, source, set))| {
         let own = dir.path().join(format!("plugin-{i}"));
         std::fs::create_dir(&own).unwrap();

@@ -1,4 +1,4 @@
-//! Plugins, built and loaded as third parties would: by cargo and cc, from folders outside the workspace.
+//! Plugins, built and loaded as by third parties: with cargo and cc, from folders outside the workspace.
 #![cfg(unix)]
 
 mod bits;

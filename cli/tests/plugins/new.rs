@@ -1,4 +1,4 @@
-//! `conefield plugins new`: from a name to a reconstruction, in both languages and of every kind.
+//! `conefield plugins new`: from a name to a reconstruction, in both languages and for every kind.
 
 use crate::build::{cargo, library, sources};
 use crate::common::{done, json, refused, text};
@@ -19,7 +19,7 @@ const KINDS: [&str; 11] = [
     "basis",
 ];
 
-/// Kinds that iterative methods are put together from.
+/// Kinds that are parts of iterative methods.
 const PIECES: [&str; 3] = ["regularizer", "data-term", "basis"];
 
 /// A scan small enough for seconds.
@@ -29,7 +29,7 @@ fn scan(dir: &Path) -> PathBuf {
     path
 }
 
-/// A check and a short run of the plugin in `folder`, built to `library`; the run's record.
+/// Checks the plugin in `folder`, built to `library`, and runs it briefly; returns the run's record.
 fn use_it(kind: &str, folder: &Path, library: &Path, scan: &Path) -> serde_json::Value {
     let library = text(library);
     let report = json(&["plugins", "check", &library, "--json"]);
@@ -51,7 +51,7 @@ fn in_rust() {
         let said = done(&["plugins", "new", &name, "--kind", kind, "--lang", "rust", "--into", &into]);
         assert!(said.contains("cargo build --release"), "{said}");
         let folder = dir.path().join(&name);
-        // The versions that this build has, so that nothing else is downloaded.
+        // The versions of this build, so that nothing else is downloaded.
         std::fs::copy(sources().join("Cargo.lock"), folder.join("Cargo.lock")).unwrap();
         cargo(&folder, &["build", "--release"]);
         if kind == "encoder" {
@@ -104,7 +104,7 @@ fn names_and_folders_are_checked() {
     assert!(!dir.path().join("mine").exists());
 }
 
-/// The page shows what `plugins new` makes, and what it makes is short.
+/// The page shows the output of `plugins new`, which must be short.
 #[test]
 fn the_page_shows_the_encoder_that_is_made() {
     let read = |path: &str| std::fs::read_to_string(sources().join(path)).unwrap();

@@ -1,4 +1,4 @@
-//! Only libraries that the user names, or puts into a folder of plugins, are loaded.
+//! Only libraries that the user names, or puts into a plugin folder, are loaded.
 
 use crate::build::{cc, sources};
 use crate::common::{conefield, text};
@@ -23,7 +23,7 @@ fn list(command: &mut assert_cmd::Command) -> Value {
     serde_json::from_str(&out).unwrap()
 }
 
-/// A spec of a stranger beside the library that it names.
+/// A stranger's spec next to the library that it names.
 fn spec(dir: &Path) -> PathBuf {
     let path = dir.join("spec.toml");
     let text = "extends = 'fast'\n[plugins]\npaths = ['dense.so']\n[encoder]\ntype = 'one-grid'\n";
@@ -46,7 +46,7 @@ fn a_spec_loads_nothing_without_leave() {
     assert!(fine && out.contains("one grid of 32 nodes") && out.contains("plugin: dense 0.1.0"), "{out}{err}");
     let (fine, out, err) = run(&mut conefield(&["--plugin", &library, "explain", &spec]));
     assert!(fine && out.contains("one grid of 32 nodes"), "{out}{err}");
-    // Leave is for libraries that are plugins.
+    // The permission applies to valid plugins only.
     std::fs::write(dir.path().join("dense.so"), "not a library").unwrap();
     let (fine, _, err) = run(&mut conefield(&["--allow-plugins-from-spec", "explain", &spec]));
     assert!(!fine && err.contains("a shared library for this system"), "{err}");
@@ -81,7 +81,7 @@ fn plugins_are_found_where_they_are_looked_for() {
     let folder = home.join("conefield/plugins");
     std::fs::create_dir_all(&folder).unwrap();
     let library = dense(&folder);
-    // One by one: the user's folder, the environment, the command line, each with what it says of itself.
+    // The user's folder, the environment and the command line in turn, each with its origin.
     let found = list(conefield(&["plugins", "list", "--json"]).env("XDG_DATA_HOME", &home));
     assert_eq!(found["plugins"][0]["place"], "user-folder");
     assert_eq!(found["plugins"][0]["plugin"]["stages"][0]["type"], "one-grid");
@@ -90,16 +90,16 @@ fn plugins_are_found_where_they_are_looked_for() {
     let found = list(conefield(&["plugins", "list", "--json", "--plugin"]).arg(&library));
     assert_eq!(found["plugins"][0]["place"], "named");
     assert_eq!(found["plugins"][0]["plugin"]["abi"], "2.2");
-    // The same file twice is one plugin.
+    // The same file twice counts as one plugin.
     let found =
         list(conefield(&["plugins", "list", "--json"]).env("XDG_DATA_HOME", &home).arg("--plugin").arg(&library));
     assert_eq!(found["plugins"].as_array().unwrap().len(), 1);
-    // A copy brings types that are taken: both owners are named.
+    // A copy brings types whose names are taken: the error names both owners.
     std::fs::copy(&library, folder.join("other.so")).unwrap();
     let found = list(conefield(&["plugins", "list", "--json"]).env("XDG_DATA_HOME", &home));
     let why = found["plugins"][1]["refused"].as_str().unwrap();
     assert!(why.contains("dense.so") && why.contains("other.so") && why.contains("one-grid"), "{why}");
-    // What is broken in a folder is a warning; what is broken and named is an error.
+    // A broken file in a folder causes a warning; a broken file that is named causes an error.
     let (fine, _, _) = run(conefield(&["explain", "fast"]).env("XDG_DATA_HOME", &home));
     assert!(fine);
     let output = assert_cmd::Command::cargo_bin("conefield")

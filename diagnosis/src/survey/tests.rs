@@ -232,7 +232,7 @@ fn a_last_view_that_repeats_the_first_gives_a_warning_with_the_right_options() {
 
 #[test]
 fn similar_views_are_not_reported_as_repeated() {
-    // Off the axis; on it, where all views are equal; and where both sides of the seam look alike.
+    // Off the axis; on the axis, where all views are equal; and with both sides of the seam alike.
     for n in [12, 60, 360] {
         let half_step = 0.5 * TAU / n as f64;
         let seam = [8.0 * half_step.cos(), -8.0 * half_step.sin()];

@@ -229,7 +229,7 @@ fn with_syntax(bytes: &[u8], syntax: &str) -> Vec<u8> {
     uid.resize(uid.len().next_multiple_of(2), 0);
     let new = [&mark[..], &(uid.len() as u16).to_le_bytes(), &uid].concat();
     let mut out = [&bytes[..at], &new, &bytes[at + old..]].concat();
-    // The group's length stands first, at byte 140.
+    // The group's length is first, at byte 140.
     let group = u32::from_le_bytes([out[140], out[141], out[142], out[143]]) + new.len() as u32 - old as u32;
     out[140..144].copy_from_slice(&group.to_le_bytes());
     out
@@ -255,13 +255,13 @@ fn hostile_files_are_refused_in_words() {
     refused(&damaged(EXPLICIT, |b| b.truncate(200)), &["a.dcm"]);
     refused(&damaged(EXPLICIT, |b| b.truncate(132)), &["a.dcm", "end of the file at byte 132"]);
     refused(&damaged(EXPLICIT, |b| b.clear()), &["DICOM slices", "none among 1 files"]);
-    // An element that claims 2 GiB, before the pixels: no memory is taken for it.
+    // An element before the pixels that claims 2 GiB: no memory is allocated for it.
     let huge = |b: &mut Vec<u8>| {
         let at = b.windows(4).position(|w| w == [0x28, 0, 0x02, 0]).unwrap();
         b.splice(at..at, [0x20, 0, 0, 0x40, b'U', b'T', 0, 0, 0, 0, 0, 0x80]);
     };
     refused(&damaged(EXPLICIT, huge), &["a.dcm", "element (0020,4000)", "2147483648 bytes"]);
-    // Sequences in sequences in sequences.
+    // Deeply nested sequences.
     let deep = |b: &mut Vec<u8>| {
         let at = b.windows(4).position(|w| w == [0x28, 0, 0x02, 0]).unwrap();
         let level =

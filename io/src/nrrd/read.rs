@@ -440,7 +440,7 @@ mod tests {
         refused(&absolute, &data, &["data file", "inside the folder"]);
         refused(HEAD, b"", &["header", "end of the file"]);
         refused(&format!("{HEAD}# {}", "x".repeat(1 << 20)), &data, &["header", "shorter"]);
-        // Gzip: a claim past what a stream can hold, damage, more data.
+        // Gzip: a claim beyond the capacity of a stream, damage, trailing data.
         let packed = HEAD.replace("raw", "gzip");
         let stream = gzip(&DATA);
         refused(

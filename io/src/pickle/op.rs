@@ -4,7 +4,7 @@ macro_rules! opcodes {
     ($($name:ident = $code:literal)*) => {
         $(pub(super) const $name: u8 = $code;)*
 
-        /// Python's name of the opcode; `None` for a byte that is no opcode.
+        /// Python's name of the opcode; `None` for a byte that is not an opcode.
         pub(super) fn name(code: u8) -> Option<&'static str> {
             match code {
                 $($code => Some(stringify!($name)),)*

@@ -55,7 +55,7 @@ pub(crate) fn folder_voxels(folder: &Path) -> Result<u64> {
 pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
     let place = folder.display().to_string();
     let names = slices(folder)?;
-    // What the files claim is checked against their sizes here, before memory is taken for all of them.
+    // Claims are checked against file sizes here, before memory for all files is allocated.
     let voxels = usize::try_from(folder_voxels(folder)?).unwrap_or(usize::MAX);
     allowance::numbers(&place, "slices", voxels)?;
     let mut text = StackText::default();
@@ -105,7 +105,7 @@ fn slices(folder: &Path) -> Result<Vec<String>> {
     folder::names(folder, &["tif", "tiff"])
 }
 
-/// What the first page says of the voxels.
+/// Description of the voxels on the first page.
 #[derive(Default)]
 struct StackText {
     /// ImageJ's lines; empty for another program's file.
@@ -135,7 +135,7 @@ impl StackText {
         self.entry(name)?.parse().ok()
     }
 
-    /// The voxel sizes in mm, if the file says all of them.
+    /// The voxel sizes in mm, if the file states all of them.
     fn spacing(&self) -> Option<[f64; 3]> {
         let mm = match self.entry("unit")? {
             "mm" | "millimeter" => 1.0,
@@ -265,7 +265,7 @@ mod tests {
         assert_eq!(v.data.slice(ndarray::s![.., 1, 0]).to_vec(), [3.0, 4.0, 5.0]);
         assert!(is_volume(dir.path()) && v.data.is_standard_layout());
         assert_eq!(volume_voxels(dir.path()).unwrap(), 18);
-        // The folder of a scan is no volume.
+        // The folder of a scan is not a volume.
         std::fs::write(at("scanner.toml"), "").unwrap();
         assert!(!is_volume(dir.path()));
 

@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 /// Files that mark a folder of Zarr, of any version.
 const MARKS: [&str; 4] = [".zattrs", ".zgroup", ".zarray", "zarr.json"];
 
-/// Whether `folder` is one of Zarr.
+/// Whether `folder` is a Zarr folder.
 pub(crate) fn is_zarr(folder: &Path) -> bool {
     MARKS.iter().any(|m| folder.join(m).is_file())
 }
@@ -28,7 +28,7 @@ pub(crate) fn is_zarr(folder: &Path) -> bool {
 #[derive(Deserialize)]
 struct Attributes {
     multiscales: Vec<Multiscale>,
-    /// What the format has no place for.
+    /// conefield's own attributes, which the format does not define.
     conefield: Option<OwnAttributes>,
 }
 
@@ -131,7 +131,7 @@ enum Packing {
 /// A level, checked as far as its description goes.
 struct Stored {
     folder: PathBuf,
-    /// Of `.zarray`, for errors.
+    /// Path of `.zarray`, for errors.
     place: String,
     array: LevelArray,
     number: Number,
@@ -160,7 +160,7 @@ impl Stored {
             let found = format!("{:?} in chunks of {:?}", array.shape, array.chunks);
             return Err(invalid("shape", found, "at least one voxel along each axis"));
         }
-        // Unlike NumPy, Zarr always says the byte order.
+        // Unlike NumPy, Zarr always states the byte order.
         let element = npy::element(&array.dtype).filter(|_| array.dtype.starts_with(['<', '>', '|']));
         let (number, order) = element.ok_or_else(|| {
             let expected = "a real number of 8 to 64 bits such as \"<f4\" or \"|u1\"";

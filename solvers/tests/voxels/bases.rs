@@ -1,4 +1,4 @@
-//! FISTA with a basis that is not the voxels: blocks of 2 × 2 × 2 of them.
+//! FISTA with a basis other than voxels: blocks of 2 × 2 × 2 voxels.
 
 use crate::kit::{Case, Heard, geometry, method};
 use conefield_core::Error;
@@ -15,7 +15,7 @@ use ndarray::{Array3, ArrayView3, ArrayViewMut3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Blocks of 2 × 2 × 2 voxels, smaller where a side is odd, of one value each.
+/// Blocks of 2 × 2 × 2 voxels with one value each, smaller at the end of odd sides.
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 struct Blocks {}
@@ -75,7 +75,7 @@ fn the_blocks_keep_to_the_contract() {
     assert!(report.passed(), "{report}");
 }
 
-/// Few voxels under many rays, so that least squares has one solution; z has an odd number of them.
+/// Few voxels and many rays, so that least squares has one solution; z has an odd number of voxels.
 fn scan() -> (Scan, Volume) {
     let mut g = geometry(16);
     g.volume = VoxelGrid { shape: [12, 12, 11], spacing: [4.0; 3], ..g.volume };
@@ -91,7 +91,7 @@ fn scan() -> (Scan, Volume) {
     let views: Vec<usize> = (0..16).collect();
     let out = scan.projections.view_mut();
     VoxelOperator::<f32>::forward(&Joseph {}, &scan.geometry, &views, truth.data.view(), out);
-    // Noise, so that the solution is not what the scan was made of.
+    // Noise, so that the solution differs from the scanned volume.
     scan.projections.mapv_inplace(|p| {
         i += 1;
         p + 0.04 * (unit(mix(7, i)) - 0.5)
@@ -99,7 +99,7 @@ fn scan() -> (Scan, Volume) {
     (scan, truth)
 }
 
-/// The volume of least squares in the basis, by conjugate gradients in double precision.
+/// The least-squares volume in the basis, by conjugate gradients in double precision.
 fn least_squares(scan: &Scan) -> Array3<f64> {
     let g = &scan.geometry;
     let on = On { grid: g.volume };
@@ -156,13 +156,13 @@ fn fista_finds_the_least_squares_of_the_basis() {
     println!("{:.1e} off the least squares, {apart:.1e} off what was scanned", off(&found.data, &exact));
     assert!(off(&found.data, &exact) < 1e-3 && apart > 3e-3, "{apart}");
     assert_eq!(found.data.dim(), (12, 12, 11));
-    // Voxels themselves fit the noise better.
+    // Voxels fit the noise better.
     let voxels = BLOCKS.replace("test-blocks", "voxels");
     let (voxels, _) = Case::of(&scan).volume(&method("fista", &format!("{voxels}stop = {{ passes = 300 }}")));
     assert!(off(&voxels.data, &exact) > 1e-2);
 }
 
-/// Where a volume has no place in the basis, the nearest that has is the start.
+/// A volume outside the basis is replaced by the nearest one in it as the start.
 #[test]
 fn a_start_is_fitted_and_held_to() {
     let (scan, truth) = scan();
@@ -179,7 +179,7 @@ fn a_start_is_fitted_and_held_to() {
     assert!(off(&crate::kit::volume(fitted).data, &exact) < 1e-5, "what blocks cannot say is left out");
 }
 
-/// Every ingredient together: a prior on the blocks, subsets, a support, held-out views, and an interruption.
+/// All options together: a prior on the blocks, subsets, a support, held-out views, and an interruption.
 #[test]
 fn an_interrupted_run_with_a_basis_goes_on_to_the_same_bits() {
     let (scan, held) = scan().0.split(&[3, 9]).unwrap();

@@ -1,11 +1,11 @@
-//! Methods on voxels that know where the object can be.
+//! Voxel methods with a support of the object.
 
 use crate::kit::{Case, bodies, geometry, method, psnr};
 use conefield_core::scan::Volume;
 use conefield_projectors::simulate::{DetectorNoise, ellipsoids, scan_ellipsoids};
 use conefield_solvers::support::carve;
 
-/// Volumes of a noisy scan: without, with the support, and what the support is.
+/// Volumes of a noisy scan, without and with the support, and the support itself.
 fn solved(kind: &str, start: Option<&Volume>) -> [Volume; 2] {
     let scan = noisy();
     let start_line = start.map_or("", |_| "start = \"earlier.nii\"\n");
@@ -35,12 +35,12 @@ fn voxels_outside_stay_empty_and_those_inside_are_as_good() {
         let (before, after) = (psnr(&without, &truth), psnr(&with, &truth));
         println!("{kind}: {before:.2} to {after:.2} dB, {:.4} outside before", outside(&without));
         assert!(outside(&without) > 0.0 && outside(&with) == 0.0, "{kind}");
-        // Rays that are shorter inside correct more: algebraic methods come to the noise in fewer passes.
+        // Rays that are shorter inside correct more: algebraic methods reach the noise in fewer passes.
         assert!(after > before - 0.5, "{kind}: {before} to {after}");
     }
 }
 
-/// What a volume to start from has outside goes with the rest.
+/// The part of a start volume outside the support is removed.
 #[test]
 fn a_start_is_cut_to_the_support() {
     let full = Volume { data: ndarray::Array3::from_elem([24; 3], 0.01), ..ellipsoids(&[], &geometry(1).volume) };

@@ -24,20 +24,20 @@ fn scan() -> Scan {
 fn the_second_goes_on_where_the_first_ended() {
     let scan = scan();
     let (both, heard) = Case::of(&scan).volume(&chain(FIRST, THEN, 4));
-    // By hand: the first one's volume as the second one's file.
+    // By hand: the first method's volume as the second one's file.
     let (first, _) = Case::of(&scan).volume(FIRST);
     let limits = Limits { steps: Some(4), ..Limits::default() };
     let by_hand = Case { file: Some(&first), limits, ..Case::of(&scan) };
     let (second, _) = by_hand.volume(&format!("start = \"first.nii\"\n{THEN}"));
     assert_eq!(both.data, second.data);
     assert_ne!(both.data, first.data);
-    // One list of records, whose steps and seconds go on.
+    // One list of records with continuing steps and seconds.
     let steps: Vec<u64> = heard.records.iter().map(|r| r.step).collect();
     assert_eq!(steps, [1, 2, 3, 4, 5, 6, 7]);
     assert!(heard.records.windows(2).all(|w| w[0].seconds <= w[1].seconds));
 }
 
-/// A field on which little is worth learning, in seconds.
+/// A trivial field that takes seconds to train.
 const FIELD: &str = "type = \"neural-field\"\nencoder = \"identity\"\nfield = { type = \"voxel-grid\", resolution = 24 }\n\
     projector = { type = \"ray-march\", samples = 48 }\ntraining = { steps = 60, rays = 256, report_every = 25 }\noptimizer.lr = 0.05\n";
 
@@ -56,7 +56,7 @@ fn a_field_is_refined_and_kept() {
     assert!(solution.result.field().is_some());
 }
 
-/// The field that the first method alone makes.
+/// The field of the first method alone.
 fn spec_field(scan: &Scan) -> conefield_core::trained::TrainedField {
     match Case::of(scan).run(FIELD, &mut Heard::default()).unwrap().result {
         Reconstruction::Field(field) => field,
@@ -67,7 +67,7 @@ fn spec_field(scan: &Scan) -> conefield_core::trained::TrainedField {
 /// A third method, after [`THEN`].
 const LAST: &str = "[[methods]]\nstop = { passes = 3 }\ntype = \"fista\"\nprior = \"total-variation\"\nbasis = { type = \"cubic\", samples = 16 }\n";
 
-/// Chains of three: on voxels, with a mean of two, and with a field first and in the middle.
+/// Chains of three methods: on voxels, with a mean of two, with a field first, and with a field in the middle.
 fn chains_of_three() -> [String; 4] {
     let voxels = format!("{}{LAST}", chain(FIRST, THEN, 4));
     let mean = voxels.replacen("type = \"chain\"\n", "type = \"chain\"\nmean = 2\n", 1);
@@ -76,7 +76,7 @@ fn chains_of_three() -> [String; 4] {
     [voxels, mean, field_first, field_between]
 }
 
-/// Whichever method is interrupted, within it or at its end: it goes on where it stood.
+/// Whichever method is interrupted, during or after it: the chain resumes at the same point.
 #[test]
 fn an_interruption_of_any_goes_on_to_the_same_bits() {
     let scan = scan();
@@ -116,8 +116,8 @@ fn an_interruption_of_any_goes_on_to_the_same_bits() {
     }
 }
 
-/// Methods two and three are one grid of 24 voxels: merged they are one method of seven passes, and the mean is its
-/// volume alone.
+/// Methods two and three use the same grid of 24 voxels: merged they are one method of seven passes, and the mean is
+/// its volume alone.
 #[test]
 fn methods_on_one_grid_are_merged() {
     let scan = scan();
@@ -138,10 +138,10 @@ fn methods_on_one_grid_are_merged() {
     assert_eq!(both.data, one.data);
     assert_eq!(found.records.len(), heard.records.len());
     assert_ne!(Case::of(&scan).volume(&chain("mean = 2\n", &levels)).0.data, one.data);
-    // Levels on grids of their own stay, and so does the mean.
+    // Levels on different grids are not merged, and the mean stays.
     let apart = |top| Case::of(&scan).volume(&chain(top, &[(12, 2), (16, 3), (24, 4)])).0.data;
     assert_eq!(apart("mean = 2\nmerge = true\n"), apart("mean = 2\n"));
-    // An interruption within the merged method goes on to the same bits.
+    // An interruption within the merged method resumes to the same bits.
     let mut heard = Heard::interrupting_after(5);
     Case::of(&scan).run(&merged, &mut heard).err().unwrap();
     let resumed = Case { resume: Some(&heard.kept.unwrap()), ..Case::of(&scan) };

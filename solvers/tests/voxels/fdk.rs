@@ -1,7 +1,7 @@
-//! FDK's scale: means within homogeneous bodies, for every kind of orbit that it has weights for.
+//! FDK's scale: means within homogeneous bodies, for every kind of orbit with weights.
 //!
-//! A circular orbit says too little about what lies off its plane: there FDK is an approximation and loses attenuation
-//! with the square of the cone angle. The voxels are therefore a thin slab in the orbit's plane, where it is exact.
+//! A circular orbit gives too little information off its plane: there FDK is an approximation and loses attenuation
+//! with the square of the cone angle. The voxels are therefore a thin slab in the orbit's plane, where FDK is exact.
 
 use crate::kit::{Case, Heard, mean, view};
 use conefield_core::geometry::{Geometry, Radians, Vec3, View, VoxelGrid};
@@ -12,22 +12,22 @@ use std::f64::consts::{PI, TAU};
 
 /// Half width of the field of view at the axis, mm.
 const REACH: f64 = 26.4;
-/// Columns' pitch at the axis, mm.
+/// Column pitch at the axis, mm.
 const PITCH: f64 = 0.8;
-/// How far a mean may be off.
+/// Tolerance of a mean.
 const EXACT: f64 = 0.005;
 
-/// How a scan is taken.
+/// Settings of a scan.
 #[derive(Debug, Clone, Copy)]
 struct Orbiting {
     /// Source to axis, mm.
     radius: f64,
     magnification: f64,
-    /// How far the detector reaches to its shorter side, mm at the axis; the other side reaches to [`REACH`].
+    /// Extent of the detector on its shorter side, mm at the axis; the other side extends to [`REACH`].
     short_side: f64,
-    /// Whether the longer side is that of u.
+    /// Whether the longer side is towards +u.
     along_u: bool,
-    /// Arc in radians, with a sign.
+    /// Arc in radians, signed.
     arc: f64,
     views: usize,
 }
@@ -36,18 +36,18 @@ const CENTRED: Orbiting =
     Orbiting { radius: 100.0, magnification: 1.5, short_side: REACH, along_u: true, arc: TAU, views: 720 };
 
 impl Orbiting {
-    /// The arc of a short scan, and `more` fans beyond it.
+    /// The arc of a short scan plus `more` fan angles.
     fn short(self, more: f64) -> Self {
         let fan = 2.0 * (REACH / self.radius).atan();
         Self { arc: PI + (1.0 + more) * fan, ..self }
     }
 
-    /// The other way round.
+    /// The opposite direction.
     fn backwards(self) -> Self {
         Self { arc: -self.arc, ..self }
     }
 
-    /// With a detector that reaches over the axis by `short_side` mm, or over the axis the other way.
+    /// With a detector that extends `short_side` mm past the axis on its shorter side.
     fn aside(self, short_side: f64, along_u: bool) -> Self {
         Self { short_side, along_u, ..self }
     }
@@ -79,8 +79,8 @@ fn scan(o: Orbiting) -> Scan {
     scan_ellipsoids(&bodies(), geometry(o))
 }
 
-/// Means within the two bodies over what they should be. 3 mm of every edge are left out, which the pixels' width and
-/// windows blur.
+/// Measured means within the two bodies, divided by the true ones. Excludes 3 mm at every edge, which the pixels' width
+/// and windows blur.
 fn means(volume: &Volume) -> [f64; 2] {
     let [large, small] = bodies();
     let within = |p: [f64; 3]| p[2].abs() < 2.0 && large.grown(-3.0).contains(p);
@@ -89,7 +89,7 @@ fn means(volume: &Volume) -> [f64; 2] {
     [around / large.value, inside / (large.value + small.value)]
 }
 
-/// How far the worse of the means is off.
+/// Deviation of the worse of the two means.
 fn off(volume: &Volume) -> f64 {
     means(volume).iter().fold(0.0, |w, m| w.max((m - 1.0).abs()))
 }
@@ -123,7 +123,7 @@ fn means_are_right_for_every_orbit_magnification_and_detector() {
     println!("the worst mean is off by {:.3} %", 100.0 * worst);
 }
 
-/// A detector from the axis outwards measures every line once: to count it half would make a volume half as dense.
+/// A detector from the axis outwards measures every line once: half weights would give half the density.
 #[test]
 fn a_detector_on_one_side_of_the_axis_counts_whole() {
     for along_u in [true, false] {
@@ -142,7 +142,7 @@ fn the_scale_does_not_depend_on_the_number_of_views() {
         let apart = [0, 1].map(|k| (m[k] - all[0][k]).abs());
         assert!(apart.iter().all(|a| *a < 0.002), "{all:?}");
     }
-    // So few views leave streaks, and yet they are a full turn: nothing is taken for the end of a short scan.
+    // So few views leave streaks, but they are a full turn: no gap counts as the end of a short scan.
     let (sparse, heard) = of(50);
     assert!(heard.said("full turn") && !heard.said("Parker"), "{:?}", heard.notes);
     assert!(off(&sparse) < 0.02, "{:?}", means(&sparse));
@@ -163,7 +163,7 @@ fn every_window_keeps_the_mean() {
 fn units_rows_and_signs_are_kept() {
     let mut scan = scan(Orbiting { views: 180, ..CENTRED });
     let (plain, _) = fdk(&scan, "");
-    // Rows that run upwards, with the images turned round.
+    // Rows that run upwards, with flipped images.
     let mut turned = scan.clone();
     turned.geometry.views.iter_mut().for_each(|v| v.v[2] *= -1.0);
     turned.projections.invert_axis(ndarray::Axis(1));
@@ -179,7 +179,7 @@ fn units_rows_and_signs_are_kept() {
     assert!(volume.data.iter().all(|x| *x >= 0.0));
 }
 
-/// The scan as it would be without the weights of rays that are measured twice: FDK counts every ray half.
+/// The scan without weights of rays that are measured twice: FDK counts every ray half.
 fn unweighted(scan: &Scan) -> Scan {
     let mut scan = scan.clone();
     let orbit = FdkOrbit::of(&scan.geometry);
@@ -205,13 +205,13 @@ fn wrong_scales_and_weights_are_seen() {
         let without = fdk(&unweighted(&scan), "").0;
         assert!(off(&without) > 4.0 * EXACT, "{orbit:?}: {:?}", means(&without));
     }
-    // The detector's side taken for the other one.
+    // The detector's side confused with the other one.
     let mut bad = scan(Orbiting { views, ..CENTRED.aside(5.2, true) });
     bad.geometry = geometry(Orbiting { views, ..CENTRED.aside(5.2, false) });
     assert!(off(&fdk(&bad, "").0) > 4.0 * EXACT);
 }
 
-/// Half a detector over part of a turn leaves lines that nobody measured: no weights are made up for them.
+/// Half a detector over part of a turn leaves unmeasured lines: no weights can replace them.
 #[test]
 fn what_cannot_be_completed_is_said() {
     let part = Orbiting { arc: 2.5, ..CENTRED };
@@ -224,7 +224,7 @@ fn what_cannot_be_completed_is_said() {
     }
 }
 
-/// PSNR in dB of the slab's inner voxels against the bodies, with the largest value as its peak.
+/// PSNR in dB of the slab's inner voxels against the bodies, with the largest value as peak.
 fn decibels(volume: &Volume) -> f64 {
     let truth = ellipsoids(&bodies(), &volume.grid);
     let peak = truth.data.iter().copied().fold(0.0, f32::max);
@@ -234,8 +234,8 @@ fn decibels(volume: &Volume) -> f64 {
     10.0 * (f64::from(peak).powi(2) / mean).log10()
 }
 
-/// Views as dense as those of a full turn give the same volume from part of one, or from a detector that sees little
-/// more than half: with the weights that the orbit asks for within 0.3 dB, without them 6 dB worse.
+/// Part of a turn, or a detector that sees little more than half, gives the same volume as a full turn with equally
+/// dense views: within 0.3 dB with the orbit's weights, 6 dB worse without.
 #[test]
 fn part_of_a_turn_is_as_good_as_all_of_it() {
     let full = decibels(&fdk(&scan(CENTRED), "").0);
@@ -257,8 +257,8 @@ fn part_of_a_turn_is_as_good_as_all_of_it() {
     }
 }
 
-/// The detector about its own columns: its rays are others, and so is what they count. Measured over a short scan, in
-/// which no opposite ray makes up for it.
+/// A detector rotated about its columns has other rays with other weights. Measured over a short scan, in which no
+/// opposite ray compensates.
 #[test]
 fn a_detector_need_not_face_the_axis() {
     for degrees in [-12.0f64, 12.0] {
@@ -271,7 +271,7 @@ fn a_detector_need_not_face_the_axis() {
         println!("{degrees}: {:?}, {:.2} dB", means(&volume), decibels(&volume));
         assert!(heard.said("short scan"), "{:?}", heard.notes);
         assert!(off(&volume) < EXACT && decibels(&volume) > 25.0, "{degrees}: {:?}", means(&volume));
-        // As if it faced the axis.
+        // As if the detector faced the axis.
         let mut facing = scan.clone();
         let radius = FdkOrbit::of(&scan.geometry).radius[0];
         for ((view, _, column), p) in facing.projections.indexed_iter_mut() {
@@ -283,7 +283,7 @@ fn a_detector_need_not_face_the_axis() {
     }
 }
 
-/// A circle around another axis than z, which does not meet the volume's middle: balls look alike from everywhere.
+/// A circle around an axis other than z that does not meet the volume's centre: balls look the same from everywhere.
 #[test]
 fn a_circle_lies_anywhere() {
     let balls = [

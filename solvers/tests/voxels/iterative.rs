@@ -1,5 +1,5 @@
-//! Every iterative method on a small scan in closed form: what it reaches, what ends it, and that nothing but the job
-//! decides about its bits.
+//! Every iterative method on a small scan in closed form: its accuracy, its end, and that its bits depend on the job
+//! only.
 
 use crate::kit::{Case, Heard, bodies, geometry, mean, method as spec, psnr, volume};
 use conefield_core::Error;
@@ -33,7 +33,7 @@ fn truth() -> Volume {
     ellipsoids(&bodies(), &geometry(24).volume)
 }
 
-/// The scan with noise of a twentieth of its largest value.
+/// The scan with noise of 5 % of its largest value.
 fn noisy() -> Scan {
     with_noise(scan())
 }
@@ -63,15 +63,15 @@ fn residuals_fall() {
         println!("{kind}: {losses:.5?}");
         assert_eq!(losses.len() as u64, n, "{kind}");
         assert!(losses[losses.len() - 1] < 0.3 * losses[0], "{kind}: {losses:?}");
-        // One has its step and the other its line search from the whole problem: no pass makes it worse.
+        // One has its step size and the other its line search from the whole problem: no pass increases the residual.
         if ["sirt", "cgls"].contains(&kind) {
             assert!(losses.windows(2).all(|w| w[1] <= w[0]), "{kind}: {losses:?}");
         }
     }
 }
 
-/// What few views leave to FDK in streaks, iterative methods find; total variation finds most. The voxels are finer
-/// than elsewhere here: how they round the bodies' edges off is part of every error.
+/// Iterative methods recover what FDK leaves in streaks with few views; total variation recovers most. The voxels are
+/// finer than in other tests: the rounding of the bodies' edges is part of every error.
 #[test]
 fn fewer_views_than_fdk_needs_are_enough() {
     let mut g = geometry(20);
@@ -86,7 +86,7 @@ fn fewer_views_than_fdk_needs_are_enough() {
         println!("fdk, {window}: {fdk:.1} dB");
         assert!(fdk < 30.9, "FDK reaches {fdk:.1} dB");
     }
-    // Conjugate gradients end early here, as they do against noise: the bodies' edges are not what voxels can be.
+    // Conjugate gradients end early here, as with noise: voxels cannot represent the bodies' edges.
     for (kind, settings, least) in [
         ("sart", String::new(), 34.2),
         ("os-sart", "subsets = 5".into(), 33.8),
@@ -116,10 +116,10 @@ fn attenuation_is_not_negative_unless_asked_for() {
     }
 }
 
-/// Noise that is cut off at 0 has a mean above it, which puts a haze around the object unless air is known for air.
+/// Noise clipped at 0 has a mean above it, which causes a haze around the object unless air is set to 0.
 #[test]
 fn air_is_taken_for_empty() {
-    // Pixels fine enough that much of the detector is beside the shadow.
+    // Pixels so fine that much of the detector is outside the shadow.
     let mut g = geometry(24);
     g.detector = [128, 144];
     g.views.iter_mut().for_each(|v| (v.u, v.v) = (v.u.map(|x| x / 4.0), v.v.map(|x| x / 4.0)));
@@ -154,7 +154,7 @@ fn every_order_of_the_views_serves() {
     }
 }
 
-/// Two passes are one pass and, from there, another with what the first's relaxation decays to.
+/// Two passes equal one pass followed by another one with the decayed relaxation.
 #[test]
 fn relaxation_decays_from_pass_to_pass() {
     let scan = scan();
@@ -242,7 +242,7 @@ fn passes_time_or_a_small_change_end_a_run() {
         let none = Limits::default();
         assert_eq!(run("passes = 3", none).1.records.len(), 3, "{kind}");
         assert_eq!(run("passes = 3", Limits { steps: Some(2), ..none }).1.records.len(), 2, "{kind}");
-        // However little time there is, one pass is made.
+        // At least one pass is made, however little time there is.
         for (stop, limits) in [
             ("seconds = 1e-9", none),
             ("passes = 9", Limits { seconds: Some(1e-9), ..none }),

@@ -1,4 +1,4 @@
-//! What these tests share: a job in a few words, an observer that keeps what it hears, measures of a volume.
+//! Shared helpers of these tests: jobs, an observer that keeps its reports, measures of a volume.
 
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
@@ -11,7 +11,7 @@ use conefield_core::spec::load::parse;
 use conefield_core::{Error, Result};
 use conefield_projectors::simulate::Ellipsoid;
 
-// Stage types register themselves where their crate is linked.
+// Stage types register themselves when their crate is linked.
 use conefield_encoders as _;
 use conefield_fields as _;
 use conefield_initializers as _;
@@ -22,15 +22,15 @@ pub fn view(angle: f64, distances: [f64; 2], pixel: [f64; 2], offset: [f64; 2]) 
     View::circular(Radians(angle), mm(distances[0]), mm(distances[1]), pixel.map(mm), offset.map(mm))
 }
 
-/// A job, less what most tests leave out.
+/// A job with only the settings that tests vary.
 pub struct Case<'a> {
     pub scan: &'a Scan,
     pub held_out: Option<&'a Scan>,
     pub reference: Option<&'a Volume>,
     pub limits: Limits,
-    /// What stands in every volume file that the spec names.
+    /// Content of every volume file that the spec names.
     pub file: Option<&'a Volume>,
-    /// What the job itself starts from.
+    /// Start volume of the job itself.
     pub start: Option<&'a Volume>,
     pub resume: Option<&'a Resume>,
 }
@@ -57,7 +57,7 @@ impl<'a> Case<'a> {
         spec.method.plan(&Context::new(&backend))?.run(&job, heard)
     }
 
-    /// The volume that comes out and what was heard.
+    /// The resulting volume and the reports.
     pub fn volume(&self, text: &str) -> (Volume, Heard) {
         let mut heard = Heard::default();
         let solution = self.run(text, &mut heard).unwrap();
@@ -69,7 +69,7 @@ pub fn spec(text: &str) -> Result<Spec> {
     parse(text, "test.toml", &[], &[]).map(|l| l.spec)
 }
 
-/// A spec like the shipped one of this name, or of a type, with `settings` instead of its own.
+/// A spec like the shipped one of this name, or of a type, with `settings` replacing its own.
 pub fn method(name: &str, settings: &str) -> String {
     let (kind, own) = match name {
         "os-sart" => ("sart", &["subsets = 10", "relaxation = 1.0", "stop = { passes = 20 }"][..]),
@@ -90,7 +90,7 @@ pub fn volume(solution: Solution) -> Volume {
     }
 }
 
-/// Keeps what it hears; interrupts after some records and keeps the checkpoint.
+/// Keeps its reports; interrupts after some records and keeps the checkpoint.
 #[derive(Default)]
 pub struct Heard {
     pub records: Vec<Record>,
@@ -126,7 +126,7 @@ impl Observer for Heard {
     fn cancelled(&self) -> bool {
         self.interrupt_after.is_some_and(|n| self.records.len() >= n)
     }
-    /// As a file would: numbers of the standing go through JSON.
+    /// Like a file: numbers of the standing pass through JSON.
     fn checkpoint(&mut self, c: &Checkpoint<'_>) -> Result<()> {
         let standing = serde_json::from_str(&serde_json::to_string(&c.standing).unwrap()).unwrap();
         let tensors = c.tensors.iter().map(|(n, shape, x)| (n.clone(), (shape.to_vec(), x.to_vec()))).collect();
@@ -136,7 +136,7 @@ impl Observer for Heard {
     }
 }
 
-/// Mean of the voxels whose centres fulfil `within`; at least 20 of them.
+/// Mean of the voxels whose centres satisfy `within`; at least 20 of them.
 pub fn mean(volume: &Volume, within: impl Fn([f64; 3]) -> bool) -> f64 {
     let found = volume.data.indexed_iter().filter(|((x, y, z), _)| within(volume.grid.voxel([*x, *y, *z])));
     let (sum, count) = found.fold((0.0, 0), |(s, n), (_, v)| (s + f64::from(*v), n + 1));

@@ -1,4 +1,4 @@
-//! Methods on voxels, held against ellipsoids whose scans are known in closed form.
+//! Voxel methods, compared with ellipsoids whose scans are known in closed form.
 
 mod bases;
 mod carved;

@@ -1,4 +1,4 @@
-//! Specs that methods on voxels refuse, and that the message names the field.
+//! Specs that voxel methods refuse, with messages that name the field.
 
 use crate::kit::{Case, Heard, bodies, geometry, method, spec};
 use conefield_core::geometry::View;
@@ -6,7 +6,7 @@ use conefield_projectors::simulate::scan_ellipsoids;
 
 const ALL: [&str; 7] = ["fdk", "sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"];
 
-/// What is said of a spec that is refused when it is read, built or run.
+/// The error for a spec that is refused when it is read, built or run.
 fn said(text: &str) -> String {
     let scan = scan_ellipsoids(&bodies(), geometry(4));
     match Case::of(&scan).run(text, &mut Heard::default()) {
@@ -27,7 +27,7 @@ fn stages_of_other_kinds_have_no_place() {
         let e = said(&method(kind, "start = 3"));
         assert!(e.contains("start: found 3, expected a text"), "{kind}: {e}");
     }
-    // FDK back-projects in its own way and starts from nothing.
+    // FDK back-projects in its own way and has no start volume.
     for setting in ["projector.type = \"joseph\"", "start = \"x.nii\""] {
         let e = said(&method("fdk", setting));
         assert!(e.contains("an unknown key"), "{e}");
@@ -41,7 +41,7 @@ fn stages_of_other_kinds_have_no_place() {
         let e = said(&method("fista", setting));
         assert!(e.contains(says), "{setting}: {e}");
     }
-    // A field cannot be rendered by what projects voxels.
+    // A field cannot be rendered by a voxel projector.
     let field = "encoder = \"identity\"\nfield = \"voxel-grid\"\nprojector.type = \"joseph\"\n";
     let e = said(&method("neural-field", field));
     assert!(e.contains("projector.type: found no projector type \"joseph\""), "{e}");
@@ -85,7 +85,7 @@ fn a_run_has_an_end() {
             let e = said(&method(kind, &format!("stop = {stop}")));
             assert!(e.contains(&format!("stop.{field}: found")), "{kind}, {stop}: {e}");
         }
-        // What is set is all that ends it: no number of passes comes with the time.
+        // Only the given settings end a run: no number of passes is added to a time.
         let spec = spec(&method(kind, "stop = { seconds = 60.0 }")).unwrap();
         let stop = serde_json::to_value(&spec).unwrap()["stop"].clone();
         assert_eq!(stop, serde_json::json!({ "seconds": 60.0 }), "{kind}");
@@ -128,7 +128,7 @@ fn settings_out_of_range_are_named() {
     assert!(e.contains("hann"), "the nearest name is offered: {e}");
 }
 
-/// FDK is for circles around z.
+/// FDK accepts only circles around z.
 #[test]
 fn fdk_refuses_other_orbits() {
     let mut scan = scan_ellipsoids(&bodies(), geometry(8));

@@ -1,4 +1,4 @@
-//! A body that goes on beyond the volume and the detector: what lies outside is found on coarse cells and taken off.
+//! A body that extends beyond the volume and the detector: the outside is estimated on coarse cells and subtracted.
 
 use crate::kit::{Case, Heard, mean, psnr, view};
 use conefield_backend_cpu::Cpu;
@@ -9,7 +9,7 @@ use conefield_core::scene::{CoarseSurround, SurroundRule};
 use conefield_projectors::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
 use conefield_solvers::surround::found;
 
-/// A body of ± 55 by 45 by 40 mm with things in it, within ± 20 mm of the middle and outside.
+/// A body of ± 55 by 45 by 40 mm with details, within ± 20 mm of the centre and outside.
 fn bodies() -> Vec<Ellipsoid> {
     let body = |center, axes, value| Ellipsoid { center, axes, value };
     vec![
@@ -21,7 +21,7 @@ fn bodies() -> Vec<Ellipsoid> {
     ]
 }
 
-/// The middle ± 20 mm of it, on a detector that sees ± 24 mm there (or ± 77 mm).
+/// Its central ± 20 mm, on a detector that sees ± 24 mm there (or ± 77 mm).
 fn geometry(wide: bool) -> Geometry {
     let turn = |i: usize| std::f64::consts::TAU * i as f64 / 40.0;
     let side = if wide { 154 } else { 48 };
@@ -36,7 +36,7 @@ fn scan() -> Scan {
     scan_ellipsoids(&bodies(), geometry(false))
 }
 
-/// As far as the body goes.
+/// Extent of the body.
 const RULE: SurroundRule = SurroundRule::Coarse(CoarseSurround { margin: 1.0, cells: 32, passes: 16 });
 /// The same in a spec.
 const SURROUND: &str = "scene.surround = { coarse = { margin = 1.0, cells = 32 } }\n";
@@ -66,14 +66,14 @@ fn every_method_loses_the_rim_that_the_outside_leaves() {
     }
 }
 
-/// The line integrals that are left are those of what is inside.
+/// The remaining line integrals are those of the inside.
 #[test]
 fn what_is_left_is_the_inside() {
     let scan = scan();
     let backend = Cpu::new();
     let left = conefield_solvers::surround::subtracted(&Job::new(&scan, &backend), RULE, &mut Heard::default());
     let left = left.unwrap().unwrap();
-    // In closed form: the chords less those beyond the box.
+    // In closed form: the chords minus the parts beyond the box.
     let inside = conefield_projectors::simulate::project(
         &ellipsoids(&bodies(), &VoxelGrid { shape: [160; 3], spacing: [0.25; 3], center: [0.0; 3] }),
         &geometry(false),
@@ -106,7 +106,7 @@ fn the_surround_is_reported_before_a_run() {
     let said = |scan: &Scan, rule: SurroundRule| found(scan, rule).unwrap().concat();
     let all = said(&scan(), near);
     assert!(all.contains("40 of 40 views: 40 x 40 x 40 cells of 2.000 mm"), "{all}");
-    // Only as far as sources and detectors leave room.
+    // Limited by the room that sources and detectors leave.
     let mut close = scan();
     close.geometry.views.iter_mut().for_each(|v| v.source = v.source.map(|x| x * 0.13));
     let all = said(&close, far);

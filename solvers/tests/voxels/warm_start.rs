@@ -1,4 +1,4 @@
-//! A known volume to start from: taken as it is by methods on voxels, learned first by fields.
+//! A known start volume: used directly by voxel methods, learned first by fields.
 
 use crate::kit::{Case, Heard, bodies, geometry, psnr};
 use conefield_core::scan::{Scan, Unit, Volume};
@@ -6,7 +6,7 @@ use conefield_core::voxel::VoxelOperator;
 use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 use conefield_projectors::voxel::Joseph;
 
-/// What a field starts from.
+/// The start of a field.
 const START: &str = "[initializer]\ntype = \"volume\"\npath = \"earlier.nii\"\n";
 
 const ALL: [&str; 6] = ["sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"];
@@ -15,7 +15,7 @@ fn truth() -> Volume {
     ellipsoids(&bodies(), &geometry(1).volume)
 }
 
-/// Projections of the voxels themselves: what they are is then a solution without rest.
+/// Projections of the voxels themselves, so that the volume is an exact solution.
 fn scan_of(volume: &Volume) -> Scan {
     let mut scan = scan_ellipsoids(&[], geometry(12));
     let views: Vec<usize> = (0..12).collect();
@@ -30,7 +30,7 @@ fn method(kind: &str, more: &str) -> String {
     crate::kit::method(kind, &format!("stop = {{ passes = 1 }}\n{weight}{descents}{more}"))
 }
 
-/// A method on voxels that starts from the file.
+/// A voxel method that starts from the file.
 fn warm(kind: &str) -> String {
     method(kind, "start = \"earlier.nii\"\n")
 }
@@ -50,7 +50,7 @@ fn the_truth_leaves_no_residual_and_stays() {
     }
 }
 
-/// The file counts in 1/unit of the scan.
+/// The file is in 1/unit of the scan.
 #[test]
 fn the_start_is_what_the_file_holds() {
     let truth = truth();
@@ -58,7 +58,7 @@ fn the_start_is_what_the_file_holds() {
     scan.unit = Unit { name: "cm".into(), mm: 10.0 };
     let tenfold = truth.clone().mapped(|x| 10.0 * x);
     for kind in ALL {
-        // No pass is made: what comes out is what stood in the file.
+        // No pass is made: the result is the content of the file.
         let limits = conefield_core::method::Limits { steps: Some(0), ..Default::default() };
         let case = Case { file: Some(&tenfold), limits, ..Case::of(&scan) };
         let (volume, heard) = case.volume(&warm(kind));
@@ -88,7 +88,7 @@ fn volumes_that_do_not_fit_are_refused() {
     }
 }
 
-/// FISTA with a pull ends between what the scan says and what it is held to, the nearer to that the stronger the pull.
+/// FISTA with a pull ends between the scan's solution and the start volume, closer to the latter with a stronger pull.
 #[test]
 fn a_pull_holds_to_the_start() {
     let truth = truth();
@@ -104,14 +104,14 @@ fn a_pull_holds_to_the_start() {
     let apart: Vec<f64> =
         [1e-2, 1.0, 1e4].iter().map(|&p| psnr(&case.volume(&spec(p)).0, &start) - psnr(&free, &start)).collect();
     assert!(apart[0] > 0.2 && apart[1] > apart[0] + 6.0 && apart[2] > apart[1] + 20.0, "{apart:?}");
-    // Without a pull it goes to the truth, held a little it stays behind.
+    // Without a pull it approaches the truth; with a slight pull it stays behind.
     assert!(psnr(&free, &truth) > psnr(&case.volume(&spec(1.0)).0, &truth) + 3.0);
 
     let e = case.run(&held(0.1, ""), &mut Heard::default()).err().unwrap().to_string();
     assert!(e.contains("pull: found 0.1, expected 0, or a volume to start from"), "{e}");
 }
 
-/// A job may hand the volume over itself; it goes before the file.
+/// A job may pass the volume itself, which takes precedence over the file.
 #[test]
 fn a_volume_that_is_handed_over_is_the_start() {
     let truth = truth();
