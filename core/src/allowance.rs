@@ -24,8 +24,8 @@ pub fn memory(place: &str, field: &str, bytes: u64) -> Result<()> {
         return Ok(());
     }
     let mib = |n: u64| format!("{} MiB", n.div_ceil(1 << 20));
-    let found = format!("{} more to read it, beside {} that are held", mib(bytes), mib(held));
-    Err(Error::invalid(place, field, found, format!("at most {} in all, as --memory or the system allows", mib(*most))))
+    let found = format!("{} more, with {} already held", mib(bytes), mib(held));
+    Err(Error::invalid(place, field, found, format!("at most {} in total, set by --memory or the system", mib(*most))))
 }
 
 /// The same check for `count` 32-bit numbers.
@@ -49,7 +49,7 @@ impl Work {
     /// Spends `units` on `what`.
     pub fn spend(&mut self, place: &str, what: &str, units: u64) -> Result<()> {
         let Some(left) = self.left.checked_sub(units) else {
-            let expected = format!("at most {} in all, far above that of any valid file", self.most);
+            let expected = format!("at most {} in total, far more than any valid file needs", self.most);
             return Err(Error::invalid(place, what, format!("more than {}", self.most), expected));
         };
         self.left = left;

@@ -225,7 +225,7 @@ impl<T: RowMap> Encoder for ByRow<T> {
 
 impl<T: RowMap> Normalizer for ByRow<T> {
     fn keep_inputs(&self, _: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        Err(Error::unsupported(self.describe(), "this normalizer cannot do without some of its inputs"))
+        Err(Error::unsupported(self.describe(), "this normalizer does not support removing inputs"))
     }
 }
 

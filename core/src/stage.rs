@@ -343,7 +343,7 @@ pub trait Encoder: Stage {
     /// The encoder that computes only the outputs `keep` (ascending).
     fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
         let _ = keep;
-        Err(Error::unsupported(self.describe(), "this encoder cannot leave out channels"))
+        Err(Error::unsupported(self.describe(), "this encoder does not support removing channels"))
     }
 
     /// Whether channels are ordered from coarse to fine, as required by masks that drop "all finer" channels.
@@ -378,7 +378,7 @@ pub trait Field: Stage {
     /// The field without the inputs outside `keep`.
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
         let _ = keep;
-        Err(Error::unsupported(self.describe(), "this field cannot do without some of its inputs"))
+        Err(Error::unsupported(self.describe(), "this field does not support removing inputs"))
     }
 
     /// Its own line integrals, if it has any ([`crate::settings::LineFieldSpec`]).

@@ -243,7 +243,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
     let number = header.number()?;
     let order = header.order()?;
     if let Some(n) = header.text("ElementNumberOfChannels")?.filter(|n| *n != "1") {
-        return Err(header.invalid("ElementNumberOfChannels", shortened(n), "1: one number a voxel"));
+        return Err(header.invalid("ElementNumberOfChannels", shortened(n), "1: one number per voxel"));
     }
     if header.flag("BinaryData")? == Some(false) {
         return Err(header.invalid("BinaryData", "False (numbers as text)", "True"));

@@ -208,7 +208,7 @@ fn quaternion(header: &NiftiHeader) -> [[f64; 4]; 3] {
 
 /// Refuses more voxels per axis than the header can express.
 pub(crate) fn check_shape(place: &str, shape: [usize; 3]) -> Result<()> {
-    let expected = "at most 32767 voxels an axis, which is all that NIfTI-1 can say (write .npy)";
+    let expected = "at most 32767 voxels per axis, the limit of NIfTI-1 (write .npy)";
     ensure(shape.iter().all(|&n| n <= i16::MAX as usize), place, "shape", format!("{shape:?}"), expected)
 }
 

@@ -206,7 +206,7 @@ fn projections(folder: &Path, place: &str, field: &str, frames: &[Frame], shape:
         all.extend(image.iter());
     }
     Array3::from_shape_vec((frames.len(), shape[0], shape[1]), all)
-        .map_err(|e| Error::invalid(place, field, e, "one projection a view"))
+        .map_err(|e| Error::invalid(place, field, e, "one projection per view"))
 }
 
 fn volume(folder: &Path, place: &str, name: &str, shape: [usize; 3]) -> Result<Array3<f32>> {

@@ -100,7 +100,7 @@ pub(crate) fn read(
     }
     let (values, [rows, columns], views) = all.unwrap_or_default();
     Array3::from_shape_vec((views, rows, columns), values)
-        .map_err(|e| Error::invalid(place, field, e, "one image a view"))
+        .map_err(|e| Error::invalid(place, field, e, "one image per view"))
 }
 
 /// Number of values that [`read`] returns, from the headers of its files.

@@ -63,7 +63,7 @@ fn stack(path: &Path, first: impl FnOnce(&mut Decoder<BufReader<File>>) -> Resul
         Ok(())
     })?;
     let all = Array3::from_shape_vec((pages, rows, columns), values)
-        .map_err(|e| Error::invalid(&place, "TIFF", e, format!("{rows} x {columns} values a page")))?;
+        .map_err(|e| Error::invalid(&place, "TIFF", e, format!("{rows} x {columns} values per page")))?;
     match all.indexed_iter().find(|(_, x)| !x.is_finite()) {
         Some(((p, r, c), x)) => {
             Err(Error::invalid(place, format!("page {p}, row {r}, column {c}"), x, "a finite number"))

@@ -150,7 +150,7 @@ fn message(said: &str, printed: &str, end: End, says: &[&str]) -> String {
 
 /// The message without sizes that differ between machines: available memory, and memory held by the program.
 fn without_figures(text: String) -> String {
-    let marks = [" are available", " that are held", " in all, as --memory"];
+    let marks = [" are available", " already held", " in total, set by --memory"];
     marks.iter().fold(text, |text, mark| {
         let Some(at) = text.find(mark) else { return text };
         let before = text[..at].rsplitn(3, ' ').nth(2).unwrap_or_default();

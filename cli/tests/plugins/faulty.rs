@@ -101,7 +101,7 @@ const FAULTS: &[Fault] = &[
     untried(
         "reads halves without a function for them",
         &["FAULT=NO_HALVES"],
-        "it has no kernels that read halves, and says that it has",
+        "it declares half-precision kernels but has none",
     ),
     untried(
         "returns NaN with parameters in halves",

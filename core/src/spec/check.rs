@@ -280,7 +280,7 @@ pub(super) fn suggest(name: &str, known: &[&str]) -> String {
         .min_by_key(|k| distance(k))
         .filter(|k| distance(k) <= (k.len() / 3).max(2) || k.starts_with(name) || name.starts_with(**k));
     match (near, known) {
-        (_, []) => "none; this build knows none".into(),
+        (_, []) => "none; this build has none".into(),
         (Some(near), [_]) => format!("{near:?}"),
         (Some(near), _) => format!("{near:?} (of {})", known.join(", ")),
         (None, _) => listed(known),

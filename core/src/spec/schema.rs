@@ -34,7 +34,7 @@ pub(super) fn label() -> [(&'static str, Value); 3] {
     }
     [
         ("name", json!({ "type": "string", "description": "Short name, shown in tables." })),
-        ("description", json!({ "type": "string", "description": "What it is for, in a sentence." })),
+        ("description", json!({ "type": "string", "description": "Purpose, in a sentence." })),
         ("plugins", plugins),
     ]
 }
@@ -61,7 +61,7 @@ pub fn spec() -> Value {
     common.insert("$schema".into(), json!({ "type": "string", "description": "Path or URL of the schema." }));
     common.insert(
         "extends".into(),
-        json!({ "type": "string", "description": "A shipped spec, or a file relative to this one, that this one changes." }),
+        json!({ "type": "string", "description": "The spec that this one modifies: a shipped name, or a file relative to this one." }),
     );
     for (key, schema) in label() {
         common.insert(key.into(), relocated(schema, key));

@@ -109,8 +109,8 @@ impl Elements<'_> {
     fn format(&self) -> Result<PixelFormat> {
         let side = |field| self.within(field, None, |n| (1..=65535).contains(&n), "1 to 65535");
         let (rows, columns) = (side(ROWS)?, side(COLUMNS)?);
-        self.within(SAMPLES, Some(1), |n| n == 1, "1: one number a pixel")?;
-        self.within(FRAMES, Some(1), |n| n == 1, "1: one slice a file (split enhanced files first)")?;
+        self.within(SAMPLES, Some(1), |n| n == 1, "1: one number per pixel")?;
+        self.within(FRAMES, Some(1), |n| n == 1, "1: one slice per file (split enhanced files first)")?;
         let allocated = self.within(ALLOCATED, None, |n| matches!(n, 8 | 16 | 32), "8, 16 or 32")?;
         let stored = self.within(STORED, Some(allocated), |n| (1..=allocated).contains(&n), "1 to BitsAllocated")?;
         let in_range = |n| (stored - 1..allocated).contains(&n);
@@ -131,11 +131,7 @@ impl Elements<'_> {
         let axes = [[six[0], six[1], six[2]], [six[3], six[4], six[5]]];
         // Files round the numbers: each axis is normalized again.
         if axes.iter().any(|a| (norm(*a) - 1.0).abs() > 1e-2) || dot(axes[0], axes[1]).abs() > 1e-2 {
-            return Err(self.invalid(
-                ORIENTATION,
-                format!("{six:?}"),
-                "two directions of length 1, upright to each other",
-            ));
+            return Err(self.invalid(ORIENTATION, format!("{six:?}"), "two orthogonal unit vectors"));
         }
         Ok(axes.map(|a| a.map(|x| x / norm(a))))
     }

@@ -95,7 +95,7 @@ impl Header {
     fn shape(&self) -> Result<[usize; 3]> {
         let text = self.required("dimension")?;
         if text != "3" {
-            return Err(self.invalid("dimension", shortened(text), "3: one volume, one number a voxel"));
+            return Err(self.invalid("dimension", shortened(text), "3: one volume, one number per voxel"));
         }
         let text = self.required("sizes")?;
         let sizes: Option<Vec<usize>> = text.split_ascii_whitespace().map(|t| t.parse().ok()).collect();

@@ -30,7 +30,7 @@ pub(crate) fn read_volume(path: &Path) -> Result<Volume> {
     let (slices, rows, columns) = pages.dim();
     // Above 4 GiB ImageJ writes one page and the other slices after it.
     if let Some(n) = text.number("images").filter(|n| *n != slices as f64) {
-        let expected = format!("{slices}, the pages of the file (save the stack with one page a slice)");
+        let expected = format!("{slices}, the pages of the file (save the stack with one page per slice)");
         return Err(Error::invalid(place, "images", n, expected));
     }
     let (grid, affine) = text.place_of_voxels(&place, [columns, rows, slices])?;
@@ -73,7 +73,7 @@ pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
             Err(Error::invalid(path.display().to_string(), field, found, expected))
         };
         if pages != 1 {
-            return invalid("pages", pages.to_string(), "1: one slice a file, or all slices in one file".into());
+            return invalid("pages", pages.to_string(), "1: one slice per file, or all slices in one file".into());
         }
         let data = match &mut data {
             Some(data) => data,
@@ -93,7 +93,7 @@ pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
         data.slice_mut(s![.., .., z]).assign(&slice.slice(s![0, .., ..]).t());
     }
     let Some(data) = data else {
-        return Err(Error::invalid(place, "slices", "no TIFF file", "one TIFF file a slice"));
+        return Err(Error::invalid(place, "slices", "no TIFF file", "one TIFF file per slice"));
     };
     let [x, y, z] = [0, 1, 2].map(|k| data.shape()[k]);
     let (grid, affine) = text.place_of_voxels(&place, [x, y, z])?;
@@ -167,7 +167,7 @@ impl StackText {
     fn place_of_voxels(&self, place: &str, shape: [usize; 3]) -> Result<(VoxelGrid, Option<Affine>)> {
         for name in ["channels", "frames"] {
             if let Some(n) = self.number(name).filter(|n| *n > 1.0) {
-                return Err(Error::invalid(place, name, n, "1: one volume, one number a voxel"));
+                return Err(Error::invalid(place, name, n, "1: one volume, one number per voxel"));
             }
         }
         let mut grid = VoxelGrid { shape, spacing: self.spacing().unwrap_or([1.0; 3]), center: [0.0; 3] };

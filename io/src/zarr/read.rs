@@ -72,7 +72,7 @@ impl Multiscale {
     fn unit(&self, place: &str) -> Result<f64> {
         let names: Vec<&str> = self.axes.iter().map(|a| a.name.as_str()).collect();
         if names != ["z", "y", "x"] {
-            let expected = "[\"z\", \"y\", \"x\"]: one volume, one number a voxel";
+            let expected = "[\"z\", \"y\", \"x\"]: one volume, one number per voxel";
             return Err(Error::invalid(place, "multiscales[0].axes", format!("{names:?}"), expected));
         }
         let unit = self.axes[0].unit.as_deref();

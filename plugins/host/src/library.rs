@@ -187,7 +187,7 @@ impl Library {
             t.stage_size >= FIRST_STAGE && t.stage_size.is_multiple_of(align_of::<ConefieldStage>()),
             place,
             "stage table",
-            format!("{} bytes a stage", t.stage_size),
+            format!("{} bytes per stage", t.stage_size),
             format!("at least {FIRST_STAGE}"),
         )?;
         ensure(!t.stages.is_null() && t.stages.is_aligned(), place, "stages", "nothing", "a table")?;

@@ -47,7 +47,7 @@ impl Orbiting {
         Self { arc: -self.arc, ..self }
     }
 
-    /// With a detector that extends `short_side` mm past the axis on its shorter side.
+    /// With a detector that extends `short_side` mm past the axis on its shorter side (negative: short of the axis).
     fn aside(self, short_side: f64, along_u: bool) -> Self {
         Self { short_side, along_u, ..self }
     }

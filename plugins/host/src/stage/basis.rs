@@ -46,7 +46,7 @@ impl BasisStage {
         count.ok_or_else(many)?;
         let double = own.functions.expand_f64.is_some() && own.functions.adjoint_f64.is_some();
         if info.double_precision != 0 && !double {
-            return Err(own.wrong("info", "it does not work in double precision, and says that it does"));
+            return Err(own.wrong("info", "it declares double precision but has no operators for it"));
         }
         Ok(ExpansionOn { own, coefficients, info })
     }

@@ -136,13 +136,13 @@ fn sound(i: &ConefieldInfo) -> Result<Info, String> {
     let scope = match i.scope {
         CONEFIELD_SCOPE_ROW => Scope::Row,
         CONEFIELD_SCOPE_RAY => Scope::Ray,
-        other => return Err(format!("it looks as far as {other}, which is none of the known scopes")),
+        other => return Err(format!("its scope {other} is unknown")),
     };
     let grads = match i.grads {
         CONEFIELD_GRADS_NONE => GradKind::None,
         CONEFIELD_GRADS_DENSE => GradKind::Dense,
         CONEFIELD_GRADS_SCATTER => GradKind::Scatter,
-        other => return Err(format!("its gradients are {other}, which is none of the known kinds")),
+        other => return Err(format!("its kind of gradients {other} is unknown")),
     };
     if (params == 0) != (grads == GradKind::None) {
         return Err(format!("{params} parameters with gradients {grads:?}"));
@@ -158,16 +158,16 @@ fn able(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<(), &'static s
         (i.params == 0 || f.init.is_some(), "there are parameters and no function init"),
         (
             i.double_precision == 0 || (f.forward_f64.is_some() && f.backward_f64.is_some()),
-            "it has no kernels in double precision, and says that it has",
+            "it declares double-precision kernels but has none",
         ),
         (
             i.halves == 0 || (f.forward_halves.is_some() && f.backward_halves.is_some()),
-            "it has no kernels that read halves, and says that it has",
+            "it declares half-precision kernels but has none",
         ),
         (!lines || (f.project.is_some() && f.backproject.is_some()), "it has no line integrals of its own"),
         (
             !lines || (f.project_f64.is_some() && f.backproject_f64.is_some()),
-            "its line integrals cannot be had in double precision",
+            "it has no line integrals in double precision",
         ),
     ];
     all.into_iter().find(|(holds, _)| !holds).map_or(Ok(()), |(_, what)| Err(what))
@@ -203,7 +203,7 @@ fn parameters(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Para
         let status =
             own.functions.parameter.map_or(CONEFIELD_FAILED, |f| unsafe { f(own.handle.stage, index, &mut p) });
         if status != CONEFIELD_OK {
-            return Err(wrong(format!("block {index} of {} cannot be had", i.blocks)));
+            return Err(wrong(format!("block {index} of {} is missing", i.blocks)));
         }
         if p.name.length == 0 || p.name.length > 256 || p.dimensions > 8 || p.name.data.is_null() {
             return Err(wrong(format!(

@@ -213,7 +213,7 @@ macro_rules! in_halves {
                 let $kernel = halves.bf16;
                 $run
             }
-            other => return Err(Error::unsupported("halves", format!("{other} is none of the known formats"))),
+            other => return Err(Error::unsupported("halves", format!("the format {other} is unknown"))),
         }
     }};
 }

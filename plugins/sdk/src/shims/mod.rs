@@ -81,7 +81,7 @@ fn guard(error: *mut ConefieldText, f: impl FnOnce() -> Result<()>) -> Conefield
         }
         Err(panic) => {
             let text = panic.downcast_ref::<String>().map(String::as_str);
-            let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a word");
+            let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a message");
             write(error, &format!("panicked: {text}"));
             // Dropping the payload could panic again.
             mem::forget(panic);

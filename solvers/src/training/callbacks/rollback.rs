@@ -58,7 +58,7 @@ conefield_core::stage_type!(Callback, "rollback", Rollback, "returns a diverging
 #[typetag::serde(name = "rollback")]
 impl CallbackSpec for Rollback {
     fn build(&self) -> Result<Box<dyn Callback>> {
-        ensure(self.times > 0, "spec", "times", 0, "at least 1; leave rollback out to never go back")?;
+        ensure(self.times > 0, "spec", "times", 0, "at least 1; omit rollback to disable it")?;
         Ok(Box::new(Guard { times: self.times, loss: None, measured: 0.0, watched: Watched::default(), copy: None }))
     }
 
