@@ -1,6 +1,6 @@
-/* Encoders that do one thing wrong each, chosen by -DFAULT=… or by another NAME, SCHEMA or ENTRY: what the host and the
- * conformance kit must find. Without a fault it is a sound encoder: y = a * x, each coordinate times a number that is
- * learned. */
+/* Encoders with one fault each, selected by -DFAULT=… or by another NAME, SCHEMA or ENTRY, which the host or the
+ * conformance kit must detect. Without a fault it is a valid encoder: y = a * x, each coordinate times a learned
+ * number. */
 #define _POSIX_C_SOURCE 199309L
 #include "conefield_plugin.h"
 
@@ -164,7 +164,7 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
     return CONEFIELD_OK;
 }
 
-/* Takes every parameter for 1, or every result for NaN. */
+/* Treats every parameter as 1, or returns NaN. */
 static ConefieldStatus forward_halves(const void *stage, uint32_t format, const uint16_t *params, struct ConefieldTile x,
                                       struct ConefieldTileMut y, struct ConefieldTileMut tape,
                                       struct ConefieldText *error) {
@@ -194,7 +194,7 @@ static ConefieldStatus resolutions(const void *stage, double *cells, size_t coun
     return CONEFIELD_OK;
 }
 
-/* Says that it leaves out channels, and hands itself back. */
+/* Claims to remove channels, but returns itself. */
 static ConefieldStatus reduce(const void *stage, uint32_t side, const size_t *keep, size_t count,
                               struct ConefieldReduced *out, struct ConefieldText *error) {
     (void)side, (void)keep, (void)count, (void)error;

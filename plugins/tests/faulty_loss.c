@@ -1,5 +1,5 @@
-/* Losses that do one thing wrong each, chosen by -DFAULT=…: what the host and the conformance kit must find. Without a
- * fault it is a sound loss: half the squared difference. */
+/* Losses with one fault each, selected by -DFAULT=…, which the host or the conformance kit must detect. Without a fault
+ * it is a valid loss: half the squared difference. */
 #include "conefield_plugin.h"
 
 #include <math.h>

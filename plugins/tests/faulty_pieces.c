@@ -1,5 +1,5 @@
-/* A regularizer, a data term, a basis and a line field of which one does one thing wrong, chosen by -DFAULT=…: what the host
- * and the conformance kit must find. Without a fault they are sound: half the squares of coefficients, half the squares of
+/* A regularizer, a data term, a basis and a line field, one of them with one fault, selected by -DFAULT=…, which the host
+ * or the conformance kit must detect. Without a fault they are valid: half the squares of coefficients, half the squares of
  * residuals, the voxels themselves, and one blob in the middle of the cube. */
 #include "conefield_plugin.h"
 
@@ -62,12 +62,12 @@ static ConefieldStatus fails(struct ConefieldText *error, const char *line) {
 /* Calls of this process. */
 static _Atomic size_t calls;
 
-/* Whether the fault `later` shows: after some calls. */
+/* Whether the fault `later` occurs: after some calls. */
 static int later(enum Fault fault) {
     return FAULT == fault && calls++ > 20;
 }
 
-/* Settings of any of them, a penalty, a misfit or an expansion: a grid, and what a penalty remembers. */
+/* Settings, a penalty, a misfit or an expansion: a grid, and the state of a penalty. */
 struct Stage {
     struct ConefieldGrid grid;
     float state;
@@ -129,7 +129,7 @@ static ConefieldStatus prox(void *penalty, const float *v, size_t n, float tau, 
     struct Stage *p = penalty;
     if (FAULT == R_FAILS || later(R_LATER)) return fails(error, "no more numbers");
     float by = FAULT == R_HALVED ? 1 + 0.5f * tau : 1 + tau;
-    /* The first call is a little off, and that is no part of the state. */
+    /* The first call is slightly wrong, and this is not part of the state. */
     if (FAULT == R_FORGETS && p->state == 0) by *= 1.01f;
     p->state = 1;
     for (size_t i = 0; i < n; i++) u[i] = v[i] > 0 || FAULT == R_BELOW ? v[i] / by : 0;

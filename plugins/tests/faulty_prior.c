@@ -1,5 +1,5 @@
-/* Priors that do one thing wrong each, chosen by -DFAULT=…: what the host and the conformance kit must find. Without a
- * fault it is a sound prior: half the squares of the values. */
+/* Priors with one fault each, selected by -DFAULT=…, which the host or the conformance kit must detect. Without a fault
+ * it is a valid prior: half the squares of the values. */
 #include "conefield_plugin.h"
 
 #include <math.h>

@@ -1,6 +1,5 @@
-/* Projectors that do one thing wrong each where they are fitted to a scene, chosen by -DFAULT=…: what the host and the
- * conformance kit must find. Without a fault it is a sound projector: equal intervals inside the box, twice as many once it
- * is fitted. */
+/* Projectors with one fault each when they are fitted to a scene, selected by -DFAULT=…, which the host or the conformance
+ * kit must detect. Without a fault it is a valid projector: equal intervals inside the box, twice as many after fitting. */
 #include "conefield_plugin.h"
 
 #include <math.h>

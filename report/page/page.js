@@ -1,4 +1,4 @@
-// Shows what the page holds: `page` is one JSON object; the voxels of a volume stand in an element of their own, as 16-bit
+// Shows the content of the page: `page` is one JSON object; each volume has its own element with its voxels, as 16-bit
 // integers, gzip, base64. All text reaches the document as text, never as markup.
 "use strict";
 (async () => {
@@ -6,7 +6,7 @@
   const page = JSON.parse(byId("page").textContent);
   const { volumes, runs, scans } = page;
 
-  /** An element with attributes and children; texts become text nodes. */
+  /** An element with attributes and children; strings become text nodes. */
   function element(name, attributes = {}, ...children) {
     const made = document.createElement(name);
     for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -24,7 +24,7 @@
   const seconds = (s) => (s < 60 ? `${s.toFixed(1)} s` : s < 3600 ? `${Math.floor(s / 60)} min ${String(Math.round(s % 60)).padStart(2, "0")} s` : `${(s / 3600).toFixed(2)} h`);
   const bytes = (n) => (n >= 2 ** 30 ? `${(n / 2 ** 30).toFixed(2)} GiB` : n >= 2 ** 20 ? `${(n / 2 ** 20).toFixed(1)} MiB` : `${(n / 1024).toFixed(0)} KiB`);
 
-  // The head, warnings and tables need no library: they come first and stand whatever fails after them.
+  // The head, warnings and tables need no library: they come first and stay, whatever fails later.
 
   byId("scan-line").textContent = scans.map((s) => s.line).join("; ");
   document.querySelector("h1").textContent = page.title;
@@ -63,7 +63,7 @@
     const known = parts.map(([name, key], i) => [name, run.record?.[key] ?? 0, page.colours[i]]).filter(([, s]) => s > 0);
     const all = known.reduce((sum, [, s]) => sum + s, 0);
     if (all === 0) continue;
-    // Short parts have no room for their names in the bar: all names stand above it.
+    // Short parts have no room for their names in the bar: all names are above it.
     const bar = element("div", { class: "bar" }), names = element("p", {}, `${run.name}: `);
     for (const [name, s, colour] of known) {
       const [part, swatch] = [element("span", { title: `${name}: ${seconds(s)}` }), element("span", { class: "swatch" })];
@@ -96,7 +96,7 @@
   });
   byId("geometry-section").hidden = scans.every((s) => !s.geometry);
 
-  // Projections: a view at a time, measured on the left, every run's prediction and what is left beside it.
+  // Projections: one view at a time, measured on the left, beside it every run's prediction and residual.
   scans.forEach((scan, at) => {
     const projected = runs.filter((r) => r.scan === at && r.views);
     if (scan.views.length === 0 || projected.length === 0) return;
@@ -154,7 +154,7 @@
         ],
       }, data, box));
     }
-    // Boxes share a row: each is as wide as it stays once all are there.
+    // Boxes share a row: each has its final width from the start.
     const widths = Array.from(byId("curves").children, (box) => Math.max(300, box.clientWidth - 4));
     drawn_plots.forEach((draw, i) => draw(widths[i]));
     byId("curves-section").hidden = byId("curves").childElementCount === 0;
@@ -168,7 +168,7 @@
   window.addEventListener("resize", () => { clearTimeout(resized); resized = setTimeout(curves, 200); });
   curves();
 
-  // The page of a run that goes on asks for a newer one, and takes over what the reader has opened. Without an answer it stays.
+  // The page of an unfinished run requests a newer one and keeps open sections open. Without an answer it stays.
   if (page.renewed) {
     const kept = JSON.parse(sessionStorage.getItem("kept") ?? "{}");
     for (const summary of document.querySelectorAll("summary")) summary.parentElement.open = (kept.open ?? []).includes(summary.textContent);
@@ -213,7 +213,7 @@
   const real = (volume, x) => (x === NO_NUMBER ? NaN : x * volume.slope + volume.offset);
   const same = (a, b) => a.shape.every((n, k) => n === b.shape[k]) && a.spacing.every((s, k) => Math.abs(s - b.spacing[k]) <= 1e-6 * s);
 
-  /** Values less values, and what all but half a percent of them stay within; the last two are kept, one a canvas. */
+  /** The difference of two volumes, and a bound of all but half a percent of it; the last two are cached, one per canvas. */
   const differences = new Map();
   async function difference(a, b) {
     const name = `${a},${b}`;
@@ -227,7 +227,7 @@
     return differences.get(name);
   }
 
-  /** A volume as a NIfTI-1 file, which the viewer reads. Voxels stand in the scan's millimetres. */
+  /** A volume as a NIfTI-1 file for the viewer, positioned in the scan's millimetres. */
   function nifti(volume, values) {
     const floats = values instanceof Float32Array;
     const buffer = new ArrayBuffer(352 + values.byteLength), view = new DataView(buffer);
@@ -311,7 +311,7 @@
     }
   }
 
-  /** What lies between the ends of the colours, of values or of a difference. */
+  /** The range of the colour map, of values or of a difference. */
   const windowOf = (minus) => (minus < 0 ? state.window : [-(state.span ?? state.usual), state.span ?? state.usual]);
 
   function showWindow() {
@@ -346,7 +346,7 @@
       };
       return this;
     }
-    /** Shows volume `index`, less volume `minus` unless that is -1. */
+    /** Shows volume `index`, minus volume `minus` unless that is -1. */
     async show(index, minus) {
       const name = `${index},${minus}`;
       this.minus = minus;
@@ -360,7 +360,7 @@
       }
       this.window();
     }
-    /** What stands in the canvas, in words. */
+    /** A description of the content of the canvas. */
     caption() {
       const [index, minus] = this.shown.split(",").map(Number);
       return volumes[index].name + (minus < 0 ? "" : ` minus ${volumes[minus].name}`);
@@ -371,7 +371,7 @@
       [image.cal_min, image.cal_max] = windowOf(this.minus);
       this.nv.updateGLVolume();
     }
-    /** Puts the crosshair at the millimetres `mm`. */
+    /** Moves the crosshair to `mm`. */
     go(mm) {
       this.nv.scene.crosshairPos = this.nv.mm2frac(mm);
       this.nv.drawScene();
@@ -382,7 +382,7 @@
     }
   }
 
-  /** The voxel of `volume` at the millimetres `mm`, or null outside. */
+  /** The voxel of `volume` at `mm`, or null outside. */
   function voxel(volume, mm) {
     const at = [0, 1, 2].map((k) => Math.round((mm[k] - first(volume, k)) / volume.spacing[k]));
     return at.every((i, k) => i >= 0 && i < volume.shape[k]) ? at : null;
@@ -392,7 +392,7 @@
     return real(volumes[index], (await stored(index))[at[0] + shape[0] * (at[1] + shape[1] * at[2])]);
   }
 
-  /** Tells the values at the crosshair, which is at the millimetres `mm` now. */
+  /** Shows the values at the crosshair, which is now at `mm`. */
   let asked = 0;
   async function moved(mm) {
     const mine = ++asked;
@@ -401,7 +401,7 @@
     const rows = [];
     for (let i = 0; i < volumes.length; i++) {
       const here = voxel(volumes[i], mm);
-      // Volumes that were not looked at yet stay packed.
+      // Volumes that have not been shown yet stay packed.
       const known = decoded.has(i) || volumes.length <= 6;
       const found = here && known ? await value(i, here) : undefined;
       rows.push([volumes[i], found]);
@@ -429,7 +429,7 @@
     later = setTimeout(() => {
       const parts = { show: state.show, minus: state.minus, beside: state.beside, window: state.window.map((x) => Number(x.toPrecision(6))), at: state.at?.map((x) => Number(x.toPrecision(6))) ?? null };
       const text = Object.entries(parts).filter(([, v]) => v !== null && v !== -1).map(([k, v]) => `${k}=${[v].flat().join(",")}`).join("&");
-      try { history.replaceState(null, "", `#${text}`); } catch { /* An address that may not change stays as it is. */ }
+      try { history.replaceState(null, "", `#${text}`); } catch { /* The address may be read-only. */ }
     }, 200);
   }
 
@@ -443,7 +443,7 @@
     frame = requestAnimationFrame(() => { panes().forEach((p) => p.window()); remember(); });
   }
 
-  /** Brings both canvases in line with `state`, one call after the other. */
+  /** Updates both canvases to `state`, one call at a time. */
   let work = Promise.resolve();
   const display = () => (work = work.then(draw, draw));
   async function draw() {

@@ -1,7 +1,7 @@
 /* A basis for conefield in C: a coefficient for each block of voxels. */
 @head@
 
-/* What a spec may set. */
+/* Settings in a spec. */
 struct Settings {
     size_t edge;
 };
@@ -15,7 +15,7 @@ struct Blocks {
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
     (void)context;
-    (void)width; /* 0, of a basis */
+    (void)width; /* 0 for a basis */
     (void)error;
     struct Settings *s = malloc(sizeof *s);
     if (s == NULL) return CONEFIELD_FAILED;
@@ -24,7 +24,7 @@ static ConefieldStatus create(const void *context, struct ConefieldStr settings,
     return CONEFIELD_OK;
 }
 
-/* Of settings and of what `on` makes. */
+/* For settings and for results of `on`. */
 static void destroy(void *stage) {
     free(stage);
 }
@@ -71,7 +71,7 @@ static size_t count(const struct ConefieldGrid *grid) {
     return grid->shape[0] * grid->shape[1] * grid->shape[2];
 }
 
-/* Both directions in one precision: voxels of coefficients, and the sum of a block's voxels. */
+/* Both directions in one precision: coefficients to voxels, and the sums over the voxels of each block. */
 #define BOTH(real, expand, adjoint) \
     static ConefieldStatus expand(const void *expansion, const real *coefficients, real *voxels, struct ConefieldText *error) { \
         const struct Blocks *b = expansion; \

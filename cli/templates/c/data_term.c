@@ -1,7 +1,7 @@
-/* A data term for conefield in C: squares of small residuals, the size of large ones. */
+/* A data term for conefield in C: quadratic for small residuals, linear for large ones. */
 @head@
 
-/* What a spec may set. */
+/* Settings in a spec. */
 struct Settings {
     double from;
 };
@@ -14,7 +14,7 @@ struct Misfit {
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
     (void)context;
-    (void)width; /* 0, of a data term */
+    (void)width; /* 0 for a data term */
     (void)error;
     struct Settings *s = malloc(sizeof *s);
     if (s == NULL) return CONEFIELD_FAILED;
@@ -23,14 +23,14 @@ static ConefieldStatus create(const void *context, struct ConefieldStr settings,
     return CONEFIELD_OK;
 }
 
-/* Of settings and of what `of` makes. */
+/* For settings and for results of `of`. */
 static void destroy(void *stage) {
     free(stage);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
     (void)stage;
-    say(text, "squares of small residuals, the size of large ones");
+    say(text, "quadratic for small residuals, linear for large ones");
     return CONEFIELD_OK;
 }
 
@@ -39,7 +39,7 @@ static int order(const void *a, const void *b) {
     return (x > y) - (x < y);
 }
 
-/* Measures the noise: second differences along rows hold little else, and their median is hardly moved by edges. */
+/* Measures the noise: second differences along rows contain little else, and edges hardly change their median. */
 static ConefieldStatus of(const void *stage, const float *measured, const size_t *shape, void **misfit,
                           struct ConefieldText *error) {
     size_t rows = shape[0] * shape[1], columns = shape[2], count = 0;
@@ -89,7 +89,7 @@ static ConefieldStatus differentiate(const void *misfit, size_t view, const floa
     return CONEFIELD_OK;
 }
 
-/* The second derivative is 1 at most, and derivatives scatter at most as the noise does: values stay as they are. */
+/* The second derivative is at most 1, and derivatives scatter at most like the noise: values stay unchanged. */
 static ConefieldStatus as_they_are(const void *misfit, size_t view, const float *measured, size_t count, float *values,
                                    struct ConefieldText *error) {
     (void)misfit;
@@ -114,7 +114,7 @@ static const struct ConefieldDataTerm DATA_TERM = {
 static const struct ConefieldStage STAGES[] = {{
     .kind = CONEFIELD_DATA_TERM,
     .name = TEXT("@name@"),
-    .doc = TEXT("squares of small residuals, the size of large ones"),
+    .doc = TEXT("quadratic for small residuals, linear for large ones"),
     .schema = TEXT(
         "{\"type\":\"object\",\"properties\":{"
         "\"from\":{\"type\":\"number\",\"exclusiveMinimum\":0,\"default\":3.0,\"description\":\"Residuals of at least this many standard deviations of the noise count by their size.\"}}}"),

@@ -13,7 +13,7 @@ typedef struct {
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
     (void)context;
-    (void)width; /* 3, of an encoder */
+    (void)width; /* 3 for an encoder */
     double bands = number(settings, "bands");
     if (!(bands >= 1 && bands <= 16)) {
         char line[80];

@@ -32,7 +32,7 @@ static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
     return CONEFIELD_OK;
 }
 
-/* One number of tape: the slope of the softplus. */
+/* One number per row of tape: the derivative of the softplus. */
 static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
     size_t n = ((const Sum *)stage)->width;
     *out = (struct ConefieldInfo){.input = n, .output = 1, .params = n + 1, .blocks = 2, .tape = 1, .macs = n,
@@ -74,7 +74,7 @@ static ConefieldStatus forward(const void *stage, const float *params, struct Co
     return CONEFIELD_OK;
 }
 
-/* Adds to the gradient of parameter `at`, if that is asked for. */
+/* Adds to the gradient of parameter `at`, if it is requested. */
 static void add(struct ConefieldGrads grads, size_t at, float sum) {
     if (at >= grads.start && at - grads.start < grads.length) grads.data[at - grads.start] += sum;
 }

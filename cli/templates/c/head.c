@@ -7,7 +7,7 @@
 
 #define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
 
-/* Writes a line for people. */
+/* Writes a readable line. */
 static void say(struct ConefieldText *out, const char *line) {
     if (out == NULL) return;
     out->length = strlen(line);
@@ -15,7 +15,7 @@ static void say(struct ConefieldText *out, const char *line) {
 }
 
 /* The number under `key` of the settings: one flat JSON object, checked against the schema by the host, with defaults filled in.
- * For numbers only: settings that are texts, lists or tables need a JSON parser. NaN if the key is not there. */
+ * For numbers only: settings that are texts, lists or tables need a JSON parser. NaN if the key is missing. */
 static double number(struct ConefieldStr settings, const char *key) {
     char quoted[64];
     char *text = malloc(settings.length + 1);

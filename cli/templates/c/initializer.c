@@ -1,7 +1,7 @@
 /* An initializer for conefield in C: fills parameters before training.
  *
- * This start fills every block of the encoder with uniform numbers; every other block stays as its stage's own scheme made
- * it.
+ * This start fills every block of the encoder with uniform numbers; every other block keeps the initialization by its
+ * own stage.
  */
 @head@
 

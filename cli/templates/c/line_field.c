@@ -27,7 +27,7 @@ static void destroy(void *stage) {
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
     char line[80];
-    snprintf(line, sizeof line, "%zu blobs a side", ((const struct Blobs *)stage)->shape[0]);
+    snprintf(line, sizeof line, "%zu blobs per side", ((const struct Blobs *)stage)->shape[0]);
     say(text, line);
     return CONEFIELD_OK;
 }
@@ -46,7 +46,7 @@ static ConefieldStatus parameter(const void *stage, size_t index, struct Conefie
     return CONEFIELD_OK;
 }
 
-/* All blobs begin with a height of 0. */
+/* All blobs start with a height of 0. */
 static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
     (void)stage;
     (void)seed;
@@ -55,7 +55,7 @@ static ConefieldStatus init(const void *stage, uint64_t seed, float *params, siz
     return CONEFIELD_OK;
 }
 
-/* The way from `at` to the middle of blob `i`. */
+/* The vector from `at` to the centre of blob `i`. */
 static void way(const struct Blobs *b, size_t i, const double at[3], double way[3]) {
     size_t n = b->shape[0], place[3] = {i / (n * n), i / n % n, i % n};
     for (size_t k = 0; k < 3; k++) way[k] = ((double)place[k] + 0.5) / (double)n - at[k];
@@ -65,7 +65,7 @@ static double dot(const double a[3], const double b[3]) {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-/* The line integral along a ray of blob `i` with a height of 1. */
+/* The line integral of blob `i`, with a height of 1, along a ray. */
 static double along(const struct Blobs *b, size_t i, const struct ConefieldRay *ray) {
     const double from[3] = {ray->origin[0], ray->origin[1], ray->origin[2]};
     const double direction[3] = {ray->direction[0], ray->direction[1], ray->direction[2]};
@@ -79,7 +79,7 @@ static int inside(const struct ConefieldRay *ray) {
     return ray->inside[1] > ray->inside[0];
 }
 
-/* Everything in one precision: values at points with their gradients, line integrals with theirs. */
+/* All functions in one precision: values at points and line integrals, each with their gradients. */
 #define PRECISION(real, Tile, TileMut, Grads, forward, backward, project, backproject) \
     static ConefieldStatus forward(const void *stage, const real *params, struct Tile x, struct TileMut y, \
                                    struct TileMut tape, struct ConefieldText *error) { \
@@ -126,7 +126,7 @@ static int inside(const struct ConefieldRay *ray) {
         } \
         return CONEFIELD_OK; \
     } \
-    /* The adjoint: the same lengths the other way. */ \
+    /* The adjoint uses the same lengths. */ \
     static ConefieldStatus backproject(const void *stage, const real *params, const struct ConefieldRay *rays, \
                                        size_t count, const real *dlines, struct Grads grads, \
                                        struct ConefieldText *error) { \

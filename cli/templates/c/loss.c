@@ -8,7 +8,7 @@ typedef struct {
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
     (void)context;
-    (void)width; /* 0, of a loss */
+    (void)width; /* 0 for a loss */
     double scale = number(settings, "scale");
     if (!(scale > 0 && isfinite(scale))) {
         char line[80];
@@ -34,7 +34,7 @@ static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
     return CONEFIELD_OK;
 }
 
-/* The loss of each pair, and its derivative by the predicted value. */
+/* The loss of each pair, and its derivative with respect to the predicted value. */
 static ConefieldStatus at(const void *stage, const double *predicted, const double *measured, size_t count, double *loss,
                           double *slope, struct ConefieldText *error) {
     (void)error;

@@ -64,7 +64,7 @@ static ConefieldStatus forward(const void *stage, const float *params, struct Co
     return CONEFIELD_OK;
 }
 
-/* Adds to the gradient of parameter `at`, if that is asked for. */
+/* Adds to the gradient of parameter `at`, if it is requested. */
 static void add(struct ConefieldGrads grads, size_t at, float sum) {
     if (at >= grads.start && at - grads.start < grads.length) grads.data[at - grads.start] += sum;
 }
@@ -89,8 +89,8 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
     return CONEFIELD_OK;
 }
 
-/* Channels stand alone: without some, the rest is a smaller stage of the same kind. The lists of what it keeps live as long
- * as it does, behind it in the same memory. */
+/* Channels are independent: without some, the rest is a smaller stage of the same kind. The lists of kept items are stored
+ * behind it in the same memory and live as long as it does. */
 static ConefieldStatus reduce(const void *stage, uint32_t side, const size_t *keep, size_t count,
                               struct ConefieldReduced *out, struct ConefieldText *error) {
     (void)side;

@@ -4,11 +4,11 @@
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
     (void)context;
-    (void)width; /* 0, of a prior */
+    (void)width; /* 0 for a prior */
     (void)error;
     struct ConefieldBlocks *b = malloc(sizeof *b);
     if (b == NULL) return CONEFIELD_FAILED;
-    /* The host refuses blocks that cannot be. */
+    /* The host refuses invalid blocks. */
     *b = (struct ConefieldBlocks){.edge = (size_t)number(settings, "edge"), .count = (size_t)number(settings, "blocks"),
                                   .spacing = number(settings, "spacing"), .weight = number(settings, "weight")};
     *stage = b;
@@ -31,7 +31,7 @@ static ConefieldStatus blocks(const void *stage, struct ConefieldBlocks *out) {
     return CONEFIELD_OK;
 }
 
-/* The penalty. `scale` times its derivatives go on top of `gradient`. */
+/* The penalty. Adds `scale` times its derivatives to `gradient`. */
 static ConefieldStatus block(const void *stage, const double *values, size_t count, double scale, double *gradient,
                              double *penalty, struct ConefieldText *error) {
     (void)error;

@@ -1,7 +1,7 @@
-/* A projector for conefield in C: rays to samples, each with the length that it stands for.
+/* A projector for conefield in C: rays to samples, each with its length.
  *
  * This start takes the middles of equal intervals within the reconstruction box. The line integral is the sum of
- * attenuation times length; the host does that, and its adjoint, where `integrate` and `adjoint` are left out.
+ * attenuation times length; the host computes it and its adjoint if `integrate` and `adjoint` are NULL.
  */
 @head@
 
@@ -33,7 +33,7 @@ static void destroy(void *stage) {
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
     char line[80];
-    snprintf(line, sizeof line, "%zu samples a ray", ((const March *)stage)->samples);
+    snprintf(line, sizeof line, "%zu samples per ray", ((const March *)stage)->samples);
     say(text, line);
     return CONEFIELD_OK;
 }
@@ -45,7 +45,7 @@ static size_t max_samples(const void *stage, const struct ConefieldRay *ray) {
 static ConefieldStatus sample(const void *stage, const struct ConefieldRay *ray, const uint64_t *seed, float *points,
                               float *weights, size_t capacity, size_t *count, struct ConefieldText *error) {
     (void)seed; /* nothing is random here */
-    (void)capacity; /* as many as max_samples said */
+    (void)capacity; /* the result of max_samples */
     (void)error;
     size_t n = max_samples(stage, ray);
     float near = ray->inside[0], length = n > 0 ? (ray->inside[1] - near) / (float)n : 0.0f;

@@ -1,7 +1,7 @@
 /* A regularizer for conefield in C: quadratic smoothness, half the squared differences of neighbouring coefficients. */
 @head@
 
-/* What a spec may set. */
+/* Settings in a spec. */
 struct Settings {
     double weight;
     size_t inner;
@@ -10,7 +10,7 @@ struct Settings {
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
     (void)context;
-    (void)width; /* 0, of a regularizer */
+    (void)width; /* 0 for a regularizer */
     (void)error;
     struct Settings *s = malloc(sizeof *s);
     if (s == NULL) return CONEFIELD_FAILED;
@@ -19,7 +19,7 @@ static ConefieldStatus create(const void *context, struct ConefieldStr settings,
     return CONEFIELD_OK;
 }
 
-/* Of settings and of penalties: both are one piece of memory. */
+/* For settings and for penalties: both are one allocation. */
 static void destroy(void *stage) {
     free(stage);
 }
@@ -33,9 +33,9 @@ static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
 /* The penalty on one grid. */
 struct Penalty {
     size_t shape[3], count, inner;
-    /* What a squared difference along each axis counts. */
+    /* Weight of a squared difference along each axis. */
     float strength[3];
-    /* Where the last call ended, and the next one begins; then the gradient of the penalty. */
+    /* The result of the last call, from which the next one starts; then the gradient of the penalty. */
     float numbers[];
 };
 
@@ -62,7 +62,7 @@ static ConefieldStatus on(const void *stage, const struct ConefieldGrid *grid, v
     return CONEFIELD_OK;
 }
 
-/* The weight: times what the scan's noise comes to in the gradient of the data term. */
+/* The weight, as a multiple of the scan's noise in the gradient of the data term. */
 static ConefieldStatus weight(const void *stage, const struct ConefieldGrid *grid, double (*noise)(void *, double),
                               void *context, double *weight, struct ConefieldText *error) {
     (void)grid;
@@ -96,7 +96,7 @@ static ConefieldStatus value(const void *penalty, const float *x, size_t count, 
     return CONEFIELD_OK;
 }
 
-/* Goes some steps down the gradient, towards the least of half the squared distance from `v` plus tau times the penalty. */
+/* Takes some gradient steps towards the minimum of half the squared distance from `v` plus tau times the penalty. */
 static ConefieldStatus prox(void *penalty, const float *v, size_t count, float tau, float *u, struct ConefieldText *error) {
     (void)error;
     struct Penalty *p = penalty;
@@ -114,7 +114,7 @@ static ConefieldStatus prox(void *penalty, const float *v, size_t count, float t
     return CONEFIELD_OK;
 }
 
-/* What the next call of `prox` starts from: it goes into checkpoints. */
+/* The state from which the next call of `prox` starts, for checkpoints. */
 static ConefieldStatus state(void *penalty, size_t index, struct ConefieldState *state) {
     static const struct ConefieldStr name = TEXT("u");
     struct Penalty *p = penalty;

@@ -5,7 +5,7 @@ use conefield_plugin::prelude::*;
 conefield_plugin::export!();
 stage_type!(Basis, "@name@", Settings, "blocks of voxels");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
@@ -33,7 +33,7 @@ impl Basis for Settings {
     }
 
     fn describe(&self) -> String {
-        format!("@name@: blocks of {} voxels an edge", self.edge)
+        format!("@name@: blocks of {} voxels per edge", self.edge)
     }
 }
 
@@ -44,7 +44,7 @@ struct Blocks {
 }
 
 impl Expansion for Blocks {
-    /// Where the coefficients stand. At the far end a block may reach beyond the voxels.
+    /// Positions of the coefficients. At the far end a block may reach beyond the voxels.
     fn coefficients(&self) -> VoxelGrid {
         let VoxelGrid { shape, spacing, center } = self.voxels;
         let blocks = shape.map(|n| n.div_ceil(self.edge));
@@ -63,7 +63,7 @@ impl Expansion for Blocks {
 }
 
 impl<R: Real> BasisOperator<R> for Blocks {
-    /// Voxels of coefficients.
+    /// Expands coefficients to voxels.
     fn expand(&self, coefficients: ArrayView3<'_, R>, mut voxels: ArrayViewMut3<'_, R>) {
         let edge = self.edge;
         voxels.indexed_iter_mut().for_each(|((x, y, z), v)| *v = coefficients[[x / edge, y / edge, z / edge]]);

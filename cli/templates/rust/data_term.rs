@@ -4,9 +4,9 @@
 use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-stage_type!(DataTerm, "@name@", Settings, "squares of small residuals, the size of large ones");
+stage_type!(DataTerm, "@name@", Settings, "quadratic for small residuals, linear for large ones");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
@@ -41,7 +41,7 @@ impl DataTerm for Settings {
     }
 }
 
-/// The noise of a scan: second differences along rows hold little else, and their median is hardly moved by edges.
+/// The noise of a scan: second differences along rows contain little else, and edges hardly change their median.
 fn noise(measured: ArrayView3<'_, f32>) -> f64 {
     let mut all = vec![];
     for row in measured.rows() {
@@ -73,10 +73,10 @@ impl Misfit for On {
         sum
     }
 
-    /// The second derivative is 1 at most, so that values stay as they are.
+    /// The second derivative is at most 1, so values stay unchanged.
     fn curve(&self, _view: usize, _measured: &[f32], _values: &mut [f32]) {}
 
-    /// Derivatives scatter at most as the noise does.
+    /// Derivatives scatter at most like the noise.
     fn spread(&self, _view: usize, _measured: &[f32], _values: &mut [f32]) {}
 
     fn noise(&self) -> f64 {

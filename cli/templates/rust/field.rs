@@ -6,7 +6,7 @@ use conefield_plugin::prelude::*;
 conefield_plugin::export!();
 stage_type!(Field, "@name@", Settings, "a weighted sum through a softplus");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {

@@ -1,7 +1,7 @@
 //! An initializer for conefield: fills parameters before training.
 //!
-//! This start fills every block whose name begins with `prefix` with uniform numbers; every other block stays as its
-//! stage's own scheme made it.
+//! This start fills every block whose name begins with `prefix` with uniform numbers; every other block keeps the
+//! initialization by its own stage.
 
 use conefield_plugin::arena::{Arena, InitReport, Layout, Weights};
 use conefield_plugin::error::{Result, ensure};
@@ -13,13 +13,13 @@ use serde::{Deserialize, Serialize};
 conefield_plugin::export!();
 conefield_plugin::stage_type!(Initializer, "@name@", Settings, "uniform numbers in the blocks of one stage");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
     /// Fill blocks whose name begins with this, such as `encoder` or `field.0.weight`.
     pub prefix: String,
-    /// Numbers are uniform between minus and plus this.
+    /// Numbers are uniform in ± this.
     pub bound: f32,
 }
 

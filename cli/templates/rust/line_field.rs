@@ -5,7 +5,7 @@ use conefield_plugin::prelude::*;
 conefield_plugin::export!();
 stage_type!(LineField, "@name@", Settings, "Gaussian blobs on a grid");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
@@ -28,7 +28,7 @@ impl LineFieldSpec for Settings {
 }
 
 impl Settings {
-    /// The way from `at` to the middle of blob `i`.
+    /// The vector from `at` to the centre of blob `i`.
     fn way(&self, i: usize, at: [f64; 3]) -> [f64; 3] {
         let n = self.blobs;
         let place = [i / (n * n), i / n % n, i % n];
@@ -45,7 +45,7 @@ impl Settings {
         (-0.5 * square * self.sharpness()).exp()
     }
 
-    /// The line integral along a ray of blob `i` with a height of 1.
+    /// The line integral of blob `i`, with a height of 1, along a ray.
     fn along(&self, i: usize, ray: &UnitRay) -> f64 {
         let way = self.way(i, ray.origin.map(f64::from));
         let ahead = dot(way, ray.direction.map(f64::from));
@@ -66,7 +66,7 @@ impl RowMap for Settings {
         vec![("height".into(), vec![self.blobs; 3])]
     }
 
-    /// All blobs begin with a height of 0.
+    /// All blobs start with a height of 0.
     fn init(&self, _: u64, params: &mut [f32]) {
         params.fill(0.0);
     }
@@ -92,7 +92,7 @@ impl RowMap for Settings {
     }
 
     fn describe(&self) -> String {
-        format!("@name@: {} blobs a side", self.blobs)
+        format!("@name@: {} blobs per side", self.blobs)
     }
 }
 
@@ -101,7 +101,7 @@ impl RayMap for Settings {
         params.iter().enumerate().map(|(i, height)| *height * R::of(self.along(i, ray))).sum()
     }
 
-    /// The adjoint: the same lengths the other way.
+    /// The adjoint uses the same lengths.
     fn backproject<R: Real>(&self, params: &[R], ray: &UnitRay, dline: R, grads: &mut Sums<'_, R>) {
         (0..params.len()).for_each(|i| grads.add(i, dline * R::of(self.along(i, ray))));
     }

@@ -5,7 +5,7 @@ use conefield_plugin::prelude::*;
 conefield_plugin::export!();
 stage_type!(Loss, "@name@", Settings, "the absolute difference, rounded near 0");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
@@ -22,7 +22,7 @@ impl Default for Settings {
 #[typetag::serde(name = "@name@")]
 impl LossSpec for Settings {
     fn build(&self) -> Result<Box<dyn Loss>> {
-        // A shader has it in single precision.
+        // Shaders use single precision.
         let good = self.scale > 0.0 && (self.scale as f32).is_normal();
         ensure(good, "spec", "scale", self.scale, "a positive number of single precision")?;
         Ok(Box::new(self.clone()))
@@ -30,14 +30,14 @@ impl LossSpec for Settings {
 }
 
 impl Loss for Settings {
-    /// The loss and its derivative by `predicted`.
+    /// The loss and its derivative with respect to `predicted`.
     fn at(&self, predicted: f64, measured: f64) -> (f64, f64) {
         let d = predicted - measured;
         let size = d.hypot(self.scale);
         (d * (d / (size + self.scale)), d / size)
     }
 
-    /// The same for a GPU; without it the loss runs on the CPU alone.
+    /// The same for a GPU; without it the loss runs on the CPU only.
     fn wgsl(&self) -> Option<Fragment> {
         let scale = format!("const stage_scale = f32({:?});\n", self.scale as f32);
         let at = "fn stage_at(predicted: f32, measured: f32) -> vec2<f32> {

@@ -1,4 +1,4 @@
-//! The stage through conefield's conformance kit.
+//! Tests the stage with conefield's conformance kit.
 
 use @crate@::Settings;
 use conefield_conformance::check_loss;

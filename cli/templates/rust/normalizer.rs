@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 conefield_plugin::export!();
 conefield_plugin::stage_type!(Normalizer, "@name@", Settings, "a learned scale and shift of every channel");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
@@ -41,7 +41,7 @@ struct Affine {
     scale: f32,
 }
 
-// One source for the single precision that trains and the double precision that checks it.
+// One source for single precision (training) and double precision (checks).
 impl<R: Real> Kernel<R> for Affine {
     fn forward(&self, params: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
         let (scale, shift) = params.split_at(self.width);
@@ -118,7 +118,7 @@ impl Stage for Affine {
 }
 
 impl Normalizer for Affine {
-    /// Channels stand alone: without some, the rest is a smaller stage of the same kind.
+    /// Channels are independent: without some, the rest is a smaller stage of the same kind.
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
         let part = |start: usize| keep.iter().map(move |&c| start + c..start + c + 1);
         Ok(Reduced {

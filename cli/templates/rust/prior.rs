@@ -5,7 +5,7 @@ use conefield_plugin::prelude::*;
 conefield_plugin::export!();
 stage_type!(Prior, "@name@", Settings, "squared differences of neighbouring points");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
@@ -38,7 +38,7 @@ impl Prior for Settings {
         Blocks { edge: self.edge, count: self.blocks, spacing: self.spacing, weight: self.weight }
     }
 
-    /// The penalty. `scale` times its derivatives go on top of `gradient`.
+    /// The penalty. Adds `scale` times its derivatives to `gradient`.
     fn block(&self, values: &[f64], scale: f64, gradient: &mut [f64]) -> f64 {
         let mut sum = 0.0;
         for step in [self.edge * self.edge, self.edge, 1] {

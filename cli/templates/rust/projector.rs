@@ -1,4 +1,4 @@
-//! A projector for conefield: rays to samples, each with the length that it stands for.
+//! A projector for conefield: rays to samples, each with its length.
 //!
 //! This start takes the middles of equal intervals within the reconstruction box. The line integral is the sum of
 //! attenuation times length, and its adjoint comes with the trait.
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 conefield_plugin::export!();
 conefield_plugin::stage_type!(Projector, "@name@", Settings, "equal intervals within the box");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
@@ -43,7 +43,7 @@ impl Projector for Settings {
         if far > near { self.samples } else { 0 }
     }
 
-    /// `seed` is `None` when a finished field is rendered: nothing is random then.
+    /// `seed` is `None` for rendering: then nothing is random.
     fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples) {
         let [near, far] = ray.inside;
         let n = self.max_samples(ray);
@@ -60,6 +60,6 @@ impl Projector for Settings {
     }
 
     fn describe(&self) -> String {
-        format!("@name@: {} samples a ray", self.samples)
+        format!("@name@: {} samples per ray", self.samples)
     }
 }

@@ -5,7 +5,7 @@ use conefield_plugin::prelude::*;
 conefield_plugin::export!();
 stage_type!(Regularizer, "@name@", Settings, "squared differences of neighbours");
 
-/// What a spec may set.
+/// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
@@ -40,7 +40,7 @@ impl Regularizer for Settings {
         Ok(Box::new(On { shape: grid.shape, strength, inner: self.inner, u, slope }))
     }
 
-    /// The weight λ. `noise(k)` is k times what the scan's noise comes to in the gradient of the data term.
+    /// The weight λ. `noise(k)` is k times the root mean square of the scan's noise in the gradient of the data term.
     fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
         Ok(noise(self.weight))
     }
@@ -53,16 +53,16 @@ impl Regularizer for Settings {
 /// The penalty on one grid.
 struct On {
     shape: [usize; 3],
-    /// What a squared difference along each axis counts.
+    /// Weight of a squared difference along each axis.
     strength: [f32; 3],
     inner: usize,
-    /// Where the last call ended, and the next one begins.
+    /// The result of the last call, from which the next one starts.
     u: Vec<f32>,
     /// The gradient of the penalty.
     slope: Vec<f32>,
 }
 
-/// Hands `take` each pair of neighbours of a grid, with their axis.
+/// Calls `take` with each pair of neighbours of a grid and their axis.
 fn neighbours([x, y, z]: [usize; 3], mut take: impl FnMut(usize, usize, usize)) {
     for (axis, (step, n)) in [(y * z, x), (z, y), (1, z)].into_iter().enumerate() {
         (0..x * y * z).filter(|i| i / step % n + 1 < n).for_each(|i| take(i, i + step, axis));
@@ -78,7 +78,7 @@ impl Penalty for On {
         sum
     }
 
-    /// Goes some steps towards the least `½‖u − v‖² + tau·R(u)` with u ≥ 0, down the gradient.
+    /// Takes some gradient steps towards the minimum of `½‖u − v‖² + tau·R(u)` with u ≥ 0.
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
         let Self { shape, strength, inner, u: at, slope } = self;
         let share = 1.0 / (1.0 + tau * 4.0 * strength.iter().sum::<f32>());
@@ -96,7 +96,7 @@ impl Penalty for On {
         u.copy_from_slice(at);
     }
 
-    /// What the next call starts from: it goes into checkpoints.
+    /// The state from which the next call starts, for checkpoints.
     fn state(&mut self) -> Vec<(&str, &mut [f32])> {
         vec![("u", &mut self.u)]
     }

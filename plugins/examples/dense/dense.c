@@ -1,8 +1,8 @@
-/* A conefield plugin in C: an encoder of one dense grid, read trilinearly.
+/* A conefield plugin in C: an encoder with one dense grid and trilinear interpolation.
  *
- * Channel k of a point is the weighted sum of feature k at the eight nodes around it. Points outside the unit cube are taken
- * for the nearest on its faces. Each parameter is touched by few rows, so gradients are scattered; the range that a call is
- * asked for says which parameters it may add to.
+ * Channel k of a point is the weighted sum of feature k at the eight nodes around it. Points outside the unit cube are clamped
+ * to its faces. Each parameter is affected by few rows, so gradients are scattered; a call adds only to the parameters in the
+ * range that it gets.
  */
 #include "conefield_plugin.h"
 
@@ -75,7 +75,7 @@ static size_t params_of(const Grid *g) {
     return g->resolution * g->resolution * g->resolution * g->features;
 }
 
-/* A worker may own a slab of the grid along x. Few and wide ones: each goes through all rows. */
+/* A worker may own a slab of the grid along x. Slabs are few and wide, because each one visits all rows. */
 static size_t slabs_of(const Grid *g) {
     return g->resolution < 8 ? g->resolution : 8;
 }
@@ -119,13 +119,13 @@ static ConefieldStatus init(const void *stage, uint64_t seed, float *params, siz
     return CONEFIELD_OK;
 }
 
-/* The node below a coordinate that counts cells. NaN compares false: its node is 0. */
+/* The node below a coordinate in cells. NaN compares false: its node is 0. */
 static size_t node_below(const Grid *g, float at) {
     size_t node = at > 0.0f ? (size_t)at : 0;
     return node > g->resolution - 2 ? g->resolution - 2 : node;
 }
 
-/* A coordinate of the cube in cells of the grid; outside the cube that of the nearest face. */
+/* Converts a coordinate of the cube to cells of the grid, clamped to the cube. */
 static float cells_at(const Grid *g, float p) {
     return (p < 0.0f ? 0.0f : p > 1.0f ? 1.0f : p) * (float)(g->resolution - 1);
 }
@@ -190,7 +190,7 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
         Corner corners[8];
         float slope[3] = {0, 0, 0};
         if (dx.data == NULL) {
-            /* Most rows lie in slabs of others. */
+            /* Most rows belong to other slabs. */
             size_t node = node_below(g, cells_at(g, x.data[row]));
             if ((node + 2) * slice <= grads.start || node * slice >= grads.start + grads.length) continue;
         }

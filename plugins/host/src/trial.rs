@@ -195,7 +195,7 @@ fn try_kernel(stage: &dyn Stage, kernel: &dyn Kernel<f32>, params: &mut Guarded<
         stage.fault()?;
         let mut complaint = y.broken("output").or_else(|| tape.broken("tape"));
         complaint = complaint.or_else(|| y.unsound("output")).or_else(|| {
-            (info.identity && y.inner() != x.inner()).then(|| "an identity must return its input".into())
+            (info.identity && y.inner() != x.inner()).then(|| "an identity must return its input unchanged".into())
         });
         if complaint.is_some() {
             return Ok(complaint);
