@@ -5,7 +5,7 @@
 //! - [`by_row`]: stages written for one row at a time; [`prelude`]: imports for their authors.
 //! - [`support`]: where the object can be; [`scene`]: the mapping between the world and the stages.
 //! - [`loss`], [`prior`]: what training minimizes.
-//! - [`wgsl`]: the same for a GPU.
+//! - [`wgsl`]: stages, losses and priors on a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state by name.
 //! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them.
 //! - [`settings`], [`precision`], [`spec`], [`registry`]: what a user writes, and the available types.
