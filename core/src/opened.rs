@@ -182,7 +182,7 @@ impl Stage for Opened {
     fn wgsl(&self) -> Option<Fragment> {
         let (fragment, n, width) = (self.open.wgsl()?, self.channels, self.info().output);
         let name = "stage_open_";
-        let parts = hosted(name, 0, &fragment) + &fragment.named(name);
+        let parts = hosted(name, 0, 0, &fragment) + &fragment.named(name);
         let forward = format!(
             "    var open: array<f32, {n}>;
     {name}forward(x, &open);

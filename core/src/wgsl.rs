@@ -10,22 +10,30 @@
 //! ```
 //!
 //! `forward` overwrites `y`. `backward` adds to gradients and overwrites `dx`, but may leave `dx` alone if
-//! `stage_wants_dx` is false. Nothing is kept between the two: `backward` recomputes what it needs. The host defines
-//! for them:
+//! `stage_wants_dx` is false. The host defines for them:
 //!
 //! ```wgsl
 //! const stage_wants_dx: bool;
 //! fn stage_param(i: u32) -> f32                                          // parameter i of the stage
+//! fn stage_keep(c: u32, v: f32)                                          // keeps v as channel c of the row
+//! fn stage_kept(c: u32) -> f32                                           // what the row keeps as channel c
 //! fn stage_grad(i: u32, v: f32)                                          // adds v to the gradient of parameter i
 //! fn stage_grad_pair(i: u32, v: vec2<f32>)                               // adds v to the gradients of i and i + 1; i is even
-//! fn stage_sum_M(at: u32, a: ptr<function, array<f32, M>>)               // adds Σ a[j] to parameters at + j
-//! fn stage_outer_M_K(at: u32, ld: u32, a: ptr<function, array<f32, M>>, b: ptr<function, array<f32, K>>)
-//!                                                                        // adds Σ a[j]·b[k] to at + j·ld + k, all different
 //! ```
 //!
-//! `stage_grad` and `stage_grad_pair` are for parameters of which a row affects few. `stage_sum_M` and `stage_outer_M_K` are
-//! sums over rows, for any numbers `M` and `K` in the name, for parameters that every row affects: all rows call them
-//! together, so never inside a branch or loop that only some rows take.
+//! `forward` may keep what `backward` needs; `backward` may keep more. A fragment that keeps `N` channels declares
+//! `const stage_keeps = Nu;`. Where nothing learns, `stage_keep` does nothing.
+//!
+//! `stage_grad` and `stage_grad_pair` are for parameters that few rows affect. Gradients of parameters that every row
+//! affects are sums over rows of kept channels. A fragment declares each in a line of its own:
+//!
+//! ```wgsl
+//! const stage_sum_0 = array<u32, 6>(AT, LD, LEFT, M, RIGHT, K);
+//! ```
+//!
+//! This adds `Σ a[j]·b[k]` to the gradient of parameter `AT + j·LD + k`, where `a` are the `M` kept channels from `LEFT` on
+//! and `b` the `K` kept channels from `RIGHT` on, as `backward` leaves them. With `K = 0` it adds `Σ a[j]` to that of
+//! `AT + j`. No two sums have a parameter in common. [`declare`] writes these lines.
 //!
 //! A stage that is compiled into the program must also call `stage_grad` and `stage_grad_pair` for all rows together, and
 //! every loop of its WGSL must end. A plugin's stage need not: its kernels carry [`FOREIGN`].
@@ -71,8 +79,7 @@
 //! `stage_spacing() -> vec3<f32>` are the volume's; a `VoxelRay` has `source` and `ahead`, the vector to the pixel, in
 //! voxels (whole numbers are voxel centres), and `length`, that vector's length in mm.
 
-use std::collections::BTreeSet;
-use std::fmt::Write;
+use std::ops::Range;
 
 /// Prefix of every name that a fragment declares or uses from its host.
 pub const PREFIX: &str = "stage_";
@@ -111,13 +118,60 @@ fn stage_backward(
     )
 }
 
-/// A sum over rows used by a fragment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Sum {
-    /// `stage_sum_M`.
-    Vector(usize),
-    /// `stage_outer_M_K`.
-    Outer(usize, usize),
+/// Gradients that are sums over rows: products of kept channels, or kept channels themselves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Sum {
+    /// Its first parameter.
+    pub at: usize,
+    /// Parameters from one channel on the left to the next.
+    pub ld: usize,
+    /// First kept channel on the left.
+    pub left: usize,
+    /// Channels on the left.
+    pub outputs: usize,
+    /// First kept channel on the right.
+    pub right: usize,
+    /// Channels on the right; 0 for the sums of the left ones.
+    pub inputs: usize,
+}
+
+impl Sum {
+    /// The sums of `outputs` kept channels from `left` on, for the parameters from `at` on.
+    pub fn vector(at: usize, left: usize, outputs: usize) -> Self {
+        Self { at, ld: 1, left, outputs, right: 0, inputs: 0 }
+    }
+
+    /// Number of its parameters.
+    pub fn params(&self) -> usize {
+        self.outputs * self.inputs.max(1)
+    }
+
+    /// The parameters of channel `j` on the left.
+    pub fn row(&self, j: usize) -> Range<usize> {
+        let start = self.at + j * self.ld;
+        start..start + self.inputs.max(1)
+    }
+
+    /// The sum in a line of a fragment.
+    fn parse(line: &str) -> Option<Self> {
+        let (_, numbers) = line.trim_start().strip_prefix("const stage_sum_")?.split_once('(')?;
+        let mut numbers = numbers.split(')').next()?.split(',').map(|n| n.trim().trim_end_matches('u').parse().ok());
+        let mut next = || numbers.next().flatten();
+        let [at, ld, left, outputs, right, inputs] = [next()?, next()?, next()?, next()?, next()?, next()?];
+        Some(Self { at, ld, left, outputs, right, inputs })
+    }
+
+    /// The line of a fragment that declares it under `name`.
+    fn line(&self, name: &str) -> String {
+        let Self { at, ld, left, outputs, right, inputs } = self;
+        format!("const {PREFIX}sum_{name} = array<u32, 6>({at}, {ld}, {left}, {outputs}, {right}, {inputs});\n")
+    }
+}
+
+/// The lines by which a fragment declares how many channels it keeps and its sums over rows.
+pub fn declare(keeps: usize, sums: &[Sum]) -> String {
+    let sums = sums.iter().enumerate().map(|(i, sum)| sum.line(&i.to_string()));
+    format!("const {PREFIX}keeps = {keeps}u;\n") + &sums.collect::<String>()
 }
 
 impl Fragment {
@@ -163,18 +217,18 @@ impl Fragment {
         None
     }
 
-    /// The sums over rows that it uses, found by name.
-    pub fn sums(&self) -> BTreeSet<Sum> {
-        let words = self.source.split(|c: char| !(c.is_alphanumeric() || c == '_'));
-        let sum = |word: &str| {
-            let rest = word.strip_prefix(PREFIX)?;
-            if let Some(m) = rest.strip_prefix("sum_") {
-                return Some(Sum::Vector(m.parse().ok()?));
-            }
-            let (m, k) = rest.strip_prefix("outer_")?.split_once('_')?;
-            Some(Sum::Outer(m.parse().ok()?, k.parse().ok()?))
+    /// Number of channels that it keeps.
+    pub fn keeps(&self) -> usize {
+        let number = |line: &str| {
+            let (_, n) = line.trim_start().strip_prefix("const stage_keeps")?.split_once('=')?;
+            n.trim().trim_end_matches(';').trim_end_matches('u').parse::<usize>().ok()
         };
-        words.filter_map(sum).collect()
+        self.source.lines().filter_map(number).fold(0, usize::saturating_add)
+    }
+
+    /// The sums over rows that it declares.
+    pub fn sums(&self) -> Vec<Sum> {
+        self.source.lines().filter_map(Sum::parse).collect()
     }
 }
 
@@ -206,11 +260,16 @@ fn tokens(text: &str) -> impl Iterator<Item = &str> {
 }
 
 /// Declares what the fragment of a part expects of its host, under names with prefix `name`, in terms of the whole's
-/// own functions; the part's parameters begin at `first`.
-pub fn hosted(name: &str, first: u32, fragment: &Fragment) -> String {
+/// own functions; the part's parameters begin at `first`, its kept channels at `kept`.
+pub fn hosted(name: &str, first: u32, kept: usize, fragment: &Fragment) -> String {
+    let keeps = fragment.keeps();
+    let own = name.strip_prefix(PREFIX).unwrap_or(name);
     let mut out = format!(
-        "const {name}wants_dx = stage_wants_dx;
+        "const {PREFIX}keeps_{own} = {keeps}u;
+const {name}wants_dx = stage_wants_dx;
 fn {name}param(i: u32) -> f32 {{ return stage_param({first}u + i); }}
+fn {name}keep(c: u32, v: f32) {{ stage_keep({kept}u + c, v); }}
+fn {name}kept(c: u32) -> f32 {{ return stage_kept({kept}u + c); }}
 fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
 "
     );
@@ -218,17 +277,9 @@ fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
         true => format!("fn {name}grad_pair(i: u32, v: vec2<f32>) {{ stage_grad_pair({first}u + i, v); }}\n"),
         false => one_by_one(name),
     };
-    for sum in fragment.sums() {
-        let _ = match sum {
-            Sum::Vector(m) => writeln!(
-                out,
-                "fn {name}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{ stage_sum_{m}({first}u + at, a); }}"
-            ),
-            Sum::Outer(m, k) => writeln!(
-                out,
-                "fn {name}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{ stage_outer_{m}_{k}({first}u + at, ld, a, b); }}"
-            ),
-        };
+    for (i, sum) in fragment.sums().iter().enumerate() {
+        let whole = Sum { at: first as usize + sum.at, left: kept + sum.left, right: kept + sum.right, ..*sum };
+        out += &whole.line(&format!("{own}{i}"));
     }
     out
 }
@@ -269,9 +320,17 @@ mod tests {
     }
 
     #[test]
-    fn sums_are_found_by_their_names() {
-        let f =
-            Fragment::new(&["stage_sum_20(at, &a); stage_outer_32_20(at, 20u, &a, &b); other_sum_3(); stage_sum_x();"]);
-        assert_eq!(f.sums().into_iter().collect::<Vec<_>>(), [Sum::Vector(20), Sum::Outer(32, 20)]);
+    fn sums_are_read_as_they_are_declared_also_from_a_part() {
+        let sums = [Sum { at: 2, ld: 9, left: 3, outputs: 4, right: 0, inputs: 3 }, Sum::vector(40, 3, 4)];
+        let part = Fragment::new(&[&declare(7, &sums), "// const stage_sum_9 = array<u32, 6>(1, 1, 1, 1, 1, 1);"]);
+        assert_eq!((part.keeps(), part.sums()), (7, sums.to_vec()));
+        let texts = [0, 1].map(|i| {
+            let name = format!("stage_{i}_");
+            hosted(&name, 100 * i, 7 * i as usize, &part) + &part.named(&name)
+        });
+        let whole = Fragment::new(&[&texts[0], &texts[1]]);
+        let moved = sums.map(|s| Sum { at: s.at + 100, left: s.left + 7, right: s.right + 7, ..s });
+        assert_eq!((whole.keeps(), whole.sums()), (14, [sums, moved].concat()));
+        assert_eq!((sums[0].params(), sums[0].row(1), sums[1].row(1)), (12, 11..14, 41..42));
     }
 }

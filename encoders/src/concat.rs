@@ -335,10 +335,12 @@ impl Stage for ConcatStage {
     fn wgsl(&self) -> Option<Fragment> {
         let width = self.info.output;
         let (mut parts, mut forward, mut backward) = (String::new(), String::new(), String::new());
+        let mut kept = 0;
         for (i, part) in self.parts.iter().enumerate() {
             let fragment = part.stage.wgsl()?;
             let name = format!("stage_{i}_");
-            parts += &hosted(&name, u32::try_from(part.params.start).ok()?, &fragment);
+            parts += &hosted(&name, u32::try_from(part.params.start).ok()?, kept, &fragment);
+            kept += fragment.keeps();
             parts += &fragment.named(&name);
             let (n, first) = (part.outputs.len(), part.outputs.start);
             let copy = format!("for (var c = 0u; c < {n}u; c++)");

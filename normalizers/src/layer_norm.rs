@@ -13,7 +13,7 @@ use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load,
 use conefield_core::stage::{
     GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
-use conefield_core::wgsl::Fragment;
+use conefield_core::wgsl::{Fragment, Sum, declare};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -266,24 +266,24 @@ impl Stage for LayerNormStage {
 
     fn wgsl(&self) -> Option<Fragment> {
         let (n, eps, affine) = (self.width, self.settings.eps as f32, self.settings.affine);
-        // Parameters affected by every row are summed over rows.
-        let sums = if affine {
-            format!(
-                "    var normal: array<f32, {n}>;
-    for (var o = 0u; o < {n}u; o++) {{ normal[o] = stage_normal(x, r, o) * (*dy)[o]; }}
-    stage_sum_{n}(0u, &normal);
-    stage_sum_{n}({n}u, dy);
+        let (declared, keeps) = if affine {
+            let lines = format!(
+                "    for (var c = 0u; c < {n}u; c++) {{
+        stage_keep(c, stage_normal(x, r, c) * (*dy)[c]);
+        stage_keep({n}u + c, (*dy)[c]);
+    }}
 "
-            )
+            );
+            (declare(2 * n, &[Sum::vector(0, 0, n), Sum::vector(n, n, n)]), lines)
         } else {
-            String::new()
+            Default::default()
         };
         let settings = format!(
-            "const stage_WIDTH = {n}u;
+            "{declared}const stage_WIDTH = {n}u;
 const stage_EPS = {eps:?};
 const stage_AFFINE = {affine};
 fn stage_gradients(x: ptr<function, array<f32, {n}>>, r: stage_Row, dy: ptr<function, array<f32, {n}>>) {{
-{sums}}}
+{keeps}}}
 "
         );
         Some(Fragment::new(&[&settings, include_str!("layer_norm.wgsl")]))

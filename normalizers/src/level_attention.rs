@@ -17,7 +17,7 @@ use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, st
 use conefield_core::stage::{
     GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
-use conefield_core::wgsl::{Fragment, functions};
+use conefield_core::wgsl::{Fragment, Sum, declare, functions};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
@@ -259,8 +259,8 @@ impl Stage for LevelAttentionStage {
         }
         let _ = write!(
             backward,
-            "{sums}    stage_sum_{levels}({bias}u, &d);
-    stage_outer_{levels}_{width}(0u, {width}u, &d, x);
+            "{sums}    for (var c = 0u; c < {width}u; c++) {{ stage_keep(c, (*x)[c]); }}
+    for (var l = 0u; l < {levels}u; l++) {{ stage_keep({width}u + l, d[l]); }}
     if stage_wants_dx {{
 {slopes}        for (var l = 0u; l < {levels}u; l++) {{
             for (var c = 0u; c < {width}u; c++) {{ (*dx)[c] += d[l] * stage_param(l * {width}u + c); }}
@@ -268,6 +268,8 @@ impl Stage for LevelAttentionStage {
     }}
 "
         );
+        let weights = Sum { at: 0, ld: width, left: width, outputs: levels, right: 0, inputs: width };
+        let constants = declare(width + levels, &[weights, Sum::vector(bias, width, levels)]) + &constants;
         let functions = functions(width, width, &forward, &backward);
         Some(Fragment::new(&[&constants, include_str!("level_attention.wgsl"), &functions]))
     }

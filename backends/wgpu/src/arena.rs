@@ -37,7 +37,7 @@ pub fn allocate(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, params: usize, 
         }
     }
     if chain.uniform() {
-        buffers.reserve(gpu, "dense", 4 * chain.dense as u64, U::UNIFORM | U::COPY_DST)?;
+        buffers.reserve(gpu, "dense", chain.uniform_bytes(), U::UNIFORM | U::COPY_DST)?;
     }
     Ok(())
 }

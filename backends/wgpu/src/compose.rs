@@ -1,11 +1,11 @@
 //! Kernels composed from the fragments of a pipeline's stages.
 //!
-//! Rows go through a kernel one an invocation, 64 to a group. `forward` takes them from the encoder to μ and keeps the
-//! features of an encoder with parameters, which are dear to compute again; `backward` starts from these, runs what lies
-//! between once more, and goes back as far as the features; `scatter` goes from there to the encoder's tables. Sums over rows
-//! are taken within a group and added to the group's own partial sums, which `merge` adds up; scattered gradients are added
-//! where they belong at once. Samples of rays that weigh 0 are passed over, and by `backward` all 64 of a group where none
-//! has a derivative.
+//! Each invocation takes one row through a kernel, 64 to a group. `forward` goes from the encoder to μ. It writes the features
+//! of an encoder with parameters and the channels that stages keep. `backward` starts from these, goes back as far as the
+//! features, and leaves their derivatives in their place. `scatter` goes from there to the encoder's tables, and adds scattered
+//! gradients where they belong at once. `sums` adds up products of kept channels over rows; each of its groups has a share of the
+//! rows and partial sums of its own, which `merge` adds up. Samples of rays that weigh 0, and rows whose derivative is 0, are
+//! skipped.
 
 use crate::device::Atomics;
 use crate::source::{Access, Source};
@@ -22,8 +22,11 @@ use std::ops::Range;
 /// Rows of a group.
 pub const GROUP: u32 = 64;
 
-/// Groups whose partial sums one invocation of `merge` adds up.
+/// Shares of the rows whose partial sums one invocation of `merge` adds up.
 const MERGED: usize = 32;
+
+/// Channels that a stage may keep.
+const MOST_KEPT: usize = 1 << 16;
 
 /// What of the device the text of kernels depends on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,6 +41,17 @@ pub struct Target {
     pub uniform_bytes: usize,
 }
 
+/// What `stage_keep` does in a kernel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Keeping {
+    /// Nothing: nothing learns.
+    Nothing,
+    /// It writes what `backward` needs.
+    Forward,
+    /// It writes what `sums` needs, but not while stages run forward once more.
+    Backward,
+}
+
 /// A stage on its way into kernels.
 #[derive(Debug, Clone)]
 pub struct Link {
@@ -50,10 +64,20 @@ pub struct Link {
     pub info: Info,
     /// Its parameters in the arena.
     range: Range<usize>,
-    /// Where its sums over rows stand among all partial sums; `None` where they go to the arena's gradients at once.
-    partial: Option<usize>,
+    /// Where its parameters stand among those that every row reads; `None` where rows read few of them.
+    dense: Option<usize>,
+    /// Its first channel on the tape.
+    tape: usize,
     /// Whether a stage before it has parameters.
     wants_dx: bool,
+}
+
+/// A sum over rows, in channels of the tape and parameters of the arena.
+#[derive(Debug, Clone, Copy)]
+struct RowSum {
+    sum: Sum,
+    /// Its first partial sum.
+    partial: usize,
 }
 
 /// The stages that do work, in order, with all that kernels need of them.
@@ -62,8 +86,12 @@ pub struct Chain {
     links: Vec<Link>,
     /// Whether the first link is the encoder, or the encoder hands on positions as they are.
     encoder: bool,
-    /// Parameters whose gradients are summed over rows.
-    pub dense: usize,
+    /// Parameters that every row reads.
+    dense: usize,
+    /// Channels that rows keep.
+    tape: usize,
+    /// Sums over rows.
+    sums: Vec<RowSum>,
     /// Parameters of the arena.
     params: usize,
     /// How parameters are read whose gradients are scattered.
@@ -90,6 +118,8 @@ impl Chain {
             links: vec![],
             encoder: false,
             dense: 0,
+            tape: 0,
+            sums: vec![],
             params: pipeline.layout().len(),
             tables: pipeline.tables,
             target,
@@ -108,7 +138,7 @@ impl Chain {
     /// One stage alone, with all that it can do.
     pub fn single(stage: &dyn Stage, tables: Tables, target: Target) -> Result<Self> {
         let params = stage.info().params;
-        let mut chain = Self { links: vec![], encoder: false, dense: 0, params, tables, target };
+        let mut chain = Self { links: vec![], encoder: false, dense: 0, tape: 0, sums: vec![], params, tables, target };
         chain.link("stage", stage, 0..params, true)?;
         Ok(chain)
     }
@@ -128,11 +158,31 @@ impl Chain {
             ));
         }
         let fragment = fragment_of(&name, stage.wgsl())?;
-        let partial = (info.grads == GradKind::Dense).then_some(self.dense);
-        self.dense += partial.map_or(0, |_| info.params);
+        let (keeps, sums) = (fragment.keeps(), fragment.sums());
+        check(&sums, keeps, info.params)
+            .map_err(|why| Error::unsupported(format!("{name} on the wgpu backend"), format!("its WGSL {why}")))?;
+        for sum in sums {
+            let partial = self.summed();
+            let sum = Sum { at: range.start + sum.at, left: self.tape + sum.left, right: self.tape + sum.right, ..sum };
+            self.sums.push(RowSum { sum, partial });
+        }
+        let dense = (info.grads == GradKind::Dense).then_some(self.dense);
+        self.dense += dense.map_or(0, |_| info.params);
         let prefix = format!("s{}_", self.links.len());
-        self.links.push(Link { name, prefix, fragment, info, range, partial, wants_dx });
+        let tape = self.tape;
+        self.tape += keeps;
+        self.links.push(Link { name, prefix, fragment, info, range, dense, tape, wants_dx });
         Ok(())
+    }
+
+    /// Channels that rows keep.
+    pub fn tape(&self) -> usize {
+        self.tape
+    }
+
+    /// Number of partial sums of a group.
+    pub fn summed(&self) -> usize {
+        self.sums.last().map_or(0, |s| s.partial + s.sum.params())
     }
 
     /// The stages.
@@ -151,10 +201,14 @@ impl Chain {
         (scattered && self.tables != Tables::F32).then_some(self.tables)
     }
 
-    /// Of the parameters whose gradients are summed over rows: their places in the arena, in the order in which they
-    /// stand in `partial` and in the uniform buffer.
+    /// The ranges of the arena that the uniform buffer has copies of, in order.
     pub fn dense_ranges(&self) -> impl Iterator<Item = Range<usize>> {
-        self.links.iter().filter(|l| l.partial.is_some()).map(|l| l.range.clone())
+        self.links.iter().filter(|l| l.dense.is_some()).map(|l| l.range.clone())
+    }
+
+    /// Bytes of the uniform buffer.
+    pub fn uniform_bytes(&self) -> u64 {
+        4 * self.dense as u64
     }
 
     /// Buffers that the arena is cut into.
@@ -235,23 +289,34 @@ impl Chain {
     }
 
     /// What `link` may call, and its own functions.
-    fn include(&self, source: &mut Source, link: &Link, gradients: bool) {
-        let Link { name, prefix, fragment, info, range, partial, wants_dx } = link;
+    fn include(&self, source: &mut Source, link: &Link, keeping: Keeping) {
+        let Link { name, prefix, fragment, info, range, dense, tape, wants_dx } = link;
         let first = range.start;
-        let param = match partial {
+        let param = match dense {
             None if self.halves().is_some() && info.grads == GradKind::Scatter => {
                 format!("arena_half({first}u + i)")
             }
             Some(offset) if self.uniform() => format!("dense[({offset}u + i) >> 2u][({offset}u + i) & 3u]"),
             _ => format!("arena_param({first}u + i)"),
         };
+        let gradients = keeping == Keeping::Backward;
+        let scattered = if gradients { format!("arena_scatter({first}u + i, v);") } else { String::new() };
+        let at = format!("tape[({tape}u + c) * step.stride + row]");
+        let (keep, kept) = match keeping {
+            Keeping::Nothing => (String::new(), "0.0"),
+            Keeping::Forward => (format!("{at} = v;"), at.as_str()),
+            Keeping::Backward => (format!("if keeping {{ {at} = v; }}"), at.as_str()),
+        };
+        // A stage that keeps nothing needs no tape.
+        let (keep, kept) = if fragment.keeps() > 0 { (keep.as_str(), kept) } else { ("", "0.0") };
         let mut text = format!(
             "const {prefix}wants_dx = {wants_dx};
 fn {prefix}param(i: u32) -> f32 {{ return {param}; }}
+fn {prefix}keep(c: u32, v: f32) {{ {keep} }}
+fn {prefix}kept(c: u32) -> f32 {{ return {kept}; }}
+fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
 "
         );
-        let scattered = if gradients { format!("arena_scatter({first}u + i, v);") } else { String::new() };
-        let _ = writeln!(text, "fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}");
         text += &match (gradients, first.is_multiple_of(2)) {
             (true, true) => {
                 format!("fn {prefix}grad_pair(i: u32, v: vec2<f32>) {{ arena_scatter_pair({first}u + i, v); }}\n")
@@ -259,39 +324,15 @@ fn {prefix}param(i: u32) -> f32 {{ return {param}; }}
             // Pairs stand at even places of the arena.
             _ => wgsl::one_by_one(prefix),
         };
-        let sums = fragment.sums();
-        if gradients && !sums.is_empty() {
-            // The sum so far, and that with what a group adds.
-            let (so_far, store) = match partial {
-                None => ("0.0".to_owned(), format!("arena_grad({first}u + i, v);")),
-                Some(offset) => {
-                    let at = format!("partial[group * {}u + {offset}u + i]", self.dense);
-                    (at.clone(), format!("{at} = before + v;"))
-                }
-            };
-            let _ = write!(
-                text,
-                "fn {prefix}so_far(i: u32) -> f32 {{ return {so_far}; }}
-fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
-"
-            );
-        }
-        for sum in sums {
-            text += &match (sum, gradients) {
-                (Sum::Vector(m), true) => vector(prefix, m),
-                (Sum::Outer(1, k), true) => row_outer(prefix, k),
-                (Sum::Outer(m, k), true) => outer(prefix, m, k),
-                // A kernel that only goes forward has no place for gradients.
-                (Sum::Vector(m), false) => {
-                    format!("fn {prefix}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{}}\n")
-                }
-                (Sum::Outer(m, k), false) => format!(
-                    "fn {prefix}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{}}\n"
-                ),
-            };
-        }
         source.add(&format!("what the host gives {name}"), &text);
         source.add(name, &fragment.named(prefix));
+    }
+
+    /// Binds the tape where stages keep something.
+    fn bind_tape(&self, source: &mut Source, access: Access) {
+        if self.tape > 0 {
+            source.bind("tape", access, "array<f32>");
+        }
     }
 
     fn step(source: &mut Source) {
@@ -299,18 +340,22 @@ fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
         source.bind("step", Access::Uniform, "Step");
     }
 
-    /// From positions to μ; keeps features where `keep`.
+    /// From positions to μ; writes features and what stages keep where `keep`.
     pub fn forward(&self, keep: bool) -> Source {
         let mut source = Source::default();
         Self::step(&mut source);
         source.bind("samples", Access::Read, "array<vec4<f32>>");
         source.bind("mu", Access::Write, "array<f32>");
-        let keep = if keep { self.kept() } else { 0 };
+        let (keeping, keep) = if keep { (Keeping::Forward, self.kept()) } else { (Keeping::Nothing, 0) };
         if keep > 0 {
             source.bind("features", Access::Write, "array<f32>");
         }
+        if keeping == Keeping::Forward {
+            self.bind_tape(&mut source, Access::Write);
+        }
+        source.add("row", ROW);
         self.declare(&mut source, false);
-        self.links.iter().for_each(|l| self.include(&mut source, l, false));
+        self.links.iter().for_each(|l| self.include(&mut source, l, keeping));
         let mut body = String::from(
             "        let at = samples[row];
         if row < step.ray_rows && at.w == 0.0 {
@@ -330,9 +375,7 @@ fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
                 i + 1
             );
             if i == 0 && keep > 0 {
-                for c in 0..keep {
-                    let _ = writeln!(body, "        features[{c}u * step.stride + row] = x1[{c}];");
-                }
+                body += &channels(keep, "features[{at}] = x1[{c}];");
             }
         }
         let _ = writeln!(body, "        mu[row] = x{}[0];", self.links.len());
@@ -350,9 +393,10 @@ fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
             String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
         let (mut from, width) = ("x0", self.features());
         if self.encoder {
+            source.add("row", ROW);
             self.declare(&mut source, false);
             let l = &self.links[0];
-            self.include(&mut source, l, false);
+            self.include(&mut source, l, Keeping::Nothing);
             let _ = writeln!(body, "        var x1: array<f32, {width}>;\n        {}forward(&x0, &x1);", l.prefix);
             from = "x1";
         }
@@ -364,7 +408,7 @@ fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
         source
     }
 
-    /// From the derivative by μ to gradients.
+    /// From the derivative by μ to gradients and to what `sums` adds up.
     pub fn backward(&self) -> Source {
         let mut source = Source::default();
         Self::step(&mut source);
@@ -375,44 +419,40 @@ fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
             let access = if self.scatters() { Access::Write } else { Access::Read };
             source.bind("features", access, "array<f32>");
         }
-        self.sums(&mut source);
+        self.bind_tape(&mut source, Access::Write);
+        source.add("row", ROW);
         self.declare(&mut source, true);
         self.additions(&mut source);
-        self.links.iter().skip(usize::from(self.scatters())).for_each(|l| self.include(&mut source, l, true));
+        self.links
+            .iter()
+            .skip(usize::from(self.scatters()))
+            .for_each(|l| self.include(&mut source, l, Keeping::Backward));
         let n = self.links.len();
-        let mut body = String::from(
+        // Where lanes add up together, none may skip a row.
+        let skip = if self.scatters() || !self.together() { "if !live { continue; }" } else { "" };
+        let mut body = format!(
             "        var at = vec4<f32>();
         var d = 0.0;
-        if row < step.rows { at = samples[row]; d = dmu[row]; }
+        if row < step.rows {{ at = samples[row]; d = dmu[row]; }}
         let live = d != 0.0;
-        if !any_of_group(live) { continue; }
+        {skip}
+        keeping = false;
         var x0 = array<f32, 3>(at.x, at.y, at.z);
-",
+"
         );
         for (i, l) in self.links[..n - 1].iter().enumerate() {
             let _ = writeln!(body, "        var x{}: array<f32, {}>;", i + 1, l.info.output);
             if i == 0 && kept > 0 {
-                let _ = writeln!(
-                    body,
-                    "        if live {{\n{}        }}",
-                    (0..kept)
-                        .map(|c| format!("            x1[{c}] = features[{c}u * step.stride + row];\n"))
-                        .collect::<String>()
-                );
+                let _ = writeln!(body, "        if live {{\n{}        }}", channels(kept, "x1[{c}] = features[{at}];"));
             } else {
                 let _ = writeln!(body, "        {}forward(&x{i}, &x{});", l.prefix, i + 1);
             }
         }
-        let _ = writeln!(body, "        var d{n} = array<f32, 1>(d);");
+        let _ = writeln!(body, "        keeping = live;\n        var d{n} = array<f32, 1>(d);");
         self.back(&mut body);
         if self.scatters() {
-            body += "        if live {\n";
-            for c in 0..kept {
-                let _ = writeln!(body, "            features[{c}u * step.stride + row] = d1[{c}];");
-            }
-            body += "        }\n";
+            body += &channels(kept, "features[{at}] = d1[{c}];");
         }
-        source.add("any", include_str!("kernels/any.wgsl"));
         source.add("backward", &self.groups(&body));
         source
     }
@@ -420,7 +460,7 @@ fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
     /// Whether the encoder's gradients are a kernel of their own, to which `backward` hands the derivatives by the features in
     /// place of these: it takes few registers, so that more of its rows wait for memory at the same time.
     pub fn scatters(&self) -> bool {
-        let scattered = |l: &Link| l.info.grads == GradKind::Scatter && l.fragment.sums().is_empty();
+        let scattered = |l: &Link| l.info.grads == GradKind::Scatter && l.fragment.keeps() == 0;
         self.kept() > 0 && self.links.len() > 1 && self.links.first().is_some_and(scattered)
     }
 
@@ -431,30 +471,24 @@ fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
         source.bind("samples", Access::Read, "array<vec4<f32>>");
         source.bind("dmu", Access::Read, "array<f32>");
         source.bind("features", Access::Read, "array<f32>");
-        source.add("rows", "var<private> lane: u32;\nvar<private> group: u32;");
+        source.add("row", ROW);
         self.declare(&mut source, true);
         self.additions(&mut source);
         let l = &self.links[0];
-        self.include(&mut source, l, true);
+        self.include(&mut source, l, Keeping::Backward);
         let kept = self.kept();
-        let mut body = format!(
+        let body = format!(
             "        var at = vec4<f32>();
         var d: array<f32, {kept}>;
         if row < step.rows && dmu[row] != 0.0 {{
             at = samples[row];
-"
-        );
-        for c in 0..kept {
-            let _ = writeln!(body, "            d[{c}] = features[{c}u * step.stride + row];");
-        }
-        let _ = write!(
-            body,
-            "        }}
+{read}        }}
         var x0 = array<f32, 3>(at.x, at.y, at.z);
         var dx: array<f32, 3>;
-        {}backward(&x0, &d, &dx);
+        {prefix}backward(&x0, &d, &dx);
 ",
-            l.prefix
+            read = channels(kept, "d[{c}] = features[{at}];"),
+            prefix = l.prefix,
         );
         source.add("scatter", &self.groups(&body));
         source
@@ -476,15 +510,7 @@ fn {prefix}store(i: u32, before: f32, v: f32) {{ {store} }}
         }
     }
 
-    /// Sums over rows and where they go.
-    fn sums(&self, source: &mut Source) {
-        if self.dense > 0 {
-            source.bind("partial", Access::Write, "array<f32>");
-        }
-        source.add("sums", include_str!("kernels/sums.wgsl"));
-    }
-
-    /// A kernel whose groups take 64 rows at a time, together; rows past the end are there too.
+    /// A kernel whose groups take 64 rows at a time, together, including rows past the end.
     fn groups(&self, body: &str) -> String {
         let (builtins, begin) = match self.together() {
             true => (
@@ -500,11 +526,9 @@ fn main(
     @builtin(num_workgroups) all: vec3<u32>,
     @builtin(local_invocation_index) index: u32,{builtins}
 ) {{
-    lane = index;
-    group = id.x;
 {begin}    let pieces = (step.rows + 63u) / 64u;
     for (var piece = id.x; piece < pieces; piece += all.x) {{
-        let row = piece * 64u + index;
+        row = piece * 64u + index;
 {body}    }}
 }}
 "
@@ -529,44 +553,109 @@ fn arena_scatter_pair(i: u32, v: vec2<f32>) { arena_grad(i, v.x); arena_grad(i +
         self.target.subgroups && !self.links.iter().any(|l| l.fragment.source.contains(wgsl::FOREIGN))
     }
 
-    /// Groups of `merge` for the sums of `groups` groups.
-    pub fn merging(&self, groups: usize) -> usize {
-        self.dense.div_ceil(GROUP as usize) * groups.div_ceil(MERGED)
+    /// The blocks of `sums`: at most 32 × 32 products each, with biases where the left channels' own sums are wanted too.
+    fn blocks(&self) -> Vec<String> {
+        let mut blocks = vec![];
+        let vector = |left, outputs| {
+            let mut vectors = self.sums.iter().filter(|s| s.sum.inputs == 0);
+            vectors.find(|v| v.sum.left == left && v.sum.outputs == outputs)
+        };
+        let mut taken = vec![];
+        // Products first: they take their biases along.
+        let (products, vectors): (Vec<&RowSum>, Vec<&RowSum>) = self.sums.iter().partition(|s| s.sum.inputs > 0);
+        for RowSum { sum, partial } in products.into_iter().chain(vectors) {
+            let Sum { left, outputs, right, inputs, .. } = *sum;
+            let bias = match inputs {
+                0 => Some(*partial),
+                _ => vector(left, outputs).map(|v| v.partial),
+            };
+            let bias = bias.filter(|b| !taken.contains(b));
+            if inputs == 0 && bias.is_none() {
+                continue;
+            }
+            taken.extend(bias);
+            for top in (0..outputs).step_by(32) {
+                for side in (0..inputs.max(1)).step_by(32) {
+                    let own = bias.filter(|_| side == 0).map_or("none".into(), |b| format!("{}u", b + top));
+                    blocks.push(format!(
+                        "Block({}u, {}u, {}u, {}u, {}u, {inputs}u, {own})",
+                        left + top,
+                        (outputs - top).min(32),
+                        right + side,
+                        inputs.saturating_sub(side).min(32),
+                        partial + top * inputs + side,
+                    ));
+                }
+            }
+        }
+        blocks
     }
 
-    /// Adds all groups' partial sums to the arena's gradients.
+    /// Groups of `sums`, where each share of the rows has `shares` of them.
+    pub fn summing(&self, shares: usize) -> usize {
+        self.blocks().len() * shares
+    }
+
+    /// Sums over rows, added to the partial sums of each share.
+    pub fn sums(&self) -> Source {
+        let mut source = Source::default();
+        Self::step(&mut source);
+        source.bind("dmu", Access::Read, "array<f32>");
+        self.bind_tape(&mut source, Access::Read);
+        source.bind("partial", Access::Write, "array<f32>");
+        let (blocks, summed) = (self.blocks(), self.summed());
+        let mut text = format!("const summed = {summed}u;\nconst blocks = {}u;\n", blocks.len());
+        source.add("sums", include_str!("kernels/sums.wgsl"));
+        text += "fn block_of(i: u32) -> Block {\n";
+        for (i, block) in blocks.iter().enumerate() {
+            let _ = match i + 1 == blocks.len() {
+                true => writeln!(text, "    return {block};\n}}"),
+                false => writeln!(text, "    if i == {i}u {{ return {block}; }}"),
+            };
+        }
+        source.add("blocks of sums", &text);
+        source
+    }
+
+    /// Groups of `merge` for the partial sums of `shares` shares of the rows.
+    pub fn merging(&self, shares: usize) -> usize {
+        self.summed().div_ceil(GROUP as usize) * shares.div_ceil(MERGED)
+    }
+
+    /// Adds all shares' partial sums to the arena's gradients.
     pub fn merge(&self) -> Source {
         let mut source = Source::default();
         source.bind("partial", Access::Read, "array<f32>");
         self.declare(&mut source, true);
         let mut text = String::from("fn arena_index(i: u32) -> u32 {\n");
-        for l in &self.links {
-            if let Some(offset) = l.partial {
-                let (end, first) = (offset + l.info.params, l.range.start);
-                let _ = writeln!(text, "    if i < {end}u {{ return {first}u + i - {offset}u; }}");
-            }
+        for RowSum { sum, partial } in &self.sums {
+            let (at, ld, width, end) = (sum.at, sum.ld, sum.inputs.max(1), partial + sum.params());
+            let _ = writeln!(
+                text,
+                "    if i < {end}u {{ return {at}u + (i - {partial}u) / {width}u * {ld}u + (i - {partial}u) % {width}u; }}"
+            );
         }
-        let (dense, blocks) = (self.dense, self.dense.div_ceil(GROUP as usize));
+        let (summed, blocks) = (self.summed(), self.summed().div_ceil(GROUP as usize));
         let _ = write!(
             text,
             "    return 0u;
 }}
 
-// Each invocation adds up the sums of {MERGED} groups.
+// Each invocation adds up the sums of {MERGED} shares.
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(num_workgroups) all: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {{
-    let summed = arrayLength(&partial) / {dense}u;
-    let pieces = {blocks}u * ((summed + {MERGED}u - 1u) / {MERGED}u);
+    let shares = arrayLength(&partial) / {summed}u;
+    let pieces = {blocks}u * ((shares + {MERGED}u - 1u) / {MERGED}u);
     for (var piece = id.x; piece < pieces; piece += all.x) {{
         let i = (piece % {blocks}u) * 64u + lane;
-        if i >= {dense}u {{ continue; }}
+        if i >= {summed}u {{ continue; }}
         let first = piece / {blocks}u * {MERGED}u;
         var sum = 0.0;
-        for (var g = first; g < min(first + {MERGED}u, summed); g++) {{ sum += partial[g * {dense}u + i]; }}
+        for (var s = first; s < min(first + {MERGED}u, shares); s++) {{ sum += partial[s * {summed}u + i]; }}
         arena_grad(arena_index(i), sum);
     }}
 }}
@@ -582,9 +671,11 @@ fn main(
         Self::step(&mut source);
         source.bind("x", Access::Read, "array<f32>");
         source.bind("y", Access::Write, "array<f32>");
+        self.bind_tape(&mut source, Access::Write);
+        source.add("row", ROW);
         self.declare(&mut source, false);
         let l = &self.links[0];
-        self.include(&mut source, l, false);
+        self.include(&mut source, l, Keeping::Forward);
         let Info { input, output, .. } = l.info;
         source.add(
             "forward",
@@ -608,16 +699,18 @@ fn main(
         for (name, access) in [("x", Access::Read), ("dy", Access::Read), ("dx", Access::Write)] {
             source.bind(name, access, "array<f32>");
         }
-        self.sums(&mut source);
+        self.bind_tape(&mut source, Access::Write);
+        source.add("row", ROW);
         self.declare(&mut source, true);
         self.additions(&mut source);
         let l = &self.links[0];
-        self.include(&mut source, l, true);
+        self.include(&mut source, l, Keeping::Backward);
         let Info { input, output, .. } = l.info;
         source.add(
             "backward",
             &self.groups(&format!(
                 "        let live = row < step.rows;
+        keeping = live;
         var x0: array<f32, {input}>;
         var d1: array<f32, {output}>;
         var d0: array<f32, {input}>;
@@ -635,109 +728,50 @@ fn main(
     }
 }
 
+/// The row that an invocation is at, and whether its stages may write what they keep.
+const ROW: &str = "var<private> row: u32;\nvar<private> keeping: bool;";
+
 /// A kernel whose invocations take rows one by one.
 fn rows(body: &str) -> String {
     format!(
         "@compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {{
-    for (var row = id.x; row < step.rows; row += groups.x * 64u) {{
+    for (row = id.x; row < step.rows; row += groups.x * 64u) {{
 {body}    }}
 }}
 "
     )
 }
 
-/// Lines that hand 32 channels of `name`, from `first` on, over to the group, with a factor; channels past `count` are 0.
-fn hand_over(side: &str, name: &str, factor: &str, first: usize, count: usize) -> String {
-    let channel = |c: usize| if c < count { format!("(*{name})[{c}]{factor}") } else { "0.0".into() };
-    let mut text = String::new();
-    for quad in 0..8 {
-        let c = first + 4 * quad;
-        if c < count {
-            let of = [c, c + 1, c + 2, c + 3].map(channel).join(", ");
-            let _ = writeln!(text, "    {side}[sums_place(lane, {quad}u)] = vec4<f32>({of});");
+/// A line for each of `count` channels, with the channel in place of `{c}` and its place in a buffer for `{at}`.
+fn channels(count: usize, line: &str) -> String {
+    let own = |c: usize| line.replace("{c}", &c.to_string()).replace("{at}", &format!("{c}u * step.stride + row"));
+    (0..count).map(|c| format!("            {}\n", own(c))).collect()
+}
+
+/// Refuses sums of channels that are not kept, of parameters that a stage does not have, and two for one parameter.
+fn check(sums: &[Sum], keeps: usize, params: usize) -> std::result::Result<(), String> {
+    if keeps > MOST_KEPT {
+        return Err(format!("keeps {keeps} channels, expected at most {MOST_KEPT}"));
+    }
+    let within = |first: usize, count: usize, all: usize| first.checked_add(count).is_some_and(|end| end <= all);
+    let mut rows = vec![];
+    for sum in sums {
+        let Sum { at, ld, left, outputs, right, inputs } = *sum;
+        if outputs == 0 || !within(left, outputs, keeps) || !within(right, inputs, keeps) {
+            return Err(format!("sums channels {left} + {outputs} and {right} + {inputs}, but keeps {keeps}"));
         }
-    }
-    text
-}
-
-/// Adds the sums of `m` channels over the rows of a group.
-fn vector(prefix: &str, m: usize) -> String {
-    let lines = sums_of(prefix, "a", "", m);
-    format!("fn {prefix}sum_{m}(at: u32, a: ptr<function, array<f32, {m}>>) {{\n{lines}}}\n")
-}
-
-/// Adds the sums of the products of one and `k` channels over the rows of a group.
-fn row_outer(prefix: &str, k: usize) -> String {
-    let lines = sums_of(prefix, "b", " * (*a)[0]", k);
-    format!(
-        "fn {prefix}outer_1_{k}(at: u32, ld: u32, a: ptr<function, array<f32, 1>>, b: ptr<function, array<f32, {k}>>) {{
-{lines}}}
-"
-    )
-}
-
-/// Lines that add the sums of `count` channels of `name`, each times `factor`.
-fn sums_of(prefix: &str, name: &str, factor: &str, count: usize) -> String {
-    let mut text = String::new();
-    for first in (0..count).step_by(32) {
-        let put = hand_over("left", name, factor, first, count);
-        let _ = write!(
-            text,
-            "    workgroupBarrier();
-{put}    workgroupBarrier();
-    let sum{first} = sums_channel();
-    if lane < 32u && {first}u + lane < {count}u {{
-        {prefix}store(at + {first}u + lane, {prefix}so_far(at + {first}u + lane), sum{first});
-    }}
-"
-        );
-    }
-    text
-}
-
-/// Adds the sums of all products of `m` and `k` channels over the rows of a group.
-fn outer(prefix: &str, m: usize, k: usize) -> String {
-    let mut text = format!(
-        "fn {prefix}outer_{m}_{k}(at: u32, ld: u32, a: ptr<function, array<f32, {m}>>, b: ptr<function, array<f32, {k}>>) {{
-    let j = lane >> 3u;
-    let c = lane & 7u;
-"
-    );
-    for top in (0..m).step_by(32) {
-        for side in (0..k).step_by(32) {
-            let put = if side == 0 { hand_over("left", "a", "", top, m) } else { String::new() };
-            let other = hand_over("right", "b", "", side, k);
-            let _ = write!(
-                text,
-                "    workgroupBarrier();
-{put}{other}    workgroupBarrier();
-    if {top}u + 4u * j < {m}u && {side}u + 4u * c < {k}u {{
-        let block = sums_block(j, c);
-        let begin = at + ({top}u + 4u * j) * ld + {side}u + 4u * c;
-"
-            );
-            let block = || (0..4).flat_map(|p| (0..4).map(move |q| (p, q)));
-            let at = |p, q| format!("begin + {p}u * ld + {q}u");
-            // All are read before the first is written: otherwise each waits for the one before.
-            for (p, q) in block() {
-                let _ = writeln!(text, "        let v{p}{q} = {prefix}so_far({});", at(p, q));
-            }
-            for (p, q) in block() {
-                let store = format!("{prefix}store({}, v{p}{q}, block[{p}][{q}]);", at(p, q));
-                // A block at the edge has too many.
-                let rows = (p > (m - 1) % 4).then(|| format!("{top}u + 4u * j + {p}u < {m}u"));
-                let columns = (q > (k - 1) % 4).then(|| format!("{side}u + 4u * c + {q}u < {k}u"));
-                let within: Vec<String> = rows.into_iter().chain(columns).collect();
-                let _ = match within.is_empty() {
-                    true => writeln!(text, "        {store}"),
-                    false => writeln!(text, "        if {} {{ {store} }}", within.join(" && ")),
-                };
-            }
-            text += "    }\n";
+        let last = ld.checked_mul(outputs - 1).and_then(|l| l.checked_add(at));
+        if !last.is_some_and(|l| within(l, inputs.max(1), params)) {
+            return Err(format!("sums to parameter {at} and later ones, but the stage has {params}"));
         }
+        rows.extend((0..outputs).map(|j| sum.row(j)));
     }
-    text + "}\n"
+    rows.sort_by_key(|r| r.start);
+    match rows.windows(2).find(|r| r[1].start < r[0].end) {
+        Some(twice) => Err(format!("has two sums for parameter {}", twice[1].start)),
+        None => Ok(()),
+    }
 }
 
 /// Samples of rays.

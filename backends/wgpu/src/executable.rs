@@ -20,11 +20,12 @@ use std::sync::Arc;
 use std::time::Instant;
 use wgpu::BufferUsages as U;
 
-/// Bytes that all groups' partial sums may take together.
+/// Bytes that all partial sums may take together.
 const PARTIAL_BYTES: usize = 64 << 20;
-/// Groups of `backward` at most, on a software device and on others: enough to fill it, few enough that their sums are merged
-/// fast.
-const BACKWARD_GROUPS: [usize; 2] = [64, 4096];
+/// Shares of the rows with partial sums of their own, on a software device and on others.
+const SHARES: [usize; 2] = [4, 256];
+/// Bytes that the rows of a wave may keep, on a software device and on others.
+const TAPE_BYTES: [u64; 2] = [16 << 20, 512 << 20];
 /// Rows of a wave at first, at least, and at most.
 const FIRST_ROWS: u32 = 1 << 14;
 const LEAST_ROWS: u32 = 1 << 12;
@@ -92,7 +93,8 @@ impl Kernels {
         if chain.scatters() {
             kernels.add(shared, "scatter", chain.scatter())?;
         }
-        if chain.dense > 0 {
+        if chain.summed() > 0 {
+            kernels.add(shared, "sums", chain.sums())?;
             kernels.add(shared, "merge", chain.merge())?;
         }
         Ok(kernels)
@@ -123,6 +125,8 @@ pub struct Wgpu {
     clean: bool,
     /// Rows that a wave may have.
     pace: Pace,
+    /// Rows that it may come to have.
+    most: u32,
     /// Rows for which there is room.
     room: u32,
     profile: Option<Profile>,
@@ -130,6 +134,10 @@ pub struct Wgpu {
 
 impl Wgpu {
     pub(crate) fn new(shared: Arc<Shared>, chain: Chain, kernels: Kernels) -> Self {
+        let adapter = &shared.gpu.adapter;
+        let tape = TAPE_BYTES[usize::from(!adapter.software)].min(adapter.bound_bytes());
+        let rows = tape / (4 * chain.tape().max(1) as u64);
+        let most = rows.clamp(u64::from(LEAST_ROWS), u64::from(MOST_ROWS)) as u32;
         Self {
             shared,
             chain,
@@ -140,7 +148,8 @@ impl Wgpu {
             buffers: Buffers::default(),
             loaded: false,
             clean: false,
-            pace: Pace::new(FIRST_ROWS, LEAST_ROWS, MOST_ROWS),
+            pace: Pace::new(FIRST_ROWS.min(most), LEAST_ROWS, most),
+            most,
             room: 0,
             profile: None,
         }
@@ -148,26 +157,30 @@ impl Wgpu {
 
     /// Bytes that it comes to hold on the device.
     pub fn device_bytes(&self) -> u64 {
-        let rows = u64::from(MOST_ROWS) * self.row_bytes();
+        let rows = u64::from(self.most) * self.row_bytes();
         let halves = self.chain.halves().map_or(0, |_| 2);
-        (16 + halves) * self.chain.params() as u64 + rows + 4 * (self.groups() * self.chain.dense) as u64
+        (16 + halves) * self.chain.params() as u64 + rows + self.partial_bytes()
     }
 
     /// Bytes that it comes to hold in the machine's memory for copies.
     pub fn host_bytes(&self) -> usize {
-        MOST_ROWS as usize * 20 + (32 << 20)
+        self.most as usize * 20 + (32 << 20)
     }
 
-    /// Positions and weights, μ and its derivative, targets, features.
+    /// Positions and weights, μ and its derivative, targets, features, kept channels.
     fn row_bytes(&self) -> u64 {
-        16 + 4 + 4 + 4 + 4 * self.chain.kept().max(self.chain.features()) as u64
+        let channels = self.chain.kept().max(self.chain.features()) + self.chain.tape();
+        16 + 4 + 4 + 4 + 4 * channels as u64
     }
 
-    /// Groups of `backward`.
-    fn groups(&self) -> usize {
-        let each = 4 * self.chain.dense.max(1);
-        let most = BACKWARD_GROUPS[usize::from(!self.gpu().adapter.software)];
-        (PARTIAL_BYTES / each).clamp(1, most)
+    /// Shares of the rows that `sums` adds up on their own.
+    fn shares(&self) -> usize {
+        let each = 4 * self.chain.summed().max(1);
+        (PARTIAL_BYTES / each).clamp(1, SHARES[usize::from(!self.gpu().adapter.software)])
+    }
+
+    fn partial_bytes(&self) -> u64 {
+        4 * (self.shares() * self.chain.summed()) as u64
     }
 
     fn gpu(&self) -> &Gpu {
@@ -188,9 +201,8 @@ impl Wgpu {
             let name = format!("rule_{s}");
             self.buffers.reserve(&shared.gpu, &name, size_of::<Rule>() as u64, U::UNIFORM | U::COPY_DST)?;
         }
-        if self.chain.dense > 0 {
-            let bytes = 4 * (self.groups() * self.chain.dense) as u64;
-            self.buffers.reserve(&shared.gpu, "partial", bytes, U::STORAGE | U::COPY_DST)?;
+        if self.chain.summed() > 0 {
+            self.buffers.reserve(&shared.gpu, "partial", self.partial_bytes(), U::STORAGE | U::COPY_DST)?;
         }
         if shared.profile && self.profile.is_none() {
             self.profile = Profile::new(&shared.gpu)?;
@@ -217,6 +229,7 @@ impl Wgpu {
         self.reserve("dmu", 4 * n, U::STORAGE)?;
         self.reserve("targets", 4 * n, U::STORAGE | U::COPY_DST)?;
         self.reserve("features", 4 * n * self.chain.kept().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
+        self.reserve("tape", 4 * n * self.chain.tape().max(1) as u64, U::STORAGE)?;
         self.room = rows;
         Ok(())
     }
@@ -389,8 +402,8 @@ impl Wgpu {
         }
         self.write("step", bytemuck::bytes_of(&step))?;
         let groups = |rows: usize| rows.div_ceil(GROUP as usize);
-        let backward = if self.chain.learns() { groups(wave.rows as usize).min(self.groups()) } else { 0 };
-        let scatter = if self.chain.scatters() { groups(wave.rows as usize) } else { 0 };
+        let backward = if self.chain.learns() { groups(wave.rows as usize) } else { 0 };
+        let scatter = if self.chain.scatters() { backward } else { 0 };
         self.launch(
             encoder,
             &[
@@ -401,6 +414,7 @@ impl Wgpu {
                 (OF_POINTS, groups(wave.points.len())),
                 (&of_blocks(wave.prior), wave.blocks.len()),
                 ("backward", backward),
+                ("sums", self.chain.summing(self.shares())),
                 ("scatter", scatter),
             ],
         )?;
@@ -458,8 +472,8 @@ impl Executable for Wgpu {
             self.learn(&mut encoder, wave, work, at)?;
             at += 4 * wave.losses() as u64;
         }
-        if self.chain.dense > 0 {
-            self.launch(&mut encoder, &[("merge", self.chain.merging(self.groups()))])?;
+        if self.chain.summed() > 0 {
+            self.launch(&mut encoder, &[("merge", self.chain.merging(self.shares()))])?;
         }
         self.gpu().queue.submit([encoder.finish()]);
         let mut stats = StepStats { samples: waves.iter().map(|w| u64::from(w.rows)).sum(), ..StepStats::default() };

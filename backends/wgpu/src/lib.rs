@@ -116,7 +116,7 @@ impl Backend for Wgpu {
             notes.push(match (info.identity, info.grads) {
                 (true, _) => format!("{name}: identity, left out"),
                 (_, GradKind::None) => format!("{name}: fused"),
-                (_, GradKind::Dense) => format!("{name}: fused, gradients summed in each group of 64 rows"),
+                (_, GradKind::Dense) => format!("{name}: fused, gradients summed over rows by a kernel of their own"),
                 (_, GradKind::Scatter) => {
                     let first = if chain.together() { ", summed in subgroups first" } else { "" };
                     format!("{name}: fused, gradients by {}{first}", adapter.atomics)
@@ -130,6 +130,9 @@ impl Backend for Wgpu {
                 .into(),
             n => format!("split: forward and backward{after}; {n} features per sample are kept in between"),
         });
+        if chain.tape() > 0 {
+            notes.push(format!("stages keep {} numbers per sample between forward, backward and sums", chain.tape()));
+        }
         if let Some(tables) = chain.halves() {
             notes.push(format!("tables are read from a copy in {tables}"));
         }

@@ -6,7 +6,7 @@ use crate::compose::{self, Chain, GROUP};
 use crate::executable::Step;
 use crate::kernel::Buffers;
 use crate::source::Source;
-use crate::wave::GpuRay;
+use crate::wave::{GpuRay, MOST_GROUPS};
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;
@@ -41,8 +41,12 @@ impl Shared {
         for (name, bytes) in [("x", inputs), ("dx", inputs), ("y", outputs), ("dy", outputs)] {
             buffers.reserve(gpu, name, bytes, usage)?;
         }
-        buffers.reserve(gpu, "partial", 4 * (groups * chain.dense) as u64, usage)?;
-        for (name, data) in [("x", x), ("dy", dy)] {
+        let shares = 3;
+        buffers.reserve(gpu, "partial", 4 * (shares * chain.summed()) as u64, usage)?;
+        buffers.reserve(gpu, "tape", 4 * (rows * chain.tape()) as u64, usage)?;
+        // No row is left out.
+        buffers.reserve(gpu, "dmu", 4 * rows as u64, usage)?;
+        for (name, data) in [("x", x), ("dy", dy), ("dmu", &vec![1.0; rows])] {
             buffers.get(name).inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::cast_slice(data)));
         }
         buffers.reserve(gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
@@ -58,8 +62,9 @@ impl Shared {
         let step = Step { rows: rows as u32, stride: rows as u32, ..Step::default() };
         run("forward", &chain.single_forward(), step, groups)?;
         run("backward", &chain.single_backward(), step, groups)?;
-        if chain.dense > 0 {
-            run("merge", &chain.merge(), step, chain.merging(groups))?;
+        if chain.summed() > 0 {
+            run("sums", &chain.sums(), step, chain.summing(shares).min(MOST_GROUPS))?;
+            run("merge", &chain.merge(), step, chain.merging(shares).min(MOST_GROUPS))?;
         }
         arena::download(gpu, &buffers, &chain, &mut arena, target.segment)?;
         let [y, dx] =

@@ -1,28 +1,57 @@
 //! WGSL of a multi-layer perceptron, layer by layer with constant widths.
 //!
-//! Products are computed in blocks of outputs, so that each value read is used for all sums in registers.
+//! Products are computed in blocks of outputs, so that each value read is used for all sums in registers. A row keeps its
+//! features, every layer's outputs and the slopes of its activations; `backward` turns these into `∂L/∂z`.
 
 use super::MlpStage;
 use crate::linear::Linear;
+use conefield_core::wgsl::{Sum, declare};
 use std::fmt::Write;
 
 /// Number of sums in a loop over inputs.
 const BLOCK: usize = 8;
 
-/// `stage_forward` and `stage_backward`.
+/// The declarations, `stage_forward` and `stage_backward`.
 pub fn functions(stage: &MlpStage) -> String {
     let last = stage.layers.len() - 1;
-    let mut forward = String::new();
+    let (features, width) = (stage.input, stage.settings.width);
+    let mut forward = format!("    for (var k = 0u; k < {features}u; k++) {{ stage_keep(k, (*x)[k]); }}\n");
     for i in 0..=last {
-        layer(stage, i, false, &mut forward);
+        layer(stage, i, &mut forward);
     }
     let _ = writeln!(forward, "    (*y)[0] = h{last}[0];");
     let mut backward = String::new();
-    for i in 0..=last {
-        layer(stage, i, true, &mut backward);
-    }
     gradients(stage, &mut backward);
-    conefield_core::wgsl::functions(stage.input, 1, &forward, &backward)
+    let keeps = features + 2 * width * last + 1;
+    declare(keeps, &sums(stage)) + &conefield_core::wgsl::functions(features, 1, &forward, &backward)
+}
+
+/// The first kept channel of a hidden layer's outputs.
+fn outputs(stage: &MlpStage, i: usize) -> usize {
+    stage.input + 2 * i * stage.settings.width
+}
+
+/// The first kept channel of the slopes of a layer's activation.
+fn slopes(stage: &MlpStage, i: usize) -> usize {
+    let hidden = i + 1 < stage.layers.len();
+    outputs(stage, i) + if hidden { stage.settings.width } else { 0 }
+}
+
+/// The gradients of weights and biases. A skip layer's first columns belong to the features.
+fn sums(stage: &MlpStage) -> Vec<Sum> {
+    let mut sums = vec![];
+    for (i, layer) in stage.layers.iter().enumerate() {
+        let Linear { skip, input, output, start } = *layer;
+        let left = slopes(stage, i);
+        let right = if i == 0 { 0 } else { outputs(stage, i - 1) };
+        let columns = |at, right, inputs| Sum { at, ld: layer.ld(), left, outputs: output, right, inputs };
+        sums.push(columns(start + skip, right, input));
+        if skip > 0 {
+            sums.push(columns(start, 0, skip));
+        }
+        sums.push(Sum::vector(layer.bias().start, left, output));
+    }
+    sums
 }
 
 /// The input of a layer: the features or the previous layer.
@@ -30,16 +59,14 @@ fn reads(i: usize) -> String {
     if i == 0 { "(*x)".into() } else { format!("h{}", i - 1) }
 }
 
-/// Computes `h{i}` and, if wanted, the activation's derivative `s{i}`.
-fn layer(stage: &MlpStage, i: usize, slopes: bool, out: &mut String) {
+/// Computes `h{i}` and keeps what `backward` needs.
+fn layer(stage: &MlpStage, i: usize, out: &mut String) {
     let layer = &stage.layers[i];
     let Linear { skip, input, output, .. } = *layer;
     let last = i + 1 == stage.layers.len();
     let act = if last { stage.settings.output } else { stage.settings.activation }.wgsl();
+    let (kept, slope) = (outputs(stage, i), slopes(stage, i));
     let _ = writeln!(out, "    var h{i}: array<f32, {output}>;");
-    if slopes {
-        let _ = writeln!(out, "    var s{i}: array<f32, {output}>;");
-    }
     for start in (0..output).step_by(BLOCK) {
         let block = start..(start + BLOCK).min(output);
         out.push_str("    {\n");
@@ -59,28 +86,24 @@ fn layer(stage: &MlpStage, i: usize, slopes: bool, out: &mut String) {
         }
         for o in block {
             let _ = writeln!(out, "        let f{o} = {act}(a{o});\n        h{i}[{o}] = f{o}.x;");
-            if slopes {
-                let _ = writeln!(out, "        s{i}[{o}] = f{o}.y;");
+            if !last {
+                let _ = writeln!(out, "        stage_keep({}u, f{o}.x);", kept + o);
             }
+            let _ = writeln!(out, "        stage_keep({}u, f{o}.y);", slope + o);
         }
         out.push_str("    }\n");
     }
 }
 
-/// From the last layer to the first: `s{i}` becomes `∂L/∂z`, gradients are summed, `*dx` accumulates.
+/// From the last layer to the first: `s{i}` is `∂L/∂z`, which takes the place of the slopes; `*dx` accumulates.
 fn gradients(stage: &MlpStage, out: &mut String) {
     let last = stage.layers.len() - 1;
-    let _ = writeln!(out, "    s{last}[0] *= (*dy)[0];");
+    let channel = slopes(stage, last);
+    let _ = writeln!(out, "    var s{last}: array<f32, 1>;\n    s{last}[0] = stage_kept({channel}u) * (*dy)[0];");
+    let _ = writeln!(out, "    stage_keep({channel}u, s{last}[0]);");
     let mut fresh = true;
     for (i, layer) in stage.layers.iter().enumerate().rev() {
-        let Linear { skip, input, output, start } = *layer;
-        let ld = layer.ld();
-        let from = if i == 0 { "x".to_owned() } else { format!("&h{}", i - 1) };
-        let _ = writeln!(out, "    stage_outer_{output}_{input}({}u, {ld}u, &s{i}, {from});", start + skip);
-        if skip > 0 {
-            let _ = writeln!(out, "    stage_outer_{output}_{skip}({start}u, {ld}u, &s{i}, x);");
-        }
-        let _ = writeln!(out, "    stage_sum_{output}({}u, &s{i});", layer.bias().start);
+        let Linear { skip, input, .. } = *layer;
         let features = if skip > 0 { skip } else { input };
         if skip > 0 || i == 0 {
             out.push_str("    if stage_wants_dx {\n");
@@ -90,7 +113,12 @@ fn gradients(stage: &MlpStage, out: &mut String) {
             fresh = false;
         }
         if i > 0 {
-            back(i, layer, skip, input, out, |k| format!("s{}[{k}] *= a{k};", i - 1));
+            let (before, first) = (i - 1, slopes(stage, i - 1));
+            let _ = writeln!(out, "    var s{before}: array<f32, {input}>;");
+            back(i, layer, skip, input, out, |k| {
+                let c = first + k;
+                format!("s{before}[{k}] = stage_kept({c}u) * a{k}; stage_keep({c}u, s{before}[{k}]);")
+            });
         }
     }
 }

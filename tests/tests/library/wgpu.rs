@@ -376,8 +376,9 @@ fn a_perturbed_constant_fails_the_parity_check() {
     let perturbed: [fn(String) -> Option<String>; 4] = [
         |s| Some(s.replace("0.23164189", "0.2318")),
         |s| Some(s.replace("1.52382103", "1.5240")),
-        |s| Some(s.replacen("stage_outer_5_3(0u", "stage_outer_5_3(1u", 1)),
-        |s| Some(s.replace("s0[0] *=", "s0[0] *= 1.001 *")),
+        // The weights of the first layer, by the wrong inputs.
+        |s| Some(s.replacen("(0, 3, 8, 5, 0, 3)", "(0, 3, 8, 5, 1, 3)", 1)),
+        |s| Some(s.replace("stage_kept(13u) *", "1.001 * stage_kept(13u) *")),
     ];
     for (i, change) in perturbed.into_iter().enumerate() {
         assert_eq!(check(change).failed(), ["WGSL parity"], "perturbation {i}");

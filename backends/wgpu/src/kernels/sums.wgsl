@@ -1,44 +1,97 @@
-// Sums over the 64 rows of a group. Rows hand their numbers over through workgroup memory, 32 channels of each side at a
-// time, four to a vector; every one of the 64 then sums a block of 4 × 4 products over all rows. Vector q of row r stands at
-// place q xor (r mod 8) of the row, so that neither writing nor reading meets the same bank twice.
+// Sums over rows. A group takes one block of products over its share of the rows. Rows hand 32 channels of each side over
+// through workgroup memory, 64 rows at a time, four channels to a vector; every lane sums a block of 4 × 4 products. Vector q of
+// row r stands at place q xor (r mod 8) of the row, so that neither writing nor reading meets the same bank twice.
 
-var<private> lane: u32;
-var<private> group: u32;
+struct Block {
+    // First kept channel on the left, and channels.
+    left: u32,
+    outputs: u32,
+    right: u32,
+    inputs: u32,
+    // First partial sum, and partial sums from one channel on the left to the next.
+    at: u32,
+    ld: u32,
+    // First partial sum of the left channels themselves.
+    own: u32,
+}
+
+const none = 0xffffffffu;
+
 var<workgroup> left: array<vec4<f32>, 512>;
 var<workgroup> right: array<vec4<f32>, 512>;
 
-fn sums_place(row: u32, quad: u32) -> u32 {
+fn place(row: u32, quad: u32) -> u32 {
     return row * 8u + (quad ^ (row & 7u));
 }
 
-// The sums of a block of vectors `j` on the left and `k` on the right.
-fn sums_block(j: u32, k: u32) -> mat4x4<f32> {
-    var sum0 = vec4<f32>();
-    var sum1 = vec4<f32>();
-    var sum2 = vec4<f32>();
-    var sum3 = vec4<f32>();
-    for (var first = 0u; first < 512u; first += 64u) {
-        for (var r = 0u; r < 8u; r++) {
-            let a = left[first + r * 8u + (j ^ r)];
-            let b = right[first + r * 8u + (k ^ r)];
-            sum0 += a.x * b;
-            sum1 += a.y * b;
-            sum2 += a.z * b;
-            sum3 += a.w * b;
-        }
+fn channel(c: u32, end: u32, row: u32) -> f32 {
+    if c < end {
+        return tape[c * step.stride + row];
     }
-    return mat4x4<f32>(sum0, sum1, sum2, sum3);
+    return 0.0;
 }
 
-// The sum of channel `lane mod 32` of the left side, by the first 32 of the group.
-fn sums_channel() -> f32 {
-    let c = lane & 31u;
-    let begin = (lane >> 5u) * 32u;
-    var sum = 0.0;
-    for (var r = begin; r < begin + 32u; r++) {
-        sum += left[sums_place(r, c >> 2u)][c & 3u];
+fn quad(c: u32, end: u32, row: u32) -> vec4<f32> {
+    return vec4<f32>(channel(c, end, row), channel(c + 1u, end, row), channel(c + 2u, end, row), channel(c + 3u, end, row));
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(num_workgroups) all: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let shares = arrayLength(&partial) / summed;
+    let j = lane >> 3u;
+    let k = lane & 7u;
+    for (var piece = id.x; piece < blocks * shares; piece += all.x) {
+        let block = block_of(piece % blocks);
+        let share = piece / blocks;
+        let left_end = block.left + block.outputs;
+        let right_end = block.right + block.inputs;
+        var sum0 = vec4<f32>();
+        var sum1 = vec4<f32>();
+        var sum2 = vec4<f32>();
+        var sum3 = vec4<f32>();
+        var own = vec4<f32>();
+        for (var first = share * 64u; first < step.rows; first += shares * 64u) {
+            let row = first + lane;
+            let live = row < step.rows && dmu[min(row, step.rows - 1u)] != 0.0;
+            workgroupBarrier();
+            for (var q = 0u; q < 8u; q++) {
+                var a = vec4<f32>();
+                var b = vec4<f32>();
+                if live {
+                    a = quad(block.left + 4u * q, left_end, row);
+                    b = quad(block.right + 4u * q, right_end, row);
+                }
+                left[place(lane, q)] = a;
+                right[place(lane, q)] = b;
+            }
+            workgroupBarrier();
+            for (var eight = 0u; eight < 512u; eight += 64u) {
+                for (var r = 0u; r < 8u; r++) {
+                    let a = left[eight + r * 8u + (j ^ r)];
+                    let b = right[eight + r * 8u + (k ^ r)];
+                    own += a;
+                    sum0 += a.x * b;
+                    sum1 += a.y * b;
+                    sum2 += a.z * b;
+                    sum3 += a.w * b;
+                }
+            }
+        }
+        let sums = mat4x4<f32>(sum0, sum1, sum2, sum3);
+        for (var p = 0u; p < 4u; p++) {
+            let o = 4u * j + p;
+            if o < block.outputs {
+                let begin = share * summed + block.at + o * block.ld;
+                for (var q = 0u; q < 4u; q++) {
+                    let i = 4u * k + q;
+                    if i < block.inputs { partial[begin + i] += sums[p][q]; }
+                }
+                if k == 0u && block.own != none { partial[share * summed + block.own + o] += own[p]; }
+            }
+        }
     }
-    right[lane].x = sum;
-    workgroupBarrier();
-    return sum + right[(lane + 32u) & 63u].x;
 }

@@ -7,7 +7,7 @@ use conefield_plugin::random::{mix, unit};
 use conefield_plugin::settings::FieldSpec;
 use conefield_plugin::simd::Real;
 use conefield_plugin::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
-use conefield_plugin::wgsl::Fragment;
+use conefield_plugin::wgsl::{Fragment, Sum, declare};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
@@ -209,11 +209,15 @@ impl Stage for SirenField {
         Some(self)
     }
 
-    /// The same layers for one row. Every row affects every weight: gradients are sums over rows.
+    /// The same layers for one row. Every row touches every weight: gradients are sums over rows of channels that `backward`
+    /// keeps, first the features, then the outputs and slopes of each layer.
     fn wgsl(&self) -> Option<Fragment> {
         let (n, last) = (self.input, self.layers.len() - 1);
         let (mut layers, mut back) = (String::new(), String::new());
-        for (k, Layer { input, output, weights, biases }) in self.layers.iter().enumerate() {
+        let mut keep = format!("    for (var i = 0u; i < {n}u; i++) {{ stage_keep(i, (*x)[i]); }}\n");
+        let mut sums = vec![];
+        let (mut right, mut keeps) = (0, n);
+        for (k, &Layer { input, output, weights, biases }) in self.layers.iter().enumerate() {
             let from = if k == 0 { "(*x)".into() } else { format!("h{}", k - 1) };
             let activation = if k == last { "stage_softplus" } else { "stage_sine" };
             let _ = write!(
@@ -229,15 +233,24 @@ impl Stage for SirenField {
     }}
 "
             );
+            let left = keeps + output;
+            sums.push(Sum { at: weights, ld: input, left, outputs: output, right, inputs: input });
+            sums.push(Sum::vector(biases, left, output));
+            let _ = write!(
+                keep,
+                "    for (var o = 0u; o < {output}u; o++) {{
+        stage_keep({keeps}u + o, h{k}[o]);
+        stage_keep({left}u + o, s{k}[o]);
+    }}
+"
+            );
+            (right, keeps) = (keeps, keeps + 2 * output);
         }
-        for (k, Layer { input, output, weights, biases }) in self.layers.iter().enumerate().rev() {
-            let from = if k == 0 { "x".into() } else { format!("&h{}", k - 1) };
+        for (k, Layer { input, output, weights, .. }) in self.layers.iter().enumerate().rev() {
             let put = if k == 0 { "(*dx)[i] =".into() } else { format!("s{}[i] *=", k - 1) };
             let _ = write!(
                 back,
-                "    stage_outer_{output}_{input}({weights}u, {input}u, &s{k}, {from});
-    stage_sum_{output}({biases}u, &s{k});
-    for (var i = 0u; i < {input}u; i++) {{
+                "    for (var i = 0u; i < {input}u; i++) {{
         var sum = 0.0;
         for (var o = 0u; o < {output}u; o++) {{ sum += stage_param({weights}u + o * {input}u + i) * s{k}[o]; }}
         {put} sum;
@@ -246,7 +259,7 @@ impl Stage for SirenField {
             );
         }
         let omega = self.settings.omega as f32;
-        Some(Fragment::new(&[&format!(
+        Some(Fragment::new(&[&declare(keeps, &sums), &format!(
             "fn stage_sine(x: f32) -> vec2<f32> {{ return vec2<f32>(sin({omega:?} * x), {omega:?} * cos({omega:?} * x)); }}
 
 fn stage_softplus(x: f32) -> vec2<f32> {{
@@ -264,7 +277,7 @@ fn stage_backward(
     dx: ptr<function, array<f32, {n}>>,
 ) {{
 {layers}    s{last}[0] *= (*dy)[0];
-{back}}}
+{back}{keep}}}
 "
         )]))
     }
