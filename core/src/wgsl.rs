@@ -15,6 +15,7 @@
 //! ```wgsl
 //! const stage_wants_dx: bool;
 //! fn stage_param(i: u32) -> f32                                          // parameter i of the stage
+//! fn stage_param4(i: u32) -> vec4<f32>                                   // parameters i to i + 3; i is a multiple of 4
 //! fn stage_keep(c: u32, v: f32)                                          // keeps v as channel c of the row
 //! fn stage_kept(c: u32) -> f32                                           // what the row keeps as channel c
 //! fn stage_grad(i: u32, v: f32)                                          // adds v to the gradient of parameter i
@@ -264,10 +265,12 @@ fn tokens(text: &str) -> impl Iterator<Item = &str> {
 pub fn hosted(name: &str, first: u32, kept: usize, fragment: &Fragment) -> String {
     let keeps = fragment.keeps();
     let own = name.strip_prefix(PREFIX).unwrap_or(name);
+    let four = if first.is_multiple_of(4) { format!("stage_param4({first}u + i)") } else { four_by_one(name) };
     let mut out = format!(
         "const {PREFIX}keeps_{own} = {keeps}u;
 const {name}wants_dx = stage_wants_dx;
 fn {name}param(i: u32) -> f32 {{ return stage_param({first}u + i); }}
+fn {name}param4(i: u32) -> vec4<f32> {{ return {four}; }}
 fn {name}keep(c: u32, v: f32) {{ stage_keep({kept}u + c, v); }}
 fn {name}kept(c: u32) -> f32 {{ return stage_kept({kept}u + c); }}
 fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
@@ -287,6 +290,12 @@ fn {name}grad(i: u32, v: f32) {{ stage_grad({first}u + i, v); }}
 /// `grad_pair` of stage `name` by two of its `grad`.
 pub fn one_by_one(name: &str) -> String {
     format!("fn {name}grad_pair(i: u32, v: vec2<f32>) {{ {name}grad(i, v.x); {name}grad(i + 1u, v.y); }}\n")
+}
+
+/// The value of `param4` of stage `name` from four of its `param`.
+pub fn four_by_one(name: &str) -> String {
+    let each = ["i", "i + 1u", "i + 2u", "i + 3u"].map(|i| format!("{name}param({i})"));
+    format!("vec4<f32>({})", each.join(", "))
 }
 
 /// Whether a setting is a positive normal number also in single precision, as used in shaders.

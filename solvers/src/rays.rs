@@ -182,12 +182,15 @@ impl<'a> RaySource<'a> {
 
     /// Draws the rays of step `step` (from 0), reproducible by `seed`.
     pub fn draw(&self, seed: u64, step: u64, count: usize, out: &mut Vec<TrainRay>) {
-        out.clear();
         let mut rng = stream(seed, 2 * step);
+        let mut drawn = Vec::with_capacity(count);
         match self.views {
-            Views::One => self.draw_from(self.view_of(seed, step), count, &mut rng, out),
-            Views::All => self.draw_from_all(count, &mut rng, out),
+            Views::One => self.draw_from(self.view_of(seed, step), count, &mut rng, &mut drawn),
+            Views::All => self.draw_from_all(count, &mut rng, &mut drawn),
         }
+        // A GPU waits meanwhile.
+        let rays = drawn.par_iter().with_min_len(512).map(|&(view, pixel)| self.ray(view, pixel));
+        rays.collect_into_vec(out);
     }
 
     /// The view of step `step`: every view once per epoch.
@@ -209,8 +212,8 @@ impl<'a> RaySource<'a> {
         self.scan.geometry.detector[1]
     }
 
-    /// Draws rays of one view. No pixel is drawn twice if there are enough.
-    fn draw_from(&self, view: usize, count: usize, rng: &mut impl Rng, out: &mut Vec<TrainRay>) {
+    /// Draws pixels of one view. No pixel is drawn twice if there are enough.
+    fn draw_from(&self, view: usize, count: usize, rng: &mut impl Rng, drawn: &mut Vec<(usize, u32)>) {
         let columns = self.columns();
         let mut pixels = Cow::from(&self.pixels[view]);
         if let Some((windows, whole)) = &self.windows {
@@ -218,7 +221,7 @@ impl<'a> RaySource<'a> {
             let most = windows.fitting(count).min(whole.len());
             let mut chosen: Vec<u32> = sample(rng, whole.len(), most).iter().map(|at| whole[at]).collect();
             let inside = chosen.iter().flat_map(|&w| windows.pixels(w, columns));
-            out.extend(inside.map(|pixel| self.ray(view, pixel)));
+            drawn.extend(inside.map(|pixel| (view, pixel)));
             chosen.sort_unstable();
             let is_inside = |p: &u32| windows.of(*p, columns).is_some_and(|w| chosen.binary_search(&w).is_ok());
             let outside: Vec<u32> = pixels.iter().copied().filter(|p| !is_inside(p)).collect();
@@ -227,25 +230,25 @@ impl<'a> RaySource<'a> {
                 pixels = Cow::from(outside);
             }
         }
-        let single = apart(rng, pixels.len(), count - out.len());
-        out.extend(single.map(|at| self.ray(view, pixels[at])));
+        let single = apart(rng, pixels.len(), count - drawn.len());
+        drawn.extend(single.map(|at| (view, pixels[at])));
     }
 
-    /// Draws rays of all views.
-    fn draw_from_all(&self, count: usize, rng: &mut impl Rng, out: &mut Vec<TrainRay>) {
+    /// Draws pixels of all views.
+    fn draw_from_all(&self, count: usize, rng: &mut impl Rng, drawn: &mut Vec<(usize, u32)>) {
         let columns = self.columns();
         if let Some((windows, whole)) = &self.windows {
             for _ in 0..windows.fitting(count) {
                 let view = self.usable[rng.random_range(0..self.usable.len())];
                 if let Some(&window) = whole[view].choose(rng) {
-                    out.extend(windows.pixels(window, columns).map(|pixel| self.ray(view, pixel)));
+                    drawn.extend(windows.pixels(window, columns).map(|pixel| (view, pixel)));
                 }
             }
         }
-        while out.len() < count {
+        while drawn.len() < count {
             let view = self.usable[rng.random_range(0..self.usable.len())];
             let pixels = &self.pixels[view];
-            out.push(self.ray(view, pixels[rng.random_range(0..pixels.len())]));
+            drawn.push((view, pixels[rng.random_range(0..pixels.len())]));
         }
     }
 }

@@ -36,8 +36,8 @@ pub fn allocate(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, params: usize, 
             buffers.reserve(gpu, &format!("halves_{s}"), bytes, U::STORAGE)?;
         }
     }
-    if chain.uniform() {
-        buffers.reserve(gpu, "dense", chain.uniform_bytes(), U::UNIFORM | U::COPY_DST)?;
+    if chain.dense_bytes() > 0 {
+        buffers.reserve(gpu, "dense", chain.dense_bytes(), U::UNIFORM | U::STORAGE | U::COPY_DST)?;
     }
     Ok(())
 }
@@ -63,8 +63,7 @@ pub fn upload(shared: &Shared, buffers: &Buffers, chain: &Chain, arena: &Arena) 
     gpu.fault()
 }
 
-/// Makes the copies anew that parameters are read from: of those that every row reads in the uniform buffer, of tables
-/// in halves.
+/// Renews the copies that kernels read parameters from: those that every row reads, and tables in halves.
 pub fn refresh(shared: &Shared, buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder) -> Result<()> {
     let (gpu, size) = (&shared.gpu, shared.target().segment);
     copy_dense(buffers, chain, encoder, size);
@@ -83,9 +82,8 @@ pub fn refresh(shared: &Shared, buffers: &Buffers, chain: &Chain, encoder: &mut 
 
 fn copy_dense(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder, size: usize) {
     let Some(dense) = buffers.get("dense") else { return };
-    let mut at = 0;
-    for range in chain.dense_ranges() {
-        let mut from = range.start;
+    for (first, range) in chain.dense_ranges() {
+        let (mut at, mut from) = (4 * first as u64, range.start);
         while from < range.end {
             let (s, end) = (from / size, range.end.min((from / size + 1) * size));
             let bytes = 4 * (end - from) as u64;

@@ -41,14 +41,14 @@ pub struct Target {
     pub uniform_bytes: usize,
 }
 
-/// What `stage_keep` does in a kernel.
+/// What stages do in a kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Keeping {
-    /// Nothing: nothing learns.
-    Nothing,
-    /// It writes what `backward` needs.
+enum Pass {
+    /// Forward, keeping nothing.
+    Evaluate,
+    /// Forward, keeping what `backward` needs.
     Forward,
-    /// It writes what `sums` needs, but not while stages run forward once more.
+    /// Backward, keeping what `sums` needs.
     Backward,
 }
 
@@ -166,8 +166,9 @@ impl Chain {
             let sum = Sum { at: range.start + sum.at, left: self.tape + sum.left, right: self.tape + sum.right, ..sum };
             self.sums.push(RowSum { sum, partial });
         }
-        let dense = (info.grads == GradKind::Dense).then_some(self.dense);
-        self.dense += dense.map_or(0, |_| info.params);
+        // Vectors of four are read in one piece.
+        let dense = (info.grads == GradKind::Dense).then_some(self.dense.next_multiple_of(4));
+        self.dense = dense.map_or(self.dense, |first| first + info.params);
         let prefix = format!("s{}_", self.links.len());
         let tape = self.tape;
         self.tape += keeps;
@@ -190,25 +191,20 @@ impl Chain {
         &self.links
     }
 
-    /// Whether the parameters that every row reads are in a uniform buffer, from which a device reads fastest.
-    pub fn uniform(&self) -> bool {
-        self.dense > 0 && 4 * self.dense.next_multiple_of(4) <= self.target.uniform_bytes
-    }
-
     /// How the copy of the parameters is rounded that tables are read from; `None` where they are read as they are.
     pub fn halves(&self) -> Option<Tables> {
         let scattered = self.links.iter().any(|l| l.info.grads == GradKind::Scatter);
         (scattered && self.tables != Tables::F32).then_some(self.tables)
     }
 
-    /// The ranges of the arena that the uniform buffer has copies of, in order.
-    pub fn dense_ranges(&self) -> impl Iterator<Item = Range<usize>> {
-        self.links.iter().filter(|l| l.dense.is_some()).map(|l| l.range.clone())
+    /// The ranges of the arena that the copy for every row holds, each with its place there.
+    pub fn dense_ranges(&self) -> impl Iterator<Item = (usize, Range<usize>)> {
+        self.links.iter().filter_map(|l| Some((l.dense?, l.range.clone())))
     }
 
-    /// Bytes of the uniform buffer.
-    pub fn uniform_bytes(&self) -> u64 {
-        4 * self.dense as u64
+    /// Bytes of the copy of the parameters that every row reads.
+    pub fn dense_bytes(&self) -> u64 {
+        16 * self.dense.div_ceil(4) as u64
     }
 
     /// Buffers that the arena is cut into.
@@ -237,7 +233,8 @@ impl Chain {
         self.params > 0
     }
 
-    fn declare(&self, source: &mut Source, gradients: bool) {
+    /// Binds the arena, and the copy of the parameters that every row reads if one of `links` has any.
+    fn declare(&self, source: &mut Source, links: &[Link], gradients: bool) {
         for s in 0..self.segments() {
             source.bind(&format!("params_{s}"), Access::Read, "array<vec2<f32>>");
         }
@@ -246,8 +243,14 @@ impl Chain {
                 source.bind(&format!("halves_{s}"), Access::Read, "array<u32>");
             }
         }
-        if self.uniform() {
-            source.bind("dense", Access::Uniform, &format!("array<vec4<f32>, {}>", self.dense.div_ceil(4)));
+        if links.iter().any(|l| l.dense.is_some()) {
+            let vectors = self.dense.div_ceil(4);
+            // Kernels with a uniform buffer compile fast. But where rows also write, reading it is slow: on an H200 `backward` took
+            // 22 ms with it and 4.4 ms with a storage buffer.
+            match gradients || 16 * vectors > self.target.uniform_bytes {
+                true => source.bind("dense", Access::Read, "array<vec4<f32>>"),
+                false => source.bind("dense", Access::Uniform, &format!("array<vec4<f32>, {vectors}>")),
+            }
         }
         let mut text = String::from("fn arena_param(i: u32) -> f32 {\n");
         // One number at a time: on an H200, reading both of a pair took twice as long.
@@ -289,29 +292,36 @@ impl Chain {
     }
 
     /// What `link` may call, and its own functions.
-    fn include(&self, source: &mut Source, link: &Link, keeping: Keeping) {
+    fn include(&self, source: &mut Source, link: &Link, pass: Pass) {
         let Link { name, prefix, fragment, info, range, dense, tape, wants_dx } = link;
         let first = range.start;
         let param = match dense {
             None if self.halves().is_some() && info.grads == GradKind::Scatter => {
                 format!("arena_half({first}u + i)")
             }
-            Some(offset) if self.uniform() => format!("dense[({offset}u + i) >> 2u][({offset}u + i) & 3u]"),
-            _ => format!("arena_param({first}u + i)"),
+            Some(first) => format!("dense[({first}u + i) >> 2u][({first}u + i) & 3u]"),
+            None => format!("arena_param({first}u + i)"),
         };
-        let gradients = keeping == Keeping::Backward;
+        let four = match dense {
+            Some(first) => format!("dense[({first}u + i) >> 2u]"),
+            None => wgsl::four_by_one(prefix),
+        };
+        let gradients = pass == Pass::Backward;
         let scattered = if gradients { format!("arena_scatter({first}u + i, v);") } else { String::new() };
         let at = format!("tape[({tape}u + c) * step.stride + row]");
-        let (keep, kept) = match keeping {
-            Keeping::Nothing => (String::new(), "0.0"),
-            Keeping::Forward => (format!("{at} = v;"), at.as_str()),
-            Keeping::Backward => (format!("if keeping {{ {at} = v; }}"), at.as_str()),
+        let (keep, kept) = match pass {
+            Pass::Evaluate => (String::new(), "0.0"),
+            Pass::Forward => (format!("{at} = v;"), at.as_str()),
+            // Rows past the end have no place on the tape.
+            Pass::Backward if !self.skips() => (format!("if row < step.rows {{ {at} = v; }}"), at.as_str()),
+            Pass::Backward => (format!("{at} = v;"), at.as_str()),
         };
         // A stage that keeps nothing needs no tape.
         let (keep, kept) = if fragment.keeps() > 0 { (keep.as_str(), kept) } else { ("", "0.0") };
         let mut text = format!(
             "const {prefix}wants_dx = {wants_dx};
 fn {prefix}param(i: u32) -> f32 {{ return {param}; }}
+fn {prefix}param4(i: u32) -> vec4<f32> {{ return {four}; }}
 fn {prefix}keep(c: u32, v: f32) {{ {keep} }}
 fn {prefix}kept(c: u32) -> f32 {{ return {kept}; }}
 fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
@@ -346,16 +356,15 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
         Self::step(&mut source);
         source.bind("samples", Access::Read, "array<vec4<f32>>");
         source.bind("mu", Access::Write, "array<f32>");
-        let (keeping, keep) = if keep { (Keeping::Forward, self.kept()) } else { (Keeping::Nothing, 0) };
+        let (pass, keep) = if keep { (Pass::Forward, self.kept()) } else { (Pass::Evaluate, 0) };
         if keep > 0 {
             source.bind("features", Access::Write, "array<f32>");
         }
-        if keeping == Keeping::Forward {
+        if pass == Pass::Forward {
             self.bind_tape(&mut source, Access::Write);
         }
-        source.add("row", ROW);
-        self.declare(&mut source, false);
-        self.links.iter().for_each(|l| self.include(&mut source, l, keeping));
+        self.declare(&mut source, &self.links, false);
+        self.links.iter().for_each(|l| self.include(&mut source, l, pass));
         let mut body = String::from(
             "        let at = samples[row];
         if row < step.ray_rows && at.w == 0.0 {
@@ -393,10 +402,9 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
             String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
         let (mut from, width) = ("x0", self.features());
         if self.encoder {
-            source.add("row", ROW);
-            self.declare(&mut source, false);
+            self.declare(&mut source, &self.links[..1], false);
             let l = &self.links[0];
-            self.include(&mut source, l, Keeping::Nothing);
+            self.include(&mut source, l, Pass::Evaluate);
             let _ = writeln!(body, "        var x1: array<f32, {width}>;\n        {}forward(&x0, &x1);", l.prefix);
             from = "x1";
         }
@@ -420,23 +428,17 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
             source.bind("features", access, "array<f32>");
         }
         self.bind_tape(&mut source, Access::Write);
-        source.add("row", ROW);
-        self.declare(&mut source, true);
+        self.declare(&mut source, &self.links, true);
         self.additions(&mut source);
-        self.links
-            .iter()
-            .skip(usize::from(self.scatters()))
-            .for_each(|l| self.include(&mut source, l, Keeping::Backward));
+        self.links.iter().skip(usize::from(self.scatters())).for_each(|l| self.include(&mut source, l, Pass::Backward));
         let n = self.links.len();
-        // Where lanes add up together, none may skip a row.
-        let skip = if self.scatters() || !self.together() { "if !live { continue; }" } else { "" };
+        let skip = if self.skips() { "if !live { continue; }" } else { "" };
         let mut body = format!(
             "        var at = vec4<f32>();
         var d = 0.0;
         if row < step.rows {{ at = samples[row]; d = dmu[row]; }}
         let live = d != 0.0;
         {skip}
-        keeping = false;
         var x0 = array<f32, 3>(at.x, at.y, at.z);
 "
         );
@@ -448,7 +450,7 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
                 let _ = writeln!(body, "        {}forward(&x{i}, &x{});", l.prefix, i + 1);
             }
         }
-        let _ = writeln!(body, "        keeping = live;\n        var d{n} = array<f32, 1>(d);");
+        let _ = writeln!(body, "        var d{n} = array<f32, 1>(d);");
         self.back(&mut body);
         if self.scatters() {
             body += &channels(kept, "features[{at}] = d1[{c}];");
@@ -464,6 +466,11 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
         self.kept() > 0 && self.links.len() > 1 && self.links.first().is_some_and(scattered)
     }
 
+    /// Whether `backward` may leave out a row. Where lanes add up together, it may not.
+    fn skips(&self) -> bool {
+        self.scatters() || !self.together()
+    }
+
     /// From derivatives by the features to the encoder's gradients.
     pub fn scatter(&self) -> Source {
         let mut source = Source::default();
@@ -471,11 +478,10 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
         source.bind("samples", Access::Read, "array<vec4<f32>>");
         source.bind("dmu", Access::Read, "array<f32>");
         source.bind("features", Access::Read, "array<f32>");
-        source.add("row", ROW);
-        self.declare(&mut source, true);
+        self.declare(&mut source, &self.links[..1], true);
         self.additions(&mut source);
         let l = &self.links[0];
-        self.include(&mut source, l, Keeping::Backward);
+        self.include(&mut source, l, Pass::Backward);
         let kept = self.kept();
         let body = format!(
             "        var at = vec4<f32>();
@@ -626,7 +632,7 @@ fn arena_scatter_pair(i: u32, v: vec2<f32>) { arena_grad(i, v.x); arena_grad(i +
     pub fn merge(&self) -> Source {
         let mut source = Source::default();
         source.bind("partial", Access::Read, "array<f32>");
-        self.declare(&mut source, true);
+        self.declare(&mut source, &[], true);
         let mut text = String::from("fn arena_index(i: u32) -> u32 {\n");
         for RowSum { sum, partial } in &self.sums {
             let (at, ld, width, end) = (sum.at, sum.ld, sum.inputs.max(1), partial + sum.params());
@@ -672,10 +678,9 @@ fn main(
         source.bind("x", Access::Read, "array<f32>");
         source.bind("y", Access::Write, "array<f32>");
         self.bind_tape(&mut source, Access::Write);
-        source.add("row", ROW);
-        self.declare(&mut source, false);
+        self.declare(&mut source, &self.links, false);
         let l = &self.links[0];
-        self.include(&mut source, l, Keeping::Forward);
+        self.include(&mut source, l, Pass::Forward);
         let Info { input, output, .. } = l.info;
         source.add(
             "forward",
@@ -700,17 +705,17 @@ fn main(
             source.bind(name, access, "array<f32>");
         }
         self.bind_tape(&mut source, Access::Write);
-        source.add("row", ROW);
-        self.declare(&mut source, true);
+        self.declare(&mut source, &self.links, true);
         self.additions(&mut source);
         let l = &self.links[0];
-        self.include(&mut source, l, Keeping::Backward);
+        self.include(&mut source, l, Pass::Backward);
         let Info { input, output, .. } = l.info;
+        let skip = if self.skips() { "if !live { continue; }" } else { "" };
         source.add(
             "backward",
             &self.groups(&format!(
                 "        let live = row < step.rows;
-        keeping = live;
+        {skip}
         var x0: array<f32, {input}>;
         var d1: array<f32, {output}>;
         var d0: array<f32, {input}>;
@@ -727,9 +732,6 @@ fn main(
         source
     }
 }
-
-/// The row that an invocation is at, and whether its stages may write what they keep.
-const ROW: &str = "var<private> row: u32;\nvar<private> keeping: bool;";
 
 /// A kernel whose invocations take rows one by one.
 fn rows(body: &str) -> String {

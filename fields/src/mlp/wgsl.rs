@@ -11,6 +11,9 @@ use std::fmt::Write;
 /// Number of sums in a loop over inputs.
 const BLOCK: usize = 8;
 
+/// Number of sums in a loop over outputs. A whole row of the weights, where it fits, is read in one piece.
+const COLUMNS: usize = 32;
+
 /// The declarations, `stage_forward` and `stage_backward`.
 pub fn functions(stage: &MlpStage) -> String {
     let last = stage.layers.len() - 1;
@@ -114,31 +117,45 @@ fn gradients(stage: &MlpStage, out: &mut String) {
         }
         if i > 0 {
             let (before, first) = (i - 1, slopes(stage, i - 1));
-            let _ = writeln!(out, "    var s{before}: array<f32, {input}>;");
-            back(i, layer, skip, input, out, |k| {
-                let c = first + k;
-                format!("s{before}[{k}] = stage_kept({c}u) * a{k}; stage_keep({c}u, s{before}[{k}]);")
-            });
+            // All are read before the first is written, so that no read waits for another.
+            let _ = write!(
+                out,
+                "    var s{before}: array<f32, {input}>;
+    for (var k = 0u; k < {input}u; k++) {{ s{before}[k] = stage_kept({first}u + k); }}
+"
+            );
+            back(i, layer, skip, input, out, |k| format!("s{before}[{k}] *= a{k};"));
+            let _ =
+                writeln!(out, "    for (var k = 0u; k < {input}u; k++) {{ stage_keep({first}u + k, s{before}[k]); }}");
         }
     }
 }
 
 /// `Wᵀ·∂L/∂z` of `count` columns from `column`; `put` writes the code that uses each.
 fn back(i: usize, layer: &Linear, column: usize, count: usize, out: &mut String, put: impl Fn(usize) -> String) {
-    for start in (0..count).step_by(BLOCK) {
-        let block = start..(start + BLOCK).min(count);
+    // Four at a time where each row of the weights begins at a multiple of 4.
+    let aligned = [layer.start, layer.ld(), column].iter().all(|n| n.is_multiple_of(4));
+    for start in (0..count).step_by(COLUMNS) {
+        let end = (start + COLUMNS).min(count);
+        let fours = if aligned { start..start + (end - start) / 4 * 4 } else { start..start };
         out.push_str("    {\n");
-        for k in block.clone() {
+        for k in start..end {
             let _ = writeln!(out, "        var a{k} = 0.0;");
         }
         let (rows, ld) = (layer.output, layer.ld());
         let _ = writeln!(out, "        for (var o = 0u; o < {rows}u; o++) {{\n            let d = s{i}[o];");
         let _ = writeln!(out, "            let at = {}u + o * {ld}u;", layer.start + column);
-        for k in block.clone() {
+        for k in fours.clone().step_by(4) {
+            let _ = writeln!(out, "            let w{k} = stage_param4(at + {k}u);");
+            for (c, name) in ["x", "y", "z", "w"].into_iter().enumerate() {
+                let _ = writeln!(out, "            a{} += w{k}.{name} * d;", k + c);
+            }
+        }
+        for k in fours.end..end {
             let _ = writeln!(out, "            a{k} += stage_param(at + {k}u) * d;");
         }
         out.push_str("        }\n");
-        for k in block {
+        for k in start..end {
             let _ = writeln!(out, "        {}", put(k));
         }
         out.push_str("    }\n");

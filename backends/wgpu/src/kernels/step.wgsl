@@ -18,3 +18,6 @@ struct Step {
     // Distance of neighbouring points in a block.
     spacing: vec3<f32>,
 }
+
+// The row that an invocation is at.
+var<private> row: u32;

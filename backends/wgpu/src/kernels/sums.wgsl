@@ -24,15 +24,11 @@ fn place(row: u32, quad: u32) -> u32 {
     return row * 8u + (quad ^ (row & 7u));
 }
 
-fn channel(c: u32, end: u32, row: u32) -> f32 {
-    if c < end {
-        return tape[c * step.stride + row];
-    }
-    return 0.0;
-}
-
+// Four channels of a row; 0 from `end` on. Without a branch, so that all of a row's reads wait at the same time.
 fn quad(c: u32, end: u32, row: u32) -> vec4<f32> {
-    return vec4<f32>(channel(c, end, row), channel(c + 1u, end, row), channel(c + 2u, end, row), channel(c + 3u, end, row));
+    let channels = vec4<u32>(c, c + 1u, c + 2u, c + 3u);
+    let at = min(channels, vec4<u32>(max(end, 1u) - 1u)) * step.stride + row;
+    return select(vec4<f32>(), vec4<f32>(tape[at.x], tape[at.y], tape[at.z], tape[at.w]), channels < vec4<u32>(end));
 }
 
 @compute @workgroup_size(64)
@@ -55,20 +51,29 @@ fn main(
         var sum3 = vec4<f32>();
         var own = vec4<f32>();
         for (var first = share * 64u; first < step.rows; first += shares * 64u) {
-            let row = first + lane;
-            let live = row < step.rows && dmu[min(row, step.rows - 1u)] != 0.0;
+            let row = min(first + lane, step.rows - 1u);
+            let live = first + lane < step.rows && dmu[row] != 0.0;
             workgroupBarrier();
-            for (var q = 0u; q < 8u; q++) {
-                var a = vec4<f32>();
-                var b = vec4<f32>();
-                if live {
-                    a = quad(block.left + 4u * q, left_end, row);
-                    b = quad(block.right + 4u * q, right_end, row);
+            // Four vectors of each side wait for memory at the same time: more would leave too few registers to other groups.
+            for (var half = 0u; half < 8u; half += 4u) {
+                var a: array<vec4<f32>, 4>;
+                var b: array<vec4<f32>, 4>;
+                for (var q = 0u; q < 4u; q++) {
+                    a[q] = quad(block.left + 4u * (half + q), left_end, row);
+                    b[q] = quad(block.right + 4u * (half + q), right_end, row);
                 }
-                left[place(lane, q)] = a;
-                right[place(lane, q)] = b;
+                for (var q = 0u; q < 4u; q++) {
+                    left[place(lane, half + q)] = select(vec4<f32>(), a[q], live);
+                    right[place(lane, half + q)] = select(vec4<f32>(), b[q], live);
+                }
             }
             workgroupBarrier();
+            if block.inputs == 0u {
+                for (var r = 0u; r < 64u && k == 0u; r++) {
+                    own += left[place(r, j)];
+                }
+                continue;
+            }
             for (var eight = 0u; eight < 512u; eight += 64u) {
                 for (var r = 0u; r < 8u; r++) {
                     let a = left[eight + r * 8u + (j ^ r)];
