@@ -51,7 +51,10 @@ class Volume:
         return self.data.shape  # type: ignore[return-value]
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Writes ``.nii``, ``.nii.gz``, ``.mha`` or ``.npy``, chosen by the extension. No partial file is left."""
+        """Writes ``.nii``, ``.nii.gz``, ``.mha``, ``.mhd``, ``.nrrd``, ``.npy``, ``.tif`` or ``.zarr``, by the extension.
+
+        No partial file is left.
+        """
         _native.write_volume(os.fspath(path), self)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:

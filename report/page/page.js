@@ -147,7 +147,7 @@
       drawn_plots.push((width) => new uPlot({
         title, width, height: 300,
         scales: { x: { time: false }, y: logarithmic ? { distr: 3 } : {} },
-        axes: [{ label: against === "seconds" ? "seconds of solving" : "steps or passes" }, { size: 70, values: (_, all) => all.map((x) => (x === null ? "" : short(x, 3))) }],
+        axes: [{ label: against === "seconds" ? "solve time, s" : "steps or passes" }, { size: 70, values: (_, all) => all.map((x) => (x === null ? "" : short(x, 3))) }],
         series: [
           { label: against === "seconds" ? "s" : "step", value: (_, x) => short(x) },
           ...drawn.map((s) => ({ label: s.name, stroke: s.colour, width: 2, spanGaps: true, points: { show: s.points.length < 30 }, value: (_, x) => short(x) })),

@@ -75,7 +75,7 @@ pub fn curves(path: &Path, title: &str, methods: &[(String, Vec<PathBuf>)]) -> R
         let _ = std::fs::remove_file(path);
         return Ok(false);
     }
-    let both = [("steps or passes", &steps), ("seconds of training", &seconds)];
+    let both = [("steps or passes", &steps), ("solve time, s", &seconds)];
     panels_png(path, &both.map(|(x, (series, options))| Panel { title, labels: [x, "PSNR, dB"], series, options }))?;
     Ok(true)
 }

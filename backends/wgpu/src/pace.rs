@@ -29,7 +29,7 @@ impl Pace {
         if each > SECONDS[1] && self.size > self.least {
             self.size /= 2;
         } else if each < SECONDS[0] && largest > self.size / 2 && self.size < self.most {
-            self.size *= 2;
+            self.size = self.size.saturating_mul(2).min(self.most);
         }
     }
 }
@@ -50,5 +50,8 @@ mod tests {
         assert_eq!(pace.size(), 1 << 12);
         (0..9).for_each(|_| pace.heard(0.01, 1, pace.size()));
         assert_eq!(pace.size(), 1 << 15);
+        let mut pace = Pace::new(1000, 1000, 1500);
+        pace.heard(0.01, 1, 1000);
+        assert_eq!(pace.size(), 1500);
     }
 }

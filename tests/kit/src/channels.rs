@@ -87,7 +87,7 @@ fn each(n: usize, mut one: impl FnMut(&[usize]) -> Result<Option<String>>) -> Ou
         match one(keep) {
             Ok(None) => {}
             Ok(Some(complaint)) => return Outcome::Failed(format!("keeping {keep:?}: {complaint}")),
-            Err(e) if e.to_string().is_empty() => return Outcome::Failed("refused without a word".into()),
+            Err(e) if e.to_string().is_empty() => return Outcome::Failed("refused with an empty message".into()),
             Err(e @ Error::Unsupported { .. }) => return Outcome::Skipped(format!("keeping {keep:?}: {e}")),
             Err(e) => return Outcome::Failed(format!("keeping {keep:?}: {e}")),
         }

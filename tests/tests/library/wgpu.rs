@@ -348,6 +348,15 @@ fn what_cannot_run_on_a_device_is_refused_in_words() {
     refused(narrow, Scope::Row, &["backward"]);
     let helper = |s: String| Some(s + "\nfn square(x: f32) -> f32 { return x * x; }\n");
     refused(helper, Scope::Row, &["field (changed)", "declares square", "stage_"]);
+    let twice = |s: String| {
+        let sum = s.lines().find(|l| l.starts_with("const stage_sum_0 ")).unwrap().replace("sum_0", "sum_99");
+        Some(s + &format!("\n{sum}\n"))
+    };
+    refused(twice, Scope::Row, &["field (changed)", "two sums for parameter"]);
+    let beyond = |s: String| Some(s.replacen("array<u32, 6>(", "array<u32, 6>(99999", 1));
+    refused(beyond, Scope::Row, &["field (changed)", "sums to parameter 99999", "the stage has"]);
+    let unkept = |s: String| Some(s.replacen("const stage_keeps = ", "const stage_less = ", 1));
+    refused(unkept, Scope::Row, &["field (changed)", "but keeps 0"]);
     let (exe, _) = backend.compile(&changed(Some, Scope::Row)).unwrap();
     let blocks: [Box<dyn Prior>; 1] = [Box::new(TotalVariation::default())];
     assert!(exe.admits(&L2 {}, &blocks).is_ok());
