@@ -146,7 +146,7 @@ fn series_that_are_no_volume_are_refused() {
     refused(&put(POSITION, VR::DS, 4, "a\\b\\c"), &["5.dcm", "ImagePositionPatient"]);
     let e = "ImageOrientationPatient";
     refused(&put(Tag(0x0020, 0x0037), VR::DS, 3, "1\\0\\0\\0\\1\\0"), &["6.dcm", e, "as in"]);
-    refused(&put(Tag(0x0020, 0x0037), VR::DS, 3, "1\\0\\0\\1\\0\\0"), &["6.dcm", e, "upright"]);
+    refused(&put(Tag(0x0020, 0x0037), VR::DS, 3, "1\\0\\0\\1\\0\\0"), &["6.dcm", e, "orthogonal"]);
     refused(&put(Tag(0x0028, 0x0030), VR::DS, 3, "0.5\\0.7"), &["6.dcm", "PixelSpacing", "0.7", "as in"]);
     refused(&put(Tag(0x0028, 0x0030), VR::DS, 3, "0\\0.7"), &["6.dcm", "PixelSpacing", "above 0"]);
     refused(&put(Tag(0x0028, 0x1053), VR::DS, 3, "1e300"), &["6.dcm", "RescaleSlope"]);
