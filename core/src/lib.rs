@@ -10,7 +10,7 @@
 //! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them.
 //! - [`settings`], [`precision`], [`spec`], [`registry`]: what a user writes, and the available types.
 //! - [`host`]: stages on the host, to inspect a model beside training.
-//! - [`voxel`]: line integrals of voxel volumes.
+//! - [`voxel`]: line integrals of voxel volumes; [`resident`]: volumes that stay on a device.
 //! - [`basis`], [`data_term`], [`regularizer`]: parts of an iterative method; [`space`]: its arrays and their memory.
 //! - [`method`]: methods, their plans and runs; [`pipeline`], [`backend`], [`trained`]: from the stages of a field to a
 //!   volume; [`checkpoint`]: the state of a run.
@@ -42,6 +42,7 @@ pub mod prior;
 pub mod random;
 pub mod registry;
 pub mod regularizer;
+pub mod resident;
 pub mod scan;
 pub mod scene;
 pub mod settings;

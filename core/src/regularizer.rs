@@ -3,6 +3,7 @@
 use crate::error::{Result, ensure};
 use crate::geometry::VoxelGrid;
 use crate::space::Space;
+use crate::wgsl::Fragment;
 use ndarray::ArrayView3;
 use rayon::prelude::*;
 use schemars::JsonSchema;
@@ -90,6 +91,11 @@ pub trait Penalty: Send {
         update.around(|v, u| self.prox(v, tau, u));
     }
 
+    /// The same proximal map for a GPU, if the penalty is one of differences and has WGSL.
+    fn dual(&mut self) -> Option<Dual<'_>> {
+        None
+    }
+
     /// State for the next call, by name, for checkpoints.
     fn state(&mut self) -> Vec<(&str, &mut [f32])> {
         vec![]
@@ -98,6 +104,29 @@ pub trait Penalty: Send {
     /// Returns and clears the first error since the last call; see [`crate::stage::Stage::fault`].
     fn fault(&self) -> Result<()> {
         Ok(())
+    }
+}
+
+/// The proximal map of a penalty of differences, by steps on its dual variables `p`: `u = max(0, v − τ·∇ᵀp)`. ∇ takes
+/// forward differences times `weights`, 0 at the far faces. Each step replaces every voxel's `p` by
+/// `stage_ascend(p, ∇u/(L·τ), guide)`, with `L = 4·Σ weights²`, a bound of `‖∇‖²`.
+pub struct Dual<'a> {
+    /// `stage_ascend`; see [`crate::wgsl`].
+    pub fragment: Fragment,
+    /// Weights of differences along x, y, z.
+    pub weights: [f32; 3],
+    /// Steps per update.
+    pub steps: usize,
+    /// The dual variables along x, y and z, from the previous update.
+    pub p: [&'a mut [f32]; 3],
+    /// A vector per voxel; 0 if there are none.
+    pub guide: Option<[&'a [f32]; 3]>,
+}
+
+impl Dual<'_> {
+    /// The bound `L` of `‖∇‖²`.
+    pub fn bound(weights: [f32; 3]) -> f32 {
+        4.0 * weights.iter().map(|g| g * g).sum::<f32>()
     }
 }
 

@@ -69,6 +69,12 @@
 //! fn stage_value(p: u32) -> f32                                          // the field at point p, z fastest
 //! ```
 //!
+//! A penalty of differences ([`Dual`](crate::regularizer::Dual)) defines a step of its dual variables at a voxel
+//!
+//! ```wgsl
+//! fn stage_ascend(p: vec3<f32>, d: vec3<f32>, guide: vec3<f32>) -> vec3<f32>
+//! ```
+//!
 //! A projector of voxels defines
 //!
 //! ```wgsl

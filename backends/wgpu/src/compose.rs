@@ -92,6 +92,8 @@ pub struct Chain {
     tape: usize,
     /// Sums over rows.
     sums: Vec<RowSum>,
+    /// The blocks of `sums`.
+    blocks: Vec<String>,
     /// Parameters of the arena.
     params: usize,
     /// How parameters are read whose gradients are scattered.
@@ -120,6 +122,7 @@ impl Chain {
             dense: 0,
             tape: 0,
             sums: vec![],
+            blocks: vec![],
             params: pipeline.layout().len(),
             tables: pipeline.tables,
             target,
@@ -132,14 +135,17 @@ impl Chain {
             let before = chain.links.iter().any(|l: &Link| l.info.params > 0);
             chain.link(&name, stage, range.clone(), before)?;
         }
+        chain.blocks = blocks_of(&chain.sums);
         Ok(chain)
     }
 
     /// One stage alone, with all that it can do.
     pub fn single(stage: &dyn Stage, tables: Tables, target: Target) -> Result<Self> {
         let params = stage.info().params;
-        let mut chain = Self { links: vec![], encoder: false, dense: 0, tape: 0, sums: vec![], params, tables, target };
+        let (links, sums, blocks) = (vec![], vec![], vec![]);
+        let mut chain = Self { links, encoder: false, dense: 0, tape: 0, sums, blocks, params, tables, target };
         chain.link("stage", stage, 0..params, true)?;
+        chain.blocks = blocks_of(&chain.sums);
         Ok(chain)
     }
 
@@ -432,7 +438,7 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
         self.additions(&mut source);
         self.links.iter().skip(usize::from(self.scatters())).for_each(|l| self.include(&mut source, l, Pass::Backward));
         let n = self.links.len();
-        let skip = if self.skips() { "if !live { continue; }" } else { "" };
+        let skip = self.skip();
         let mut body = format!(
             "        var at = vec4<f32>();
         var d = 0.0;
@@ -469,6 +475,11 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
     /// Whether `backward` may leave out a row. Where lanes add up together, it may not.
     fn skips(&self) -> bool {
         self.scatters() || !self.together()
+    }
+
+    /// Leaves out a row that is not `live`, where `backward` may.
+    fn skip(&self) -> &'static str {
+        if self.skips() { "if !live { continue; }" } else { "" }
     }
 
     /// From derivatives by the features to the encoder's gradients.
@@ -559,47 +570,9 @@ fn arena_scatter_pair(i: u32, v: vec2<f32>) { arena_grad(i, v.x); arena_grad(i +
         self.target.subgroups && !self.links.iter().any(|l| l.fragment.source.contains(wgsl::FOREIGN))
     }
 
-    /// The blocks of `sums`, each of at most 32 × 32 products. A block also adds up its left channels where a sum wants them (biases).
-    fn blocks(&self) -> Vec<String> {
-        let mut blocks = vec![];
-        let vector = |left, outputs| {
-            let mut vectors = self.sums.iter().filter(|s| s.sum.inputs == 0);
-            vectors.find(|v| v.sum.left == left && v.sum.outputs == outputs)
-        };
-        let mut taken = vec![];
-        // Products first: they take their biases along.
-        let (products, vectors): (Vec<&RowSum>, Vec<&RowSum>) = self.sums.iter().partition(|s| s.sum.inputs > 0);
-        for RowSum { sum, partial } in products.into_iter().chain(vectors) {
-            let Sum { left, outputs, right, inputs, .. } = *sum;
-            let bias = match inputs {
-                0 => Some(*partial),
-                _ => vector(left, outputs).map(|v| v.partial),
-            };
-            let bias = bias.filter(|b| !taken.contains(b));
-            if inputs == 0 && bias.is_none() {
-                continue;
-            }
-            taken.extend(bias);
-            for top in (0..outputs).step_by(32) {
-                for side in (0..inputs.max(1)).step_by(32) {
-                    let own = bias.filter(|_| side == 0).map_or("none".into(), |b| format!("{}u", b + top));
-                    blocks.push(format!(
-                        "Block({}u, {}u, {}u, {}u, {}u, {inputs}u, {own})",
-                        left + top,
-                        (outputs - top).min(32),
-                        right + side,
-                        inputs.saturating_sub(side).min(32),
-                        partial + top * inputs + side,
-                    ));
-                }
-            }
-        }
-        blocks
-    }
-
     /// Groups of `sums` for `shares` shares of the rows: one per share and block.
     pub fn summing(&self, shares: usize) -> usize {
-        self.blocks().len() * shares
+        self.blocks.len() * shares
     }
 
     /// Sums over rows, added to the partial sums of each share.
@@ -609,7 +582,7 @@ fn arena_scatter_pair(i: u32, v: vec2<f32>) { arena_grad(i, v.x); arena_grad(i +
         source.bind("dmu", Access::Read, "array<f32>");
         self.bind_tape(&mut source, Access::Read);
         source.bind("partial", Access::Write, "array<f32>");
-        let (blocks, summed) = (self.blocks(), self.summed());
+        let (blocks, summed) = (&self.blocks, self.summed());
         let mut text = format!("const summed = {summed}u;\nconst blocks = {}u;\n", blocks.len());
         source.add("sums", include_str!("kernels/sums.wgsl"));
         text += "fn block_of(i: u32) -> Block {\n";
@@ -710,7 +683,7 @@ fn main(
         let l = &self.links[0];
         self.include(&mut source, l, Pass::Backward);
         let Info { input, output, .. } = l.info;
-        let skip = if self.skips() { "if !live { continue; }" } else { "" };
+        let skip = self.skip();
         source.add(
             "backward",
             &self.groups(&format!(
@@ -789,6 +762,44 @@ pub fn sample(projector: &dyn Projector) -> Result<Source> {
     source.add(&name, &fragment.named("projector_"));
     source.add("sample", include_str!("kernels/sample.wgsl"));
     Ok(source)
+}
+
+/// The blocks of the kernel `sums` in WGSL, each of at most 32 × 32 products. A block also adds up its left channels where a sum wants them (biases).
+fn blocks_of(sums: &[RowSum]) -> Vec<String> {
+    let mut blocks = vec![];
+    let vector = |left, outputs| {
+        let mut vectors = sums.iter().filter(|s| s.sum.inputs == 0);
+        vectors.find(|v| v.sum.left == left && v.sum.outputs == outputs)
+    };
+    let mut taken = vec![];
+    // Products first: they take their biases along.
+    let (products, vectors): (Vec<&RowSum>, Vec<&RowSum>) = sums.iter().partition(|s| s.sum.inputs > 0);
+    for RowSum { sum, partial } in products.into_iter().chain(vectors) {
+        let Sum { left, outputs, right, inputs, .. } = *sum;
+        let bias = match inputs {
+            0 => Some(*partial),
+            _ => vector(left, outputs).map(|v| v.partial),
+        };
+        let bias = bias.filter(|b| !taken.contains(b));
+        if inputs == 0 && bias.is_none() {
+            continue;
+        }
+        taken.extend(bias);
+        for top in (0..outputs).step_by(32) {
+            for side in (0..inputs.max(1)).step_by(32) {
+                let own = bias.filter(|_| side == 0).map_or("none".into(), |b| format!("{}u", b + top));
+                blocks.push(format!(
+                    "Block({}u, {}u, {}u, {}u, {}u, {inputs}u, {own})",
+                    left + top,
+                    (outputs - top).min(32),
+                    right + side,
+                    inputs.saturating_sub(side).min(32),
+                    partial + top * inputs + side,
+                ));
+            }
+        }
+    }
+    blocks
 }
 
 /// Points of blocks.

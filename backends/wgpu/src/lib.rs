@@ -10,6 +10,7 @@
 //! - [`profile`]: time on the device.
 //! - [`single`]: one stage alone, by which it is compared with the CPU.
 //! - [`voxels`]: projection of voxel volumes and FDK's back-projection.
+//! - [`resident`]: proximal gradient updates of volumes that stay on the device.
 //!
 //! Sums have no fixed order where many rows touch one parameter: results agree with the CPU's to rounding, and two runs
 //! with each other.
@@ -22,8 +23,11 @@ pub mod kernel;
 pub mod measure;
 mod pace;
 pub mod profile;
+mod resident;
 pub mod single;
 pub mod source;
+#[cfg(feature = "translations")]
+mod translations;
 pub mod voxels;
 pub mod wave;
 

@@ -77,7 +77,7 @@ impl Source {
         let capabilities =
             Capabilities::SHADER_FLOAT32_ATOMIC | Capabilities::SHADER_FLOAT16_IN_FLOAT32 | Capabilities::SUBGROUP;
         let mut validator = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), capabilities);
-        validator.validate(&module).map(drop).map_err(|e| {
+        let info = validator.validate(&module).map_err(|e| {
             let line = e.location(&self.text).map(|l| l.line_number as usize);
             let mut why = e.as_inner().to_string();
             let mut cause = std::error::Error::source(e.as_inner());
@@ -86,7 +86,14 @@ impl Source {
                 cause = c.source();
             }
             self.fault(line, &why)
-        })
+        })?;
+        #[cfg(feature = "translations")]
+        for (language, text) in crate::translations::all(&module, &info) {
+            text.map_err(|why| self.fault(None, &format!("{language}: {why}")))?;
+        }
+        #[cfg(not(feature = "translations"))]
+        let _ = info;
+        Ok(())
     }
 
     /// An error in line `line` (from 1) of the text.

@@ -12,6 +12,7 @@ use crate::source::{Access, Source};
 use crate::wave::MOST_GROUPS;
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::{Geometry, sub};
+use conefield_core::resident::{Resident, Volumes};
 use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelView};
 use conefield_core::wgsl::Fragment;
 use ndarray::{ArrayView3, ArrayViewMut3, Axis, s};
@@ -22,6 +23,8 @@ use wgpu::BufferUsages as U;
 
 /// Bytes of projections on the device at once.
 const LINES_BYTES: u64 = 64 << 20;
+/// How kernels and the host use an array.
+pub(crate) const ARRAY: U = U::STORAGE.union(U::COPY_SRC).union(U::COPY_DST);
 /// Views that one uniform buffer holds for back-projection.
 const VIEWS: usize = 128;
 /// Rays or voxels of a launch at first, on a software device and on others, at least and at most.
@@ -131,60 +134,66 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
 }
 
 /// What a launch works on: buffers that are used again, and how many rays or voxels it may take.
-struct Room {
-    buffers: Buffers,
+pub(crate) struct Room {
+    pub(crate) buffers: Buffers,
     pace: Pace,
 }
 
 impl Room {
-    fn new(gpu: &Gpu) -> Self {
+    pub(crate) fn new(gpu: &Gpu) -> Self {
         let first = FIRST[usize::from(!gpu.adapter.software)];
         Self { buffers: Buffers::default(), pace: Pace::new(first, LEAST, MOST) }
     }
 
-    /// Runs `source` over `0..count` in launches, each after `uniform` has written where it begins and ends.
-    fn run<T: bytemuck::Pod>(
+    /// Runs each of `sources` over `0..count` in launches, each after `uniform` has written where it begins and ends.
+    pub(crate) fn run<T: bytemuck::Pod>(
         &mut self,
         shared: &Shared,
-        label: &str,
-        source: &Source,
+        sources: &[(&str, &Source)],
         uniform: (&str, impl Fn(u32, u32) -> T),
         count: u32,
     ) -> Result<()> {
         let gpu = &shared.gpu;
-        let kernel = shared.kernels.get(gpu, label, source)?;
         self.buffers.reserve(gpu, uniform.0, size_of::<T>() as u64, U::UNIFORM | U::COPY_DST)?;
-        let bound = kernel.bind(gpu, &self.buffers)?;
+        let mut kernels = vec![];
+        for (label, source) in sources {
+            let kernel = shared.kernels.get(gpu, label, source)?;
+            let bound = kernel.bind(gpu, &self.buffers)?;
+            kernels.push((kernel, bound));
+        }
         let started = Instant::now();
-        let (mut at, mut launches) = (0, 0);
-        while at < count {
-            let end = count.min(at.saturating_add(self.pace.size()));
-            let value = uniform.1(at, end);
-            self.buffers.get(uniform.0).inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::bytes_of(&value)));
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let groups = (end - at).div_ceil(GROUP).min(MOST_GROUPS as u32);
-            kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, groups);
-            gpu.queue.submit([encoder.finish()]);
-            at = end;
-            launches += 1;
+        let mut launches = 0;
+        for (kernel, bound) in &kernels {
+            let mut at = 0;
+            while at < count {
+                let end = count.min(at.saturating_add(self.pace.size()));
+                let value = uniform.1(at, end);
+                self.buffers.get(uniform.0).inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::bytes_of(&value)));
+                let mut encoder = gpu.device.create_command_encoder(&Default::default());
+                let groups = (end - at).div_ceil(GROUP).min(MOST_GROUPS as u32);
+                kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), bound, groups);
+                gpu.queue.submit([encoder.finish()]);
+                at = end;
+                launches += 1;
+            }
         }
         gpu.wait()?;
         self.pace.heard(started.elapsed().as_secs_f64(), launches, count.min(self.pace.size()));
         Ok(())
     }
 
-    fn write(&self, shared: &Shared, name: &str, data: &[f32]) {
+    pub(crate) fn write(&self, shared: &Shared, name: &str, data: &[f32]) {
         self.buffers.get(name).inspect(|b| shared.gpu.queue.write_buffer(b, 0, bytemuck::cast_slice(data)));
     }
 
-    fn clear(&self, shared: &Shared, name: &str) {
+    pub(crate) fn clear(&self, shared: &Shared, name: &str) {
         let mut encoder = shared.gpu.device.create_command_encoder(&Default::default());
         self.buffers.get(name).inspect(|b| encoder.clear_buffer(b, 0, None));
         shared.gpu.queue.submit([encoder.finish()]);
     }
 
     /// Hands the first `count` numbers of `name` to `take`.
-    fn read(&mut self, shared: &Shared, name: &str, count: usize, take: impl FnOnce(&[f32])) -> Result<()> {
+    pub(crate) fn read(&mut self, shared: &Shared, name: &str, count: usize, take: impl FnOnce(&[f32])) -> Result<()> {
         let gpu = &shared.gpu;
         let bytes = 4 * count as u64;
         self.buffers.reserve(gpu, "staging", bytes, U::MAP_READ | U::COPY_DST)?;
@@ -197,7 +206,10 @@ impl Room {
 
     /// Adds the numbers of `name` to those of `part`, in order.
     fn add_to(&mut self, shared: &Shared, name: &str, mut part: ArrayViewMut3<'_, f32>) -> Result<()> {
-        self.read(shared, name, part.len(), |found| part.iter_mut().zip(found).for_each(|(p, f)| *p += f))
+        self.read(shared, name, part.len(), |found| match part.as_slice_mut() {
+            Some(part) => part.iter_mut().zip(found).for_each(|(p, f)| *p += f),
+            None => part.iter_mut().zip(found).for_each(|(p, f)| *p += f),
+        })
     }
 }
 
@@ -215,13 +227,104 @@ impl Shared {
         let each = shape[0].div_ceil(parts).max(1);
         Ok((0..shape[0]).step_by(each).map(|x| x..(x + each).min(shape[0])).collect())
     }
+
+    /// Makes room for the largest of `slabs`, the first.
+    fn reserve_slab(&self, room: &mut Room, slabs: &[Range<usize>], shape: (usize, usize, usize)) -> Result<()> {
+        let planes = slabs.first().map_or(0, Range::len);
+        room.buffers.reserve(&self.gpu, "volume", 4 * (planes * shape.1 * shape.2) as u64, ARRAY).map(drop)
+    }
+}
+
+/// A projector's kernels: they take line integrals of the buffer `volume` and add up `lines`, or the reverse.
+pub(crate) struct Walks {
+    pub(crate) shared: Arc<Shared>,
+    forward: Source,
+    adjoint: Source,
+}
+
+impl Walks {
+    fn new(shared: Arc<Shared>, projector: &dyn VoxelProjector) -> Result<Self> {
+        let name = format!("projector ({})", projector.describe());
+        let fragment = fragment_of(&name, projector.wgsl())?;
+        let atomics = shared.gpu.adapter.atomics;
+        let [forward, adjoint] = [true, false].map(|forward| kernel(&fragment, &name, atomics, forward));
+        forward.validate()?;
+        adjoint.validate()?;
+        Ok(Self { shared, forward, adjoint })
+    }
+
+    /// How many views are on the device at once.
+    pub(crate) fn views_at_once(&self, pixels: usize) -> usize {
+        let bytes = LINES_BYTES.min(self.shared.gpu.adapter.bound_bytes());
+        (bytes as usize / (4 * pixels).max(1)).max(1)
+    }
+
+    /// Writes the views and makes room for their line integrals. Returns the uniform values of a launch, still without
+    /// the range of planes.
+    fn prepare(&self, room: &mut Room, geometry: &Geometry, views: &[usize]) -> Result<Projection> {
+        let gpu = &self.shared.gpu;
+        let data: Vec<f32> = views.iter().flat_map(|&v| projected(geometry, v)).flatten().collect();
+        room.buffers.reserve(gpu, "views", 4 * data.len() as u64, U::STORAGE | U::COPY_DST)?;
+        room.write(&self.shared, "views", &data);
+        let [rows, columns] = geometry.detector;
+        let pixels = rows * columns;
+        room.buffers.reserve(gpu, "lines", 4 * (views.len() * pixels) as u64, ARRAY)?;
+        Ok(Projection {
+            shape: geometry.volume.shape.map(|n| n as u32),
+            count: (views.len() * pixels) as u32,
+            spacing: geometry.volume.spacing.map(|h| h as f32),
+            columns: columns as u32,
+            pixels: pixels as u32,
+            ..Projection::default()
+        })
+    }
+
+    /// Overwrites `out` with line integrals for some views that are on the device at once. For each of `slabs`, `fill`
+    /// writes its voxels into `volume`.
+    pub(crate) fn integrate(
+        &self,
+        room: &mut Room,
+        (geometry, views): (&Geometry, &[usize]),
+        slabs: &[Range<usize>],
+        mut fill: impl FnMut(&Room, &Range<usize>),
+        mut out: ArrayViewMut3<'_, f32>,
+    ) -> Result<()> {
+        let uniform = self.prepare(room, geometry, views)?;
+        room.clear(&self.shared, "lines");
+        for slab in slabs {
+            fill(room, slab);
+            self.walk(room, &self.forward, uniform, slab)?;
+        }
+        room.read(&self.shared, "lines", out.len(), |found| match out.as_slice_mut() {
+            Some(out) => out.copy_from_slice(found),
+            None => out.iter_mut().zip(found).for_each(|(o, l)| *o = *l),
+        })
+    }
+
+    /// Adds the adjoint of `lines` for some views that are on the device at once to `volume`, which is `slab`.
+    pub(crate) fn spread(
+        &self,
+        room: &mut Room,
+        (geometry, views): (&Geometry, &[usize]),
+        slab: &Range<usize>,
+        lines: ArrayView3<'_, f32>,
+    ) -> Result<()> {
+        let uniform = self.prepare(room, geometry, views)?;
+        room.write(&self.shared, "lines", lines.as_standard_layout().as_slice().unwrap_or_default());
+        self.walk(room, &self.adjoint, uniform, slab)
+    }
+
+    fn walk(&self, room: &mut Room, source: &Source, uniform: Projection, slab: &Range<usize>) -> Result<()> {
+        let label = if std::ptr::eq(source, &self.forward) { "forward projection" } else { "adjoint of projection" };
+        let (held, held_end) = (slab.start as u32, slab.end as u32);
+        let uniforms = |begin, end| Projection { held, held_end, begin, end, ..uniform };
+        room.run(&self.shared, &[(label, source)], ("projection", uniforms), uniform.count)
+    }
 }
 
 /// A projector's work on a device.
 pub struct DeviceOperator {
-    shared: Arc<Shared>,
-    forward: Source,
-    adjoint: Source,
+    walks: Arc<Walks>,
     room: Mutex<Room>,
     fault: Mutex<Option<Error>>,
 }
@@ -235,15 +338,9 @@ pub struct OnDevice {
 impl OnDevice {
     /// Takes a projector's work to the device; refuses one without WGSL.
     pub fn new(shared: Arc<Shared>, inner: Box<dyn VoxelProjector>) -> Result<Self> {
-        let name = format!("projector ({})", inner.describe());
-        let fragment = fragment_of(&name, inner.wgsl())?;
-        let atomics = shared.gpu.adapter.atomics;
-        let [forward, adjoint] = [true, false].map(|forward| kernel(&fragment, &name, atomics, forward));
-        forward.validate()?;
-        adjoint.validate()?;
         let room = Mutex::new(Room::new(&shared.gpu));
-        let operator = DeviceOperator { shared, forward, adjoint, room, fault: Mutex::default() };
-        Ok(Self { inner, operator })
+        let walks = Arc::new(Walks::new(shared, inner.as_ref())?);
+        Ok(Self { inner, operator: DeviceOperator { walks, room, fault: Mutex::default() } })
     }
 }
 
@@ -257,42 +354,16 @@ impl VoxelProjector for OnDevice {
     fn wgsl(&self) -> Option<Fragment> {
         self.inner.wgsl()
     }
+    fn resident(&self, volumes: Volumes<'_>) -> Option<Result<Box<dyn Resident>>> {
+        let placed = crate::resident::OnDevice::new(self.operator.walks.clone(), volumes);
+        Some(placed.map(|resident| Box::new(resident) as Box<dyn Resident>))
+    }
     fn describe(&self) -> String {
-        format!("{}, on {}", self.inner.describe(), self.operator.shared.gpu.adapter)
+        format!("{}, on {}", self.inner.describe(), self.operator.walks.shared.gpu.adapter)
     }
 }
 
 impl DeviceOperator {
-    /// How many views are on the device at once.
-    fn views_at_once(&self, pixels: usize) -> usize {
-        let bytes = LINES_BYTES.min(self.shared.gpu.adapter.bound_bytes());
-        (bytes as usize / (4 * pixels).max(1)).max(1)
-    }
-
-    /// Writes the views. Returns the uniform values of a launch, still without the range of planes.
-    fn prepare(&self, room: &mut Room, geometry: &Geometry, views: &[usize]) -> Result<Projection> {
-        let data: Vec<f32> = views.iter().flat_map(|&v| projected(geometry, v)).flatten().collect();
-        room.buffers.reserve(&self.shared.gpu, "views", 4 * data.len() as u64, U::STORAGE | U::COPY_DST)?;
-        room.write(&self.shared, "views", &data);
-        let [rows, columns] = geometry.detector;
-        let pixels = (rows * columns) as u32;
-        Ok(Projection {
-            shape: geometry.volume.shape.map(|n| n as u32),
-            count: views.len() as u32 * pixels,
-            spacing: geometry.volume.spacing.map(|h| h as f32),
-            columns: columns as u32,
-            pixels,
-            ..Projection::default()
-        })
-    }
-
-    fn buffers(&self, room: &mut Room, slab: usize, lines: usize) -> Result<()> {
-        let usage = U::STORAGE | U::COPY_SRC | U::COPY_DST;
-        room.buffers.reserve(&self.shared.gpu, "volume", 4 * slab as u64, usage)?;
-        room.buffers.reserve(&self.shared.gpu, "lines", 4 * lines as u64, usage)?;
-        Ok(())
-    }
-
     fn project(
         &self,
         geometry: &Geometry,
@@ -301,24 +372,16 @@ impl DeviceOperator {
         mut out: ArrayViewMut3<'_, f32>,
     ) -> Result<()> {
         let room = &mut *self.room.lock().unwrap_or_else(PoisonError::into_inner);
-        let shared = &self.shared;
-        let plane = volume.len() / volume.len_of(Axis(0)).max(1);
-        let pixels = geometry.detector[0] * geometry.detector[1];
-        let chunk = self.views_at_once(pixels);
+        let shared = &self.walks.shared;
+        let chunk = self.walks.views_at_once(geometry.detector[0] * geometry.detector[1]);
         let slabs = shared.slabs(geometry.volume.shape)?;
-        for (views, mut out) in views.chunks(chunk).zip(out.axis_chunks_iter_mut(Axis(0), chunk)) {
-            let uniform = self.prepare(room, geometry, views)?;
-            self.buffers(room, slabs[0].len() * plane, views.len() * pixels)?;
-            room.clear(shared, "lines");
-            for slab in &slabs {
-                let part = volume.slice(s![slab.clone(), .., ..]);
-                let part = part.as_standard_layout();
-                room.write(shared, "volume", part.as_slice().unwrap_or_default());
-                let (held, held_end) = (slab.start as u32, slab.end as u32);
-                let uniforms = |begin, end| Projection { held, held_end, begin, end, ..uniform };
-                room.run(shared, "forward projection", &self.forward, ("projection", uniforms), uniform.count)?;
-            }
-            room.read(shared, "lines", out.len(), |found| out.iter_mut().zip(found).for_each(|(o, l)| *o = *l))?;
+        shared.reserve_slab(room, &slabs, volume.dim())?;
+        let fill = |room: &Room, slab: &Range<usize>| {
+            let part = volume.slice(s![slab.clone(), .., ..]);
+            room.write(shared, "volume", part.as_standard_layout().as_slice().unwrap_or_default());
+        };
+        for (views, out) in views.chunks(chunk).zip(out.axis_chunks_iter_mut(Axis(0), chunk)) {
+            self.walks.integrate(room, (geometry, views), &slabs, fill, out)?;
         }
         Ok(())
     }
@@ -331,19 +394,14 @@ impl DeviceOperator {
         mut volume: ArrayViewMut3<'_, f32>,
     ) -> Result<()> {
         let room = &mut *self.room.lock().unwrap_or_else(PoisonError::into_inner);
-        let shared = &self.shared;
-        let plane = volume.len() / volume.len_of(Axis(0)).max(1);
-        let pixels = geometry.detector[0] * geometry.detector[1];
-        let chunk = self.views_at_once(pixels);
-        for slab in shared.slabs(geometry.volume.shape)? {
-            self.buffers(room, slab.len() * plane, chunk.min(views.len()) * pixels)?;
+        let shared = &self.walks.shared;
+        let chunk = self.walks.views_at_once(geometry.detector[0] * geometry.detector[1]);
+        let slabs = shared.slabs(geometry.volume.shape)?;
+        shared.reserve_slab(room, &slabs, volume.dim())?;
+        for slab in slabs {
             room.clear(shared, "volume");
             for (views, lines) in views.chunks(chunk).zip(projections.axis_chunks_iter(Axis(0), chunk)) {
-                let uniform = self.prepare(room, geometry, views)?;
-                room.write(shared, "lines", lines.as_standard_layout().as_slice().unwrap_or_default());
-                let (held, held_end) = (slab.start as u32, slab.end as u32);
-                let uniforms = |begin, end| Projection { held, held_end, begin, end, ..uniform };
-                room.run(shared, "adjoint of projection", &self.adjoint, ("projection", uniforms), uniform.count)?;
+                self.walks.spread(room, (geometry, views), &slab, lines)?;
             }
             room.add_to(shared, "volume", volume.slice_mut(s![slab, .., ..]))?;
         }
@@ -423,13 +481,12 @@ pub fn backproject(
         pad: [0.0; 3],
     };
     let mut room = Room::new(gpu);
-    let usage = U::STORAGE | U::COPY_SRC | U::COPY_DST;
     room.buffers.reserve(gpu, "views", (VIEWS * size_of::<SeenView>()) as u64, U::UNIFORM | U::COPY_DST)?;
-    room.buffers.reserve(gpu, "images", (chunk * rows * columns * 4) as u64, usage)?;
-    room.buffers.reserve(gpu, "padded", chunk as u64 * bytes, usage)?;
+    room.buffers.reserve(gpu, "images", (chunk * rows * columns * 4) as u64, ARRAY)?;
+    room.buffers.reserve(gpu, "padded", chunk as u64 * bytes, ARRAY)?;
     for slab in shared.slabs(shape)? {
         let count = slab.len() * plane;
-        room.buffers.reserve(gpu, "volume", 4 * count as u64, usage)?;
+        room.buffers.reserve(gpu, "volume", 4 * count as u64, ARRAY)?;
         room.clear(shared, "volume");
         for (views, images) in views.chunks(chunk).zip(images.axis_chunks_iter(Axis(0), chunk)) {
             let seen: Vec<SeenView> = views.iter().map(seen).collect();
@@ -445,8 +502,8 @@ pub fn backproject(
                 columns: columns as u32,
                 pad: [0; 3],
             };
-            room.run(shared, "exchange", &pad, ("back", uniforms), (views.len() * padded) as u32)?;
-            room.run(shared, "back-projection", &voxels, ("back", uniforms), count as u32)?;
+            room.run(shared, &[("exchange", &pad)], ("back", uniforms), (views.len() * padded) as u32)?;
+            room.run(shared, &[("back-projection", &voxels)], ("back", uniforms), count as u32)?;
         }
         room.add_to(shared, "volume", volume.slice_mut(s![slab, .., ..]))?;
     }

@@ -188,8 +188,8 @@ impl Iteration for Iterate {
         std::mem::take(&mut self.sweep.x)
     }
 
-    fn state(&mut self) -> Vec<(String, &mut [f32])> {
-        vec![("x".into(), flat_mut(&mut self.sweep.x))]
+    fn state(&mut self) -> Result<Vec<(String, &mut [f32])>> {
+        Ok(vec![("x".into(), flat_mut(&mut self.sweep.x))])
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

@@ -160,12 +160,12 @@ impl Iteration for Iterate {
         std::mem::take(&mut self.x)
     }
 
-    fn state(&mut self) -> Vec<(String, &mut [f32])> {
-        vec![
+    fn state(&mut self) -> Result<Vec<(String, &mut [f32])>> {
+        Ok(vec![
             ("x".into(), flat_mut(&mut self.x)),
             ("residual".into(), flat_mut(&mut self.residual)),
             ("direction".into(), flat_mut(&mut self.direction)),
-        ]
+        ])
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

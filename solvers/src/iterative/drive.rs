@@ -39,7 +39,7 @@ pub trait Iteration {
     fn take(&mut self, problem: &Problem<'_>) -> Array3<f32>;
 
     /// The complete state for the next pass, by name, for checkpoints.
-    fn state(&mut self) -> Vec<(String, &mut [f32])>;
+    fn state(&mut self) -> Result<Vec<(String, &mut [f32])>>;
 
     /// An error of a stage since the last call.
     fn fault(&self) -> Result<()> {
@@ -228,7 +228,7 @@ impl<'a> Run<'a> {
         let (step, seconds) = (self.step, self.clock.seconds());
         let kept = serde_json::json!(self.kept);
         let standing = Standing { step, recorded: step, seconds, method: kept, ..Standing::default() };
-        let mut state = method.state();
+        let mut state = method.state()?;
         if let (Some(best), Some(_)) = (&mut self.best, self.kept.best) {
             state.push((BEST.into(), flat_mut(best)));
         }
@@ -277,7 +277,7 @@ fn restore(resume: &Resume, method: &mut dyn Iteration, best: Option<&mut Array3
     let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.method.clone());
     let kept = kept.map_err(|e| Error::invalid(&resume.place, "method", e, "the state of this method"))?;
     let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), flat_mut(best)));
-    for (name, values) in method.state().into_iter().chain(best) {
+    for (name, values) in method.state()?.into_iter().chain(best) {
         let found = resume.tensor(&name).map(|t| &t.1);
         let fits = found.filter(|t| t.len() == values.len());
         let said = found.map_or("nothing".into(), |t| format!("{} numbers", t.len()));

@@ -16,7 +16,7 @@ use super::model::{Model, projected};
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, split, summary};
 use super::plan::{Iterative, IterativePlan};
-use super::problem::{images_mut, room};
+use super::problem::{images, images_mut, room};
 use super::regularizers::Nonnegative;
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat, flat_mut};
@@ -28,11 +28,12 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
 use conefield_core::random::stream;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update};
+use conefield_core::resident::{Factors, Resident, Volumes};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
 use conefield_core::spec::stage;
-use conefield_core::voxel::VoxelProjectorSpec;
+use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
 use conefield_projectors::voxel::Joseph;
 use ndarray::{Array3, Axis, Zip};
 use rand::RngExt;
@@ -212,8 +213,9 @@ impl Iterative for Built {
         let start = self.shared.known(job, &space)?;
         let mut arrays = Arrays::new(self, expansion, &voxels, &space, start)?;
         arrays.begin(&problem);
-        let mut iterate = Iterate::new(self, &problem, data, arrays)?;
+        let mut iterate = Iterate::new(self, &problem, data, arrays, opened.projector())?;
         observer.note(&iterate.description());
+        iterate.settle(&problem, observer);
         drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
     }
 
@@ -277,6 +279,8 @@ struct Arrays {
     towards: Option<Array3<f32>>,
     /// The pixels of a subset. After subsets have been merged, their views are processed in parts.
     pixels: Array3<f32>,
+    /// The volumes on a device, which are then newer than `ahead` and the penalty's state here.
+    resident: Option<Box<dyn Resident>>,
 }
 
 /// The callback of [`Arrays::part_by_part`]: computes images of some views for back-projection.
@@ -303,7 +307,85 @@ impl Arrays {
             before: coefficients(),
             towards: (settings.pull > 0.0).then(coefficients),
             pixels: room(space, settings.subsets.count(space.header().views)),
+            resident: None,
         })
+    }
+
+    /// Takes the volumes to the projector's device, if it has one.
+    fn settle(&mut self, problem: &Problem<'_>, projector: &dyn VoxelProjector) -> Option<Result<()>> {
+        if !self.model.projects_coefficients() {
+            return None;
+        }
+        let Self { model, penalty, x, ahead, towards, .. } = self;
+        let shape = x.dim().into();
+        let (inside, towards) = (model.inside(problem), towards.as_ref().map(flat));
+        let volumes = Volumes { shape, x: flat(x), ahead: flat(ahead), towards, inside, dual: penalty.dual() };
+        let placed = projector.resident(volumes)?;
+        Some(placed.map(|resident| self.resident = Some(resident)))
+    }
+
+    /// Overwrites the gradient with that of the data term at `ahead`. Returns `‖p − A·x‖²` and the data term.
+    fn differentiate(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) -> Result<[f64; 2]> {
+        let (mut residual, mut misfit) = (0.0, 0.0);
+        let mut differentiate = |views: &[usize], pixels: &mut Array3<f32>| {
+            residual += problem.subtract(views, pixels);
+            let misfits = problem.each_image(views, pixels, |view, measured, r| data.differentiate(view, measured, r));
+            misfit += misfits.iter().sum::<f64>();
+        };
+        if let Some(resident) = &mut self.resident {
+            for part in views.chunks(self.pixels.len_of(Axis(0)).max(1)) {
+                resident.forward(problem.geometry, part, images_mut(&mut self.pixels, part.len()))?;
+                problem.operator.fault()?;
+                differentiate(part, &mut self.pixels);
+                resident.adjoint(problem.geometry, part, images(&self.pixels, part.len()))?;
+            }
+            return Ok([residual, misfit]);
+        }
+        let ahead = std::mem::take(&mut self.ahead);
+        self.part_by_part(problem, views, &mut |model, views, pixels| {
+            model.forward(problem, views, &ahead, pixels);
+            differentiate(views, pixels);
+        });
+        self.ahead = ahead;
+        Ok([residual, misfit])
+    }
+
+    /// Makes an update with the gradient.
+    fn update(&mut self, problem: &Problem<'_>, factors: Factors) -> Result<()> {
+        if let Some(resident) = &mut self.resident {
+            return resident.update(factors);
+        }
+        let Self { model, penalty, x, ahead, gradient, towards, .. } = self;
+        let update = Update {
+            gradient: flat_mut(gradient),
+            ahead: flat_mut(ahead),
+            x: flat_mut(x),
+            step: factors.step,
+            momentum: factors.momentum,
+            towards: towards.as_ref().map(|towards| (flat(towards), factors.pull)),
+            inside: model.inside(problem),
+        };
+        penalty.update(update, factors.tau);
+        Ok(())
+    }
+
+    /// Adapts the penalty to the coefficients before a pass. Returns its value if it changed.
+    fn adapt(&mut self) -> Result<Option<f64>> {
+        let value = self.penalty.adapt(self.x.view());
+        if let (Some(_), Some(resident)) = (value, &mut self.resident)
+            && let Some(guide) = self.penalty.dual().and_then(|dual| dual.guide)
+        {
+            resident.guide(guide)?;
+        }
+        Ok(value)
+    }
+
+    /// Brings the state here up to date, and gives up the volumes on the device.
+    fn unsettle(&mut self) -> Result<()> {
+        match (self.resident.take(), self.penalty.dual()) {
+            (Some(mut resident), Some(dual)) => resident.rest(flat_mut(&mut self.ahead), dual.p),
+            _ => Ok(()),
+        }
     }
 
     /// Clears coefficients outside the object's support and restarts from the rest.
@@ -377,8 +459,11 @@ impl Arrays {
 const PROBES: usize = 3;
 const SAFETY: f64 = 1.15;
 
-struct Iterate {
+struct Iterate<'a> {
     arrays: Arrays,
+    projector: &'a dyn VoxelProjector,
+    /// Whether the volumes stay on a device.
+    resides: bool,
     data: Box<dyn Misfit>,
     views: usize,
     /// Current number of subsets.
@@ -399,8 +484,14 @@ struct Iterate {
     misfit: f64,
 }
 
-impl Iterate {
-    fn new(settings: &Built, problem: &Problem<'_>, data: Box<dyn Misfit>, mut arrays: Arrays) -> Result<Self> {
+impl<'a> Iterate<'a> {
+    fn new(
+        settings: &Built,
+        problem: &Problem<'_>,
+        data: Box<dyn Misfit>,
+        mut arrays: Arrays,
+        projector: &'a dyn VoxelProjector,
+    ) -> Result<Self> {
         let views = problem.scan.geometry.views.len();
         let subsets = settings.subsets.of(views);
         let grid = arrays.model.grid();
@@ -414,6 +505,8 @@ impl Iterate {
         ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
         Ok(Self {
             arrays,
+            projector,
+            resides: false,
             data,
             views,
             subsets: subsets.len() as f64,
@@ -434,48 +527,49 @@ impl Iterate {
         format!("{}: the prior's weight is {:.3e}", self.data.describe(), self.lambda / side)
     }
 
+    /// Takes the volumes to the projector's device, if it has one; otherwise they travel to it for each projection.
+    fn settle(&mut self, problem: &Problem<'_>, observer: &mut dyn Observer) {
+        match self.arrays.settle(problem, self.projector) {
+            None => {}
+            Some(Ok(())) => {
+                self.resides = true;
+                observer.note("the volumes stay on the device");
+            }
+            Some(Err(why)) => observer.note(&format!("the volumes travel to the device for each projection: {why}")),
+        }
+    }
+
     /// Processes one subset: a gradient step and the prior's proximal map. Returns `‖p − A·x‖²` and the data term.
-    fn update(&mut self, problem: &Problem<'_>, views: &[usize]) -> [f64; 2] {
-        let (mut residual, mut misfit) = (0.0, 0.0);
-        let ahead = std::mem::take(&mut self.arrays.ahead);
-        let data = self.data.as_ref();
-        self.arrays.part_by_part(problem, views, &mut |model, views, pixels| {
-            residual += model.residual(problem, views, &ahead, pixels);
-            let misfits = problem.each_image(views, pixels, |view, measured, r| data.differentiate(view, measured, r));
-            misfit += misfits.iter().sum::<f64>();
-        });
-        self.arrays.ahead = ahead;
+    fn update(&mut self, problem: &Problem<'_>, views: &[usize]) -> Result<[f64; 2]> {
+        let misfits = self.arrays.differentiate(problem, self.data.as_ref(), views)?;
         let t = 0.5 * (1.0 + (1.0 + 4.0 * self.t * self.t).sqrt());
         let momentum = ((self.t - 1.0) / t) as f32;
         self.t = t.min((MOMENTUM / self.subsets).max(1.0));
-        let Arrays { model, penalty, x, ahead, gradient, towards, .. } = &mut self.arrays;
-        let update = Update {
-            gradient: flat_mut(gradient),
-            ahead: flat_mut(ahead),
-            x: flat_mut(x),
-            step: (self.subsets / self.lipschitz) as f32,
-            momentum,
-            towards: towards.as_ref().map(|towards| (flat(towards), self.pull)),
-            inside: model.inside(problem),
-        };
-        penalty.update(update, (self.lambda / self.lipschitz) as f32);
-        [residual, misfit]
+        let (step, tau) = ((self.subsets / self.lipschitz) as f32, (self.lambda / self.lipschitz) as f32);
+        self.arrays.update(problem, Factors { step, momentum, pull: self.pull, tau })?;
+        Ok(misfits)
     }
 }
 
-impl Iteration for Iterate {
+impl Iteration for Iterate<'_> {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         Zip::from(&mut self.arrays.before).and(&self.arrays.x).par_for_each(|before, x| *before = *x);
+        if self.resides && self.arrays.resident.is_none() {
+            self.arrays.settle(problem, self.projector).transpose()?;
+        }
         // A changed penalty must not count as progress or regress.
-        if let Some(value) = self.arrays.penalty.adapt(self.arrays.x.view()) {
+        if let Some(value) = self.arrays.adapt()? {
             self.objective = self.misfit + self.lambda * value;
         }
         let (mut residual, mut misfit) = (0.0, 0.0);
         let subsets = split(self.views, self.subsets as usize);
         for s in self.order.of(subsets.len(), problem.seed, pass) {
-            let [r, m] = self.update(problem, &subsets[s]);
+            let [r, m] = self.update(problem, &subsets[s])?;
             residual += r;
             misfit += m;
+        }
+        if let Some(resident) = &mut self.arrays.resident {
+            resident.coefficients(flat_mut(&mut self.arrays.x))?;
         }
         let Arrays { penalty, x, before, towards, .. } = &self.arrays;
         let change = change(x, before);
@@ -511,11 +605,12 @@ impl Iteration for Iterate {
         self.data.fault()
     }
 
-    fn state(&mut self) -> Vec<(String, &mut [f32])> {
+    fn state(&mut self) -> Result<Vec<(String, &mut [f32])>> {
+        self.arrays.unsettle()?;
         let own = [("x", &mut self.arrays.x), ("ahead", &mut self.arrays.ahead)];
         let own = own.map(|(name, x)| (name.to_owned(), flat_mut(x)));
         let prior = self.arrays.penalty.state().into_iter().map(|(name, x)| (format!("prior.{name}"), x));
-        own.into_iter().chain(prior).collect()
+        Ok(own.into_iter().chain(prior).collect())
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

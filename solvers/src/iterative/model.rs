@@ -66,6 +66,11 @@ impl Model {
         self.expansion.fault()
     }
 
+    /// Whether the projector takes the coefficients as they are.
+    pub(super) fn projects_coefficients(&self) -> bool {
+        self.expansion.are_samples()
+    }
+
     /// The grid of the coefficients.
     pub(super) fn grid(&self) -> VoxelGrid {
         self.expansion.coefficients()
@@ -97,17 +102,6 @@ impl Model {
     /// Like [`Problem::forward`].
     pub(super) fn forward(&mut self, problem: &Problem<'_>, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) {
         problem.forward(views, self.projected(problem, x), out);
-    }
-
-    /// Like [`Problem::residual`].
-    pub(super) fn residual(
-        &mut self,
-        problem: &Problem<'_>,
-        views: &[usize],
-        x: &Array3<f32>,
-        out: &mut Array3<f32>,
-    ) -> f64 {
-        problem.residual(views, self.projected(problem, x), out)
     }
 
     /// Adds `(A·B)ᵀ·y` for some views to `out`.

@@ -58,6 +58,11 @@ impl Problem<'_> {
     /// `‖p − A·x‖²`.
     pub fn residual(&self, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) -> f64 {
         self.forward(views, x, out);
+        self.subtract(views, out)
+    }
+
+    /// Overwrites the first images of `out`, `A·x` for some views, with `p − A·x`; see [`Problem::residual`].
+    pub(super) fn subtract(&self, views: &[usize], out: &mut Array3<f32>) -> f64 {
         for (mut image, &v) in out.axis_iter_mut(Axis(0)).zip(views) {
             let both = Zip::from(&mut image).and(self.scan.view(v));
             match &self.shadow {

@@ -133,6 +133,11 @@ impl Opened {
         Within::job(self.within.as_ref(), job)
     }
 
+    /// The projector, where the backend works.
+    pub(super) fn projector(&self) -> &dyn VoxelProjector {
+        self.projector.as_ref()
+    }
+
     /// Its problem, with every pixel as measured or binned.
     pub(super) fn problem<'a>(&'a self, job: &Job<'a>) -> Problem<'a> {
         let (operator, inside) = (self.projector.operator(), self.inside.as_ref());

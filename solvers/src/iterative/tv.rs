@@ -8,9 +8,10 @@
 use super::edges::Edges;
 use super::flat_mut;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::Update;
+use conefield_core::regularizer::{Dual, Update};
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
 use conefield_core::space::Space;
+use conefield_core::wgsl::Fragment;
 use ndarray::{Array3, ArrayView3};
 use rayon::prelude::*;
 use std::ops::Range;
@@ -127,6 +128,18 @@ impl TvProx {
     /// The total variation of `x`.
     pub fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
         total_variation(x, self.g, self.edges.as_ref())
+    }
+
+    /// The proximal map for a GPU.
+    pub fn on_device(&mut self, steps: usize) -> Dual<'_> {
+        let ascend = if self.edges.is_some() { ASCEND_ALONG_EDGES } else { ASCEND };
+        Dual {
+            fragment: Fragment::new(&[ascend]),
+            weights: self.g,
+            steps,
+            p: self.dual.each_mut().map(flat_mut),
+            guide: self.edges.as_ref().map(Edges::vectors),
+        }
     }
 
     /// The dual along x, y and z, for a checkpoint.
@@ -259,7 +272,7 @@ struct Scale {
 
 impl Scale {
     fn new(g: [f32; 3], tau: f32) -> Self {
-        let bound = 4.0 * g.iter().map(|g| g * g).sum::<f32>();
+        let bound = Dual::bound(g);
         Self { down: g.map(|g| g * tau), up: g.map(|g| g / (bound * tau)) }
     }
 }
@@ -531,6 +544,18 @@ fn ascent<S: Simd>(
     let inner = dot(n, p);
     std::array::from_fn(|k| (p[k] - n[k] * inner) * shrink)
 }
+
+/// [`ascent`] in WGSL, without edges and with them.
+const ASCEND: &str = "fn stage_ascend(p: vec3<f32>, d: vec3<f32>, n: vec3<f32>) -> vec3<f32> {
+    let q = p + d;
+    return q / max(1.0, length(q));
+}
+";
+const ASCEND_ALONG_EDGES: &str = "fn stage_ascend(p: vec3<f32>, d: vec3<f32>, n: vec3<f32>) -> vec3<f32> {
+    let q = p + d + n * (dot(n, p) / (1.0 - dot(n, n)) - dot(n, d));
+    return (q - n * dot(n, q)) / max(1.0, length(q));
+}
+";
 
 #[inline(always)]
 fn dot<T: Copy + std::ops::Add<Output = T> + std::ops::Mul<Output = T>>(a: [T; 3], b: [T; 3]) -> T {

@@ -1,11 +1,16 @@
 //! Projection of voxel volumes on a device against double precision, and classical methods there against the CPU.
 
-use crate::common::{scan, solve_on, truth};
+use crate::common::{Stop, plan, scan, solve_on, spec, truth};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
 use conefield_core::geometry::Geometry;
+use conefield_core::method::{Job, Observer, Record};
 use conefield_core::random::{mix, unit};
+use conefield_core::regularizer::{RegularizerSpec, Update};
+use conefield_core::resident::{Factors, Volumes};
+use conefield_core::scan::ScanHeader;
+use conefield_core::space::Space;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};
 use conefield_core::wgsl::Fragment;
 use ndarray::Array3;
@@ -113,6 +118,177 @@ fn a_perturbed_walk_is_found_and_what_cannot_run_is_refused() {
     assert!(e.contains("projector (changed") && e.contains("line"), "{e}");
 }
 
+/// Three updates with gradients and masks on the device and on the host; the largest difference of each array, and of the
+/// line integrals, as a share of the array's largest number. `change` changes the WGSL.
+fn updates_differ(
+    backend: &dyn Backend,
+    prior: &Value,
+    [pulled, masked]: [bool; 2],
+    tau: f32,
+    change: fn(String) -> String,
+) -> conefield_core::Result<f64> {
+    let g = geometry();
+    let joseph = projector(json!({"type": "joseph"}));
+    let placed = backend.place(projector(json!({"type": "joseph"})))?;
+    let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: g.volume.shape });
+    let on = || {
+        let spec: Box<dyn RegularizerSpec> = serde_json::from_value(prior.clone()).unwrap();
+        spec.build().unwrap().on(&g.volume, &space).unwrap()
+    };
+    let (mut here, mut there) = (on(), on());
+    let volume = |seed| numbers(g.volume.shape, seed).mapv(|v| v as f32);
+    let (mut x, mut ahead, towards) = (volume(1), volume(2), volume(3));
+    // Edges of the coefficients.
+    assert_eq!(here.adapt(x.view()), there.adapt(x.view()));
+    let inside: Vec<bool> = (0..x.len()).map(|i| i % 7 != 0).collect();
+    let (towards, inside) = (pulled.then(|| towards.as_slice().unwrap()), masked.then_some(&inside[..]));
+    let mut dual = there.dual().unwrap();
+    dual.fragment.source = change(dual.fragment.source);
+    let (all, shape) = (x.len(), g.volume.shape);
+    let volumes = Volumes {
+        shape,
+        x: x.as_slice().unwrap(),
+        ahead: ahead.as_slice().unwrap(),
+        towards,
+        inside,
+        dual: Some(dual),
+    };
+    let mut device = placed.resident(volumes).expect("a device")?;
+    let views: Vec<usize> = (0..g.views.len()).rev().collect();
+    let [rows, columns] = g.detector;
+    let mut worst = 0.0f64;
+    let mut compare = |found: &[f32], want: &[f32]| {
+        let top = want.iter().fold(1e-30f32, |m, v| m.max(v.abs()));
+        let off = found.iter().zip(want).map(|(a, b)| f64::from((a - b).abs() / top)).fold(0.0, f64::max);
+        worst = worst.max(off);
+    };
+    for seed in 10..13 {
+        let (mut want, mut found) =
+            (Array3::zeros((views.len(), rows, columns)), Array3::zeros((views.len(), rows, columns)));
+        joseph.operator().forward(&g, &views, ahead.view(), want.view_mut());
+        device.forward(&g, &views, found.view_mut())?;
+        compare(found.as_slice().unwrap(), want.as_slice().unwrap());
+        let images = numbers(want.dim(), seed).mapv(|v| (v - 0.5) as f32);
+        let mut gradient = Array3::zeros(shape);
+        joseph.operator().adjoint(&g, &views, images.view(), gradient.view_mut());
+        device.adjoint(&g, &views, images.view())?;
+        let factors = Factors { step: 0.01, momentum: 0.6, pull: 0.2, tau };
+        here.update(
+            Update {
+                gradient: gradient.as_slice_mut().unwrap(),
+                ahead: ahead.as_slice_mut().unwrap(),
+                x: x.as_slice_mut().unwrap(),
+                step: factors.step,
+                momentum: factors.momentum,
+                towards: towards.map(|towards| (towards, factors.pull)),
+                inside,
+            },
+            tau,
+        );
+        device.update(factors)?;
+        if let (Some(_), Some(dual)) = (here.adapt(x.view()), here.dual()) {
+            device.guide(dual.guide.unwrap())?;
+        }
+    }
+    let mut arrays: [Vec<f32>; 5] = std::array::from_fn(|_| vec![f32::NAN; all]);
+    let [found, before, p, q, r] = &mut arrays;
+    device.coefficients(found)?;
+    device.rest(before, [p, q, r])?;
+    let [p, q, r] = here.dual().unwrap().p;
+    let want = [x.as_slice().unwrap(), ahead.as_slice().unwrap(), p, q, r];
+    arrays.iter().zip(want).for_each(|(found, want)| compare(found, want));
+    Ok(worst)
+}
+
+#[test]
+fn updates_on_the_device_are_those_of_the_host() {
+    let priors = [
+        json!({"type": "total-variation", "inner": 3}),
+        json!({"type": "directional-total-variation", "edge": 0.5, "inner": 4}),
+    ];
+    for (name, backend) in crate::device::backends("updates") {
+        for prior in &priors {
+            for [pulled, masked] in [[false, false], [true, false], [false, true], [true, true]] {
+                for tau in [0.0, 0.2] {
+                    let found = updates_differ(&backend, prior, [pulled, masked], tau, |s| s);
+                    if name == "small buffers" {
+                        let e = found.unwrap_err().to_string();
+                        assert!(e.contains("a volume takes 7488 bytes, a buffer holds 2048"), "{e}");
+                        continue;
+                    }
+                    let off = found.unwrap();
+                    println!("{}, pull {pulled}, mask {masked}, weight {tau}, {name}: {off:.1e}", prior["type"]);
+                    assert!(off < LIMIT, "{prior}, pull {pulled}, mask {masked}, weight {tau}, {name}: {off}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_perturbed_prior_is_found_and_one_without_wgsl_travels() {
+    let Some((_, backend)) = crate::device::backends("negative controls").into_iter().next() else { return };
+    let prior = json!({"type": "total-variation"});
+    let wrong = |s: String| s.replace("p + d", "p + 1.01 * d");
+    assert!(updates_differ(&backend, &prior, [false; 2], 0.2, wrong).unwrap() > LIMIT);
+    let invalid = |s: String| s.replace("let q", "let r");
+    let e = updates_differ(&backend, &prior, [false; 2], 0.2, invalid).unwrap_err().to_string();
+    assert!(e.contains("penalty") && e.contains("line"), "{e}");
+    let method = json!({"type": "fista", "prior": {"type": "none"}, "stop": {"passes": 1}});
+    let said = notes(&method, &backend);
+    assert!(said.iter().any(|n| n.contains("the volumes travel") && n.contains("no WGSL")), "{said:?}");
+}
+
+/// Keeps what a run notes.
+struct Notes(Vec<String>);
+impl Observer for Notes {
+    fn progress(&mut self, _: u64, _: f64, _: f64) {}
+    fn record(&mut self, _: &Record) {}
+    fn note(&mut self, line: &str) {
+        self.0.push(line.into());
+    }
+}
+
+fn notes(method: &Value, backend: &dyn Backend) -> Vec<String> {
+    let (scan, mut notes) = (scan(), Notes(vec![]));
+    let mut plan = plan(&spec(method).unwrap(), backend, &Weights::default()).unwrap();
+    plan.run(&Job { seed: 7, ..Job::new(&scan, backend) }, &mut notes).unwrap();
+    notes.0
+}
+
+#[test]
+fn volumes_stay_on_the_device_also_across_a_checkpoint() {
+    let method = json!({
+        "type": "fista", "basis": {"type": "cubic", "spacing": 1.5}, "stop": {"passes": 6}, "subsets": 4,
+        "prior": {"type": "directional-total-variation"}, "scene": {"support": "carve"},
+    });
+    for (name, backend) in crate::device::backends("checkpoints of volumes") {
+        let said = notes(&method, &backend);
+        let stay = if name == "small buffers" { "the volumes travel" } else { "the volumes stay on the device" };
+        assert!(said.iter().any(|n| n.contains(stay)), "{name}: {said:?}");
+        let scan = scan();
+        let mut plan = plan(&spec(&method).unwrap(), &backend, &Weights::default()).unwrap();
+        let job = Job { seed: 7, ..Job::new(&scan, &backend) };
+        let whole = plan.run(&job, &mut Notes(vec![])).unwrap().result.volume(&backend).unwrap().data;
+        let mut stop = Stop::at(3);
+        let _ = plan.run(&job, &mut stop);
+        let kept = stop.kept.expect("a checkpoint");
+        assert_eq!(kept.standing.step, 3);
+        let resumed = Job { resume: Some(&kept), ..job };
+        let resumed = plan.run(&resumed, &mut Notes(vec![])).unwrap().result.volume(&backend).unwrap().data;
+        let error = off(&resumed, &whole.mapv(f64::from));
+        println!("{name}: {error:.1e}");
+        assert!(error < 1e-4, "{name}: {error}");
+        // A run that forgets its momentum ends elsewhere.
+        let (fresh, _) = solve_on(&backend, &json!({"type": "chain", "methods": [
+            {"type": "fista", "basis": method["basis"], "stop": {"passes": 3}, "subsets": 4, "prior": method["prior"], "scene": method["scene"]},
+            {"type": "fista", "basis": method["basis"], "stop": {"passes": 3}, "subsets": 4, "prior": method["prior"], "scene": method["scene"]},
+        ]}), &scan, &Weights::default()).unwrap();
+        let fresh = fresh.result.volume(&backend).unwrap().data;
+        assert!(off(&fresh, &whole.mapv(f64::from)) > 1e-3, "{name}");
+    }
+}
+
 fn psnr(spec: &Value, backend: &dyn Backend) -> f64 {
     let (solution, _) = solve_on(backend, spec, &scan(), &Weights::default()).unwrap();
     let (found, truth) = (solution.result.volume(backend).unwrap(), truth());
@@ -132,6 +308,8 @@ fn classical_methods_end_where_the_cpu_does() {
         json!({"type": "sart", "stop": {"passes": 3}}),
         json!({"type": "cgls", "stop": {"passes": 5}}),
         json!({"type": "fista", "prior": {"type": "total-variation"}, "stop": {"passes": 5}}),
+        json!({"type": "fista", "prior": {"type": "directional-total-variation"}, "stop": {"passes": 5},
+            "basis": {"type": "cubic", "spacing": 1.5}, "scene": {"support": "carve"}}),
     ];
     // On the CPU, wherever this runs: a method that makes next to nothing would agree with anything.
     let empty = decibels(truth().data.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / truth().data.len() as f64);

@@ -46,13 +46,14 @@ const fn program(name: &'static str, limit_s: u64, program: &'static str, argume
 }
 
 /// The most informative stages come first, because the machine may be available for a few minutes only.
-const STAGES: [Stage; 9] = [
+const STAGES: [Stage; 10] = [
     own("adapter", 20, device::adapter),
     own("limits", 60, device::limits),
     own("compile", 60, speed::compile),
     own("quick-parity", 90, speed::quick_parity),
     own("kernels", 120, speed::kernels),
     own("voxels", 60, speed::voxels),
+    own("classical", 120, speed::classical),
     own("training", 100, speed::training),
     program("parity-of-stages", 120, "parity-stages", &["--test-threads", "1"]),
     program("parity-of-runs", 120, "parity-library", &["--test-threads", "1", "wgpu"]),

@@ -221,6 +221,38 @@ pub fn voxels(asked: &Asked) -> Result<()> {
     Ok(())
 }
 
+/// `smooth-tv` on the kit's scan, as a user runs it, on the device and on the CPU: seconds of the whole command and PSNR. A software
+/// device makes one pass per level.
+pub fn classical(asked: &Asked) -> Result<()> {
+    let run = std::env::temp_dir().join(format!("conefield-contact-{}", std::process::id()));
+    let program = file("conefield")?;
+    for backend in [format!("wgpu:{}", asked.adapter), "cpu".into()] {
+        let mut command = Command::new(&program);
+        command.arg("reconstruct").arg(file("scan")?).args(["--spec", "smooth-tv", "--force", "-q", "-o"]).arg(&run);
+        command.args(["--backend", &backend]);
+        if asked.software {
+            command.args((0..3).flat_map(|level| ["--set".into(), format!("methods.{level}.stop.passes=1")]));
+        }
+        let started = Instant::now();
+        let done = command.output()?;
+        let seconds = started.elapsed().as_secs_f64();
+        let truth = file("scan")?.join("truth.nii.gz");
+        let scores = Command::new(&program)
+            .args(["evaluate", "-q", "--json"])
+            .args([run.join("volume.nii.gz"), truth])
+            .output()?;
+        let _ = std::fs::remove_dir_all(&run);
+        for done in [&done, &scores] {
+            if !done.status.success() {
+                return Err(String::from_utf8_lossy(&done.stderr).into());
+            }
+        }
+        let scores: Value = serde_json::from_slice(&scores.stdout)?;
+        say(&json!({ "spec": "smooth-tv", "backend": backend, "seconds": seconds, "psnr": scores["psnr"] }));
+    }
+    Ok(())
+}
+
 /// Sixty seconds of `balanced` on the kit's scan, as a user runs it: the seconds to marks of PSNR, and the last one.
 pub fn training(asked: &Asked) -> Result<()> {
     let run = std::env::temp_dir().join(format!("conefield-contact-{}", std::process::id()));

@@ -3,7 +3,7 @@
 use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update, Weight};
+use conefield_core::regularizer::{Dual, Penalty, Regularizer, RegularizerSpec, Update, Weight};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use schemars::JsonSchema;
@@ -83,6 +83,10 @@ impl Penalty for On {
         if let Some(update) = self.prox.update(update, tau, self.inner) {
             update.around(|v, u| self.prox.apply(v, tau, self.inner, u));
         }
+    }
+
+    fn dual(&mut self) -> Option<Dual<'_>> {
+        Some(self.prox.on_device(self.inner))
     }
 
     fn state(&mut self) -> Vec<(&str, &mut [f32])> {
