@@ -142,8 +142,8 @@ impl Kernels {
     }
 }
 
-/// The volumes on a device.
-pub struct OnDevice {
+/// The volumes, with the projector's and their own kernels.
+pub struct DeviceVolumes {
     walks: Arc<Walks>,
     /// Buffers of the projector.
     rays: Room,
@@ -155,7 +155,7 @@ pub struct OnDevice {
     steps: usize,
 }
 
-impl OnDevice {
+impl DeviceVolumes {
     /// Uploads the volumes. Refuses those that are larger than a buffer, and a penalty without WGSL.
     pub fn new(walks: Arc<Walks>, volumes: Volumes<'_>) -> Result<Self> {
         let shared = walks.shared.clone();
@@ -221,7 +221,7 @@ impl OnDevice {
     }
 }
 
-impl Resident for OnDevice {
+impl Resident for DeviceVolumes {
     fn forward(&mut self, geometry: &Geometry, views: &[usize], mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
         self.project("ahead")?;
         let (chunk, whole) = (self.views_at_once(geometry), [0..self.shape[0]]);

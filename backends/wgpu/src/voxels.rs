@@ -355,7 +355,7 @@ impl VoxelProjector for OnDevice {
         self.inner.wgsl()
     }
     fn resident(&self, volumes: Volumes<'_>) -> Option<Result<Box<dyn Resident>>> {
-        let placed = crate::resident::OnDevice::new(self.operator.walks.clone(), volumes);
+        let placed = crate::resident::DeviceVolumes::new(self.operator.walks.clone(), volumes);
         Some(placed.map(|resident| Box::new(resident) as Box<dyn Resident>))
     }
     fn describe(&self) -> String {
