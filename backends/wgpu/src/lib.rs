@@ -10,7 +10,7 @@
 //! - [`profile`]: time on the device.
 //! - [`single`]: one stage alone, by which it is compared with the CPU.
 //! - [`voxels`]: projection of voxel volumes and FDK's back-projection.
-//! - [`resident`]: proximal gradient updates of volumes that stay on the device.
+//! - `resident`: proximal gradient updates of volumes that stay on the device.
 //!
 //! Sums have no fixed order where many rows touch one parameter: results agree with the CPU's to rounding, and two runs
 //! with each other.
