@@ -535,7 +535,9 @@ impl<'a> Iterate<'a> {
                 self.resides = true;
                 observer.note("the volumes stay on the device");
             }
-            Some(Err(why)) => observer.note(&format!("the volumes travel to the device for each projection: {why}")),
+            Some(Err(why)) => {
+                observer.note(&format!("the volumes are copied to the device for each projection: {why}"))
+            }
         }
     }
 

@@ -236,7 +236,7 @@ fn a_perturbed_prior_is_found_and_one_without_wgsl_travels() {
     assert!(e.contains("penalty") && e.contains("line"), "{e}");
     let method = json!({"type": "fista", "prior": {"type": "none"}, "stop": {"passes": 1}});
     let said = notes(&method, &backend);
-    assert!(said.iter().any(|n| n.contains("the volumes travel") && n.contains("no WGSL")), "{said:?}");
+    assert!(said.iter().any(|n| n.contains("the volumes are copied") && n.contains("no WGSL")), "{said:?}");
 }
 
 /// Keeps what a run notes.
@@ -264,7 +264,7 @@ fn volumes_stay_on_the_device_also_across_a_checkpoint() {
     });
     for (name, backend) in crate::device::backends("checkpoints of volumes") {
         let said = notes(&method, &backend);
-        let stay = if name == "small buffers" { "the volumes travel" } else { "the volumes stay on the device" };
+        let stay = if name == "small buffers" { "the volumes are copied" } else { "the volumes stay on the device" };
         assert!(said.iter().any(|n| n.contains(stay)), "{name}: {said:?}");
         let scan = scan();
         let mut plan = plan(&spec(&method).unwrap(), &backend, &Weights::default()).unwrap();
