@@ -1,6 +1,6 @@
 //! A proximal gradient method whose volumes stay on a device.
 //!
-//! Only images travel: line integrals to the host, which applies the data term, and its derivatives back.
+//! Only images are copied: line integrals to the host, which applies the data term, and its derivatives back.
 
 use crate::error::Result;
 use crate::geometry::Geometry;

@@ -6,8 +6,8 @@
 use crate::compose::fragment_of;
 use crate::device::Gpu;
 use crate::source::{Access, Source};
-use crate::voxels::{ARRAY, Room, Walks};
-use conefield_core::error::Result;
+use crate::voxels::{ARRAY, Room, Walks, each};
+use conefield_core::error::{Error, Result};
 use conefield_core::geometry::Geometry;
 use conefield_core::regularizer::Dual;
 use conefield_core::resident::{Factors, Resident, Volumes};
@@ -59,18 +59,7 @@ fn kernel(bindings: &[(&str, Access)], functions: &[(&str, &str)], body: &str) -
     for (name, text) in functions {
         source.add(name, text);
     }
-    source.add(
-        "voxels",
-        &format!(
-            "@compute @workgroup_size(64)
-fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {{
-    for (var i = proximal.begin + id.x; i < proximal.end; i += groups.x * 64u) {{
-        {body}
-    }}
-}}
-"
-        ),
-    );
+    source.add("voxels", &each("proximal", body));
     source
 }
 
@@ -161,8 +150,9 @@ impl DeviceVolumes {
         let shared = walks.shared.clone();
         let gpu = &shared.gpu;
         let Volumes { shape, x, ahead, towards, inside, dual } = volumes;
-        let fragment = fragment_of("the prior", dual.as_ref().map(|dual| dual.fragment.clone()))?;
-        let Some(Dual { weights, steps, p, guide, .. }) = dual else { return Err(gpu.error("no prior")) };
+        let dual = dual.ok_or_else(|| Error::unsupported("the prior on the device", "it has no WGSL"))?;
+        let Dual { fragment, weights, steps, p, guide } = dual;
+        let fragment = fragment_of("the prior", Some(fragment))?;
         let (bytes, most) = (4 * x.len() as u64, gpu.adapter.bound_bytes());
         if bytes > most {
             return Err(gpu.error(format!("a volume takes {bytes} bytes, a buffer holds {most}")));

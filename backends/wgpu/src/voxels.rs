@@ -85,6 +85,19 @@ fn projected(geometry: &Geometry, view: usize) -> [[f32; 4]; 4] {
     [voxels(sub(w.source, lower)), voxels(corner), voxels(w.u), voxels(w.v)]
 }
 
+/// A kernel that runs `body` for each i of a launch, from `begin` to `end` of the uniform buffer `launch`.
+pub(crate) fn each(launch: &str, body: &str) -> String {
+    format!(
+        "@compute @workgroup_size(64)
+fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {{
+    for (var i = {launch}.begin + id.x; i < {launch}.end; i += groups.x * 64u) {{
+        {body}
+    }}
+}}
+"
+    )
+}
+
 fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> Source {
     let mut source = Source::default();
     source.add("projection", include_str!("kernels/project.wgsl"));
@@ -115,21 +128,8 @@ fn walk_visit(voxel: vec3<u32>, weight: f32) {{
         ),
     );
     source.add(name, &fragment.named("walk_"));
-    source.add(
-        "rays",
-        &format!(
-            "@compute @workgroup_size(64)
-fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {{
-    for (var i = projection.begin + id.x; i < projection.end; i += groups.x * 64u) {{
-        let line = line_of(i);
-        {begin}
-        walk_walk(projected(line));
-        {end}
-    }}
-}}
-"
-        ),
-    );
+    let body = format!("let line = line_of(i);\n        {begin}\n        walk_walk(projected(line));\n        {end}");
+    source.add("rays", &each("projection", &body));
     source
 }
 
@@ -206,10 +206,7 @@ impl Room {
 
     /// Adds the numbers of `name` to those of `part`, in order.
     fn add_to(&mut self, shared: &Shared, name: &str, mut part: ArrayViewMut3<'_, f32>) -> Result<()> {
-        self.read(shared, name, part.len(), |found| match part.as_slice_mut() {
-            Some(part) => part.iter_mut().zip(found).for_each(|(p, f)| *p += f),
-            None => part.iter_mut().zip(found).for_each(|(p, f)| *p += f),
-        })
+        self.read(shared, name, part.len(), |found| part.iter_mut().zip(found).for_each(|(p, f)| *p += f))
     }
 }
 
@@ -295,10 +292,7 @@ impl Walks {
             fill(room, slab);
             self.walk(room, &self.forward, uniform, slab)?;
         }
-        room.read(&self.shared, "lines", out.len(), |found| match out.as_slice_mut() {
-            Some(out) => out.copy_from_slice(found),
-            None => out.iter_mut().zip(found).for_each(|(o, l)| *o = *l),
-        })
+        room.read(&self.shared, "lines", out.len(), |found| out.iter_mut().zip(found).for_each(|(o, l)| *o = *l))
     }
 
     /// Adds the adjoint of `lines` for some views that are on the device at once to `volume`, which is `slab`.

@@ -335,7 +335,6 @@ impl Arrays {
         if let Some(resident) = &mut self.resident {
             for part in views.chunks(self.pixels.len_of(Axis(0)).max(1)) {
                 resident.forward(problem.geometry, part, images_mut(&mut self.pixels, part.len()))?;
-                problem.operator.fault()?;
                 differentiate(part, &mut self.pixels);
                 resident.adjoint(problem.geometry, part, images(&self.pixels, part.len()))?;
             }
@@ -556,12 +555,13 @@ impl<'a> Iterate<'a> {
 impl Iteration for Iterate<'_> {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         Zip::from(&mut self.arrays.before).and(&self.arrays.x).par_for_each(|before, x| *before = *x);
-        if self.resides && self.arrays.resident.is_none() {
-            self.arrays.settle(problem, self.projector).transpose()?;
-        }
         // A changed penalty must not count as progress or regress.
         if let Some(value) = self.arrays.adapt()? {
             self.objective = self.misfit + self.lambda * value;
+        }
+        // After a checkpoint.
+        if self.resides && self.arrays.resident.is_none() {
+            self.arrays.settle(problem, self.projector).transpose()?;
         }
         let (mut residual, mut misfit) = (0.0, 0.0);
         let subsets = split(self.views, self.subsets as usize);

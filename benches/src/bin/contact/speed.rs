@@ -17,6 +17,7 @@ use conefield_projectors::voxel::layout::Pinhole;
 use conefield_solvers::losses::L1;
 use ndarray::Array3;
 use serde_json::{Value, json};
+use std::path::PathBuf;
 use std::process::Command;
 use std::time::Instant;
 
@@ -221,10 +222,15 @@ pub fn voxels(asked: &Asked) -> Result<()> {
     Ok(())
 }
 
+/// Where a run of the program writes, until it is removed.
+fn run_folder() -> PathBuf {
+    std::env::temp_dir().join(format!("conefield-contact-{}", std::process::id()))
+}
+
 /// `smooth-tv` on the kit's scan, as a user runs it, on the device and on the CPU: seconds of the whole command and PSNR. A software
 /// device makes one pass per level.
 pub fn classical(asked: &Asked) -> Result<()> {
-    let run = std::env::temp_dir().join(format!("conefield-contact-{}", std::process::id()));
+    let run = run_folder();
     let program = file("conefield")?;
     for backend in [format!("wgpu:{}", asked.adapter), "cpu".into()] {
         let mut command = Command::new(&program);
@@ -255,7 +261,7 @@ pub fn classical(asked: &Asked) -> Result<()> {
 
 /// Sixty seconds of `balanced` on the kit's scan, as a user runs it: the seconds to marks of PSNR, and the last one.
 pub fn training(asked: &Asked) -> Result<()> {
-    let run = std::env::temp_dir().join(format!("conefield-contact-{}", std::process::id()));
+    let run = run_folder();
     let mut command = Command::new(file("conefield")?);
     command.arg("reconstruct").arg(file("scan")?).args(["--spec", "balanced", "--seconds", "60s", "--force"]);
     command.args(["--reference", "truth", "--set", "training.report_every=25", "-q", "-o"]).arg(&run);
