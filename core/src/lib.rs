@@ -7,7 +7,8 @@
 //! - [`loss`], [`prior`]: what training minimizes.
 //! - [`wgsl`]: stages, losses and priors on a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state by name.
-//! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them.
+//! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them; [`finite`]: values
+//!   that must not be.
 //! - [`settings`], [`precision`], [`spec`], [`registry`]: what a user writes, and the available types.
 //! - [`host`]: stages on the host, to inspect a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes; [`resident`]: volumes that stay on a device.
@@ -26,6 +27,7 @@ pub mod data_term;
 pub mod dense;
 pub mod error;
 pub mod files;
+pub mod finite;
 pub mod geometry;
 pub mod half;
 pub mod host;

@@ -1,6 +1,7 @@
 //! Scans (projections with geometry) and volumes (voxels with grid).
 
 use crate::error::{Result, ensure};
+use crate::finite::{first_not, stray};
 use crate::geometry::{Geometry, Vec3, View, VoxelGrid};
 use ndarray::{Array3, ArrayView2, Zip, s};
 use serde::{Deserialize, Serialize};
@@ -97,7 +98,7 @@ impl Scan {
             self.unit.mm,
             "a positive finite number of millimetres",
         )?;
-        if let Some((at, x)) = self.projections.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        if let Some((at, x)) = stray(&self.projections) {
             return Err(crate::Error::invalid(
                 place,
                 format!("projections[{}, {}, {}]", at.0, at.1, at.2),
@@ -105,7 +106,7 @@ impl Scan {
                 "a finite line integral",
             ));
         }
-        if let Some((at, x)) = self.projections.indexed_iter().find(|(_, x)| x.abs() > MOST) {
+        if let Some((at, x)) = first_not(&self.projections, |x| x.abs() <= MOST) {
             let field = format!("projections[{}, {}, {}]", at.0, at.1, at.2);
             let expected = format!("a line integral of at most {MOST:e}, past which single precision overflows");
             return Err(crate::Error::invalid(place, field, format!("{x:e}"), expected));

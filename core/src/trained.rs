@@ -3,6 +3,7 @@
 use crate::allowance;
 use crate::backend::{Backend, Executable};
 use crate::error::{Error, Result, ensure};
+use crate::finite::stray;
 use crate::geometry::VoxelGrid;
 use crate::parts::{Part, Voxels};
 use crate::pipeline::{Model, Pipeline};
@@ -122,7 +123,7 @@ impl Voxels for FieldVoxels<'_> {
 
     fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
         self.sampler.fill(self.model, self.exe.as_mut(), part, out.view_mut())?;
-        match out.indexed_iter().find(|(_, m)| !m.is_finite()) {
+        match stray(&out) {
             None => Ok(()),
             Some(((x, y, z), value)) => {
                 let voxel = [part[0].start + x, part[1].start + y, part[2].start + z];

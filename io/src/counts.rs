@@ -5,6 +5,7 @@
 //! records: `A = −ln((I − d)/(f − d))`.
 
 use conefield_core::error::ensure;
+use conefield_core::finite::stray;
 use conefield_core::{Error, Result};
 use conefield_corrections::filling::Filling;
 use conefield_diagnosis::bad_pixels::{from_fields, outliers};
@@ -144,7 +145,7 @@ impl CountsReport {
 
 fn check_counts(place: &str, counts: &Array3<f32>) -> Result<()> {
     ensure(!counts.is_empty(), place, "counts", format!("{:?}", counts.shape()), "at least one pixel of one view")?;
-    match counts.indexed_iter().find(|(_, x)| !x.is_finite()) {
+    match stray(&counts) {
         Some(((v, r, c), x)) => Err(Error::invalid(place, format!("counts[{v}, {r}, {c}]"), x, "a finite number")),
         None => Ok(()),
     }
@@ -200,7 +201,7 @@ fn check_field(place: &str, field: &str, image: &Array2<f32>, want: [usize; 2]) 
     let expected = format!("{} x {} (rows x columns), as the projections", want[0], want[1]);
     let (rows, columns) = image.dim();
     ensure([rows, columns] == want, place, field, format!("{rows} x {columns}"), expected)?;
-    match image.indexed_iter().find(|(_, x)| !x.is_finite()) {
+    match stray(&image) {
         Some(((r, c), x)) => Err(Error::invalid(place, format!("{field}[{r}, {c}]"), x, "a finite number")),
         None => Ok(()),
     }

@@ -4,6 +4,7 @@
 use crate::affine::Affine;
 use crate::memory;
 use crate::number;
+use conefield_core::finite::stray;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -26,7 +27,7 @@ pub(crate) fn read(place: &str, grid: VoxelGrid, affine: Option<Affine>, values:
     let data = Array3::from_shape_vec((nx, ny, nz).f(), values)
         .map_err(|e| Error::invalid(place, "data", e, "as many values as voxels"))?;
     let data = memory::in_order(place, "data", data)?;
-    if let Some((at, x)) = data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+    if let Some((at, x)) = stray(&data) {
         let voxel = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
         return Err(Error::invalid(place, voxel, x, "a finite number"));
     }

@@ -14,6 +14,7 @@ use crate::input::must_unpack;
 use crate::memory;
 use crate::number::{ByteOrder, Number};
 use conefield_core::error::ensure;
+use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance, files};
 use hdf5_reader::{Dataset, Datatype, FileStorage, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
 use layout::{Found, Layout};
@@ -252,7 +253,7 @@ impl Container {
         shape[0] = count;
         let array = ArrayD::from_shape_vec(IxDyn(&shape), values)
             .map_err(|e| self.invalid(data.name(), e, "values of its shape"))?;
-        match array.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        match stray(&array) {
             Some((at, x)) => Err(self.invalid(&format!("{}{:?}", data.name(), at.slice()), x, "a finite number")),
             None => Ok(array),
         }

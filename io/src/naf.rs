@@ -12,6 +12,7 @@ use crate::scan::DataSet;
 use crate::unit::{self, Reading, Units};
 use crate::{rays, write_atomic};
 use conefield_core::error::ensure;
+use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit, Volume};
@@ -314,7 +315,7 @@ pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volu
     if let Some(v) = volume {
         let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", grid.shape));
         ensure(v.data.shape() == grid.shape, &place, "shape of the volume", found, expected)?;
-        if let Some((at, x)) = v.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        if let Some((at, x)) = stray(&v.data) {
             let field = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
             return Err(Error::invalid(place, field, x, "a finite number"));
         }

@@ -4,6 +4,7 @@ use crate::file_order::{self, FileOrder};
 use crate::input::Input;
 use crate::memory;
 use crate::number::{self, ByteOrder, Number};
+use conefield_core::finite::stray;
 use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
 use ndarray::{Array, ArrayD, Dimension, IxDyn, ShapeBuilder};
@@ -58,7 +59,7 @@ pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
     let array = ArrayD::from_shape_vec(IxDyn(&header.shape).set_f(header.fortran), values)
         .map_err(|e| input.invalid("shape", e, expected()))?;
     let array = memory::in_order(&input.place(), "data", array)?;
-    if let Some((at, x)) = array.indexed_iter().find(|(_, x)| !x.is_finite()) {
+    if let Some((at, x)) = stray(&array) {
         return Err(input.invalid(format!("data{:?}", at.slice()), x, "a finite number"));
     }
     Ok(array)

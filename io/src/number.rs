@@ -65,11 +65,11 @@ impl Number {
 
 /// Writes `values`, little-endian.
 pub(crate) fn write(w: &mut dyn Write, values: &[f32]) -> std::io::Result<()> {
-    let mut raw = Vec::with_capacity(1 << 16);
-    for part in values.chunks(1 << 14) {
-        raw.clear();
-        raw.extend(part.iter().flat_map(|x| x.to_le_bytes()));
-        w.write_all(&raw)?;
+    let mut raw = [[0; 4]; 1 << 14];
+    for part in values.chunks(raw.len()) {
+        let raw = &mut raw[..part.len()];
+        raw.iter_mut().zip(part).for_each(|(raw, x)| *raw = x.to_le_bytes());
+        w.write_all(raw.as_flattened())?;
     }
     Ok(())
 }

@@ -12,6 +12,7 @@ pub(crate) use write::{check_shape, write};
 
 use crate::input::must_unpack;
 use crate::memory;
+use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance, files};
 use ndarray::Array3;
 use std::fs::File;
@@ -64,7 +65,7 @@ fn stack(path: &Path, first: impl FnOnce(&mut Decoder<BufReader<File>>) -> Resul
     })?;
     let all = Array3::from_shape_vec((pages, rows, columns), values)
         .map_err(|e| Error::invalid(&place, "TIFF", e, format!("{rows} x {columns} values per page")))?;
-    match all.indexed_iter().find(|(_, x)| !x.is_finite()) {
+    match stray(&all) {
         Some(((p, r, c), x)) => {
             Err(Error::invalid(place, format!("page {p}, row {r}, column {c}"), x, "a finite number"))
         }

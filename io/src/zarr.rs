@@ -14,6 +14,7 @@ pub(crate) use read::{is_zarr, read, shape};
 
 use crate::affine;
 use crate::{folder, number, write_folder_atomic, write_text_atomic};
+use conefield_core::finite::stray;
 use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
 use flate2::Compression;
@@ -97,7 +98,7 @@ impl Pyramid<'_> {
         if level == 0 {
             let part = std::array::from_fn(|k| at[k] * SIDE..at[k] * SIDE + size[k]);
             voxels.fill(&part, values.view_mut())?;
-            if let Some(((x, y, z), v)) = values.indexed_iter().find(|(_, v)| !v.is_finite()) {
+            if let Some(((x, y, z), v)) = stray(&values) {
                 let voxel: [usize; 3] = [x + at[0] * SIDE, y + at[1] * SIDE, z + at[2] * SIDE];
                 let place = self.path.display().to_string();
                 return Err(Error::invalid(place, format!("voxel {voxel:?}"), v, "a finite number"));

@@ -1,8 +1,8 @@
 //! Refuses inputs on which no metric can be computed, before any work.
 
 use conefield_core::error::{Error, Result, ensure};
-use ndarray::{ArrayView3, Zip};
-use rayon::prelude::*;
+use conefield_core::finite::stray;
+use ndarray::ArrayView3;
 
 const PLACE: &str = "metrics";
 
@@ -22,12 +22,7 @@ pub(crate) fn pair(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f6
 }
 
 fn finite(volume: ArrayView3<f32>, name: &str) -> Result<()> {
-    // The usual case is decided in one parallel pass; the index is searched only if there is one.
-    let ok = volume.axis_iter(ndarray::Axis(0)).into_par_iter().all(|plane| Zip::from(&plane).all(|x| x.is_finite()));
-    if ok {
-        return Ok(());
-    }
-    match volume.indexed_iter().find(|(_, x)| !x.is_finite()) {
+    match stray(&volume) {
         Some(((i, j, k), x)) => Err(Error::invalid(PLACE, format!("{name}[{i}, {j}, {k}]"), x, "a finite value")),
         None => Ok(()),
     }

@@ -2,6 +2,7 @@
 //! label.
 
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::finite::first_not;
 use ndarray::{Array3, ArrayView3};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -38,7 +39,7 @@ pub struct Dice {
 /// The labels of an integer-valued volume. Other values are refused; `place` names the volume in errors.
 pub fn label_map(place: &str, volume: ArrayView3<f32>) -> Result<Array3<u32>> {
     let whole = |x: f32| x.fract() == 0.0 && (0.0..LARGEST).contains(&x);
-    if let Some(((x, y, z), value)) = volume.indexed_iter().find(|(_, v)| !whole(**v)) {
+    if let Some(((x, y, z), value)) = first_not(&volume, whole) {
         let expected = "a label: a whole number from 0 (background) to 16777215";
         return Err(Error::invalid(place, format!("voxel [{x}, {y}, {z}]"), value, expected));
     }

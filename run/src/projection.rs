@@ -1,6 +1,7 @@
 //! Predicted views of a volume, and residuals of measured views.
 
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::registry::{Kind, names};
 use conefield_core::scan::{Scan, Volume};
@@ -72,7 +73,7 @@ pub fn predicted(
     geometry.validate("projection")?;
     let (found, expected) = (format!("{:?}", volume.data.shape()), format!("{:?}", geometry.volume.shape));
     ensure(volume.data.shape() == geometry.volume.shape, "projection", "shape of the volume", found, expected)?;
-    if let Some(((x, y, z), value)) = volume.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+    if let Some(((x, y, z), value)) = stray(&volume.data) {
         return Err(Error::invalid("projection", format!("voxel [{x}, {y}, {z}]"), value, "a finite attenuation"));
     }
     let [rows, columns] = geometry.detector;

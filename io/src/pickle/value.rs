@@ -5,6 +5,7 @@
 
 use super::numpy::{Array, Dtype, Global};
 use crate::memory;
+use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance};
 use ndarray::{ArrayD, Dimension, IxDyn};
 
@@ -295,7 +296,7 @@ impl<'p, 'a> Item<'p, 'a> {
         let values = ArrayD::from_shape_vec(IxDyn(array.stored()), values).map_err(|e| self.invalid(e, expected()))?;
         let values = values.permuted_axes(IxDyn(array.axes()));
         let values = memory::in_order(&self.pickle.place, self.key(), values)?;
-        match values.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        match stray(&values) {
             Some((at, x)) => {
                 Err(Error::invalid(&self.pickle.place, format!("{}{:?}", self.key(), at.slice()), x, "a finite number"))
             }

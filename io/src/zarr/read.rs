@@ -8,6 +8,7 @@ use crate::npy;
 use crate::number::{ByteOrder, Number};
 use crate::text::{Notation, parse, shortened};
 use conefield_core::files::read_text;
+use conefield_core::finite::stray;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result, allowance};
@@ -314,7 +315,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
             from..grid.shape[k].min(from.saturating_add([cx, cy, cz][k]))
         });
         let part = chunk.slice(s![..z.len(), ..y.len(), ..x.len()]);
-        if let Some(((k, j, i), value)) = part.indexed_iter().find(|(_, v)| !v.is_finite()) {
+        if let Some(((k, j, i), value)) = stray(&part) {
             let voxel = [x.start + i, y.start + j, z.start + k];
             let place = path.display().to_string();
             return Err(Error::invalid(place, format!("voxel {voxel:?}"), value, "a finite number"));

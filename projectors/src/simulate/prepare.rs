@@ -1,6 +1,7 @@
 //! Prepares a volume for a simulated scan.
 
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::finite::stray;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use ndarray::Array3;
@@ -83,7 +84,7 @@ impl HuMapping {
 
     /// Maps every voxel. Refuses voxels that are not finite.
     pub fn apply(&self, volume: Volume) -> Result<Volume> {
-        if let Some(((i, j, k), x)) = volume.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        if let Some(((i, j, k), x)) = stray(&volume.data) {
             return Err(Error::invalid("HU mapping", format!("volume[{i}, {j}, {k}]"), x, "a finite value in HU"));
         }
         Ok(volume.mapped(|hu| self.value(hu)))

@@ -5,6 +5,7 @@
 //! clipped to the box and sampled at the midpoints of equal steps.
 
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::finite::stray;
 use conefield_core::geometry::Geometry;
 use conefield_core::scan::Volume;
 use ndarray::Array3;
@@ -91,11 +92,11 @@ impl Sampler {
             }
         }
         if data.iter().any(|x| !x.is_finite()) {
-            let at = volume.data.indexed_iter().find(|(_, x)| !x.is_finite());
+            let at = stray(&volume.data);
             return Err(Error::invalid(
                 "projection",
                 at.map_or("volume".into(), |((i, j, k), _)| format!("volume[{i}, {j}, {k}]")),
-                at.map_or(f32::NAN, |(_, x)| *x),
+                at.map_or(f32::NAN, |(_, x)| x),
                 "a finite value",
             ));
         }

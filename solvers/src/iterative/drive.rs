@@ -9,6 +9,7 @@ use crate::schedule::{Clock, Ends};
 use conefield_core::Error;
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
+use conefield_core::finite::stray;
 use conefield_core::method::{Best, Job, Observer, Reconstruction, Record, Solution};
 use conefield_core::scan::Volume;
 use conefield_core::space::Space;
@@ -266,7 +267,7 @@ const BEST: &str = "best";
 
 /// Refuses a volume with a value that is not finite.
 pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
-    match volume.indexed_iter().find(|(_, x)| !x.is_finite()) {
+    match stray(&volume) {
         Some((at, x)) => Err(Error::Diverged { step, what: format!("voxel {at:?} is {x}") }),
         None => Ok(()),
     }

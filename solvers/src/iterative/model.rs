@@ -135,7 +135,7 @@ impl Model {
         let shape = self.expansion.coefficients().shape;
         let (mut gradient, mut direction) = (space.array(shape), space.array(shape));
         let mut ahead = space.volume();
-        if residual.iter().all(|x| *x == 0.0) {
+        if norm2(residual) == 0.0 {
             return x;
         }
         operator.adjoint(residual.view(), gradient.view_mut());
@@ -149,8 +149,8 @@ impl Model {
                 break;
             }
             let alpha = (gamma / square) as f32;
-            x.scaled_add(alpha, &direction);
-            residual.scaled_add(-alpha, &ahead);
+            Zip::from(&mut x).and(&direction).par_for_each(|x, d| *x += alpha * d);
+            Zip::from(&mut *residual).and(&ahead).par_for_each(|r, a| *r -= alpha * a);
             operator.adjoint(residual.view(), gradient.view_mut());
             let beta = (norm2(&gradient) / gamma) as f32;
             gamma = norm2(&gradient);

@@ -7,6 +7,7 @@ use crate::fit::support;
 use crate::surround::Within;
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
+use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::method::{Job, Observer};
 use conefield_core::scan::{Scan, Volume};
@@ -169,7 +170,7 @@ fn in_mm(job: &Job<'_>, place: &str, volume: Volume) -> Result<Volume> {
     let shape = job.scan.geometry.volume.shape;
     let found = format!("{:?}", volume.data.shape());
     ensure(volume.data.shape() == shape, place, "shape", found, format!("{shape:?}, the voxels of the scan"))?;
-    if let Some((at, x)) = volume.data.indexed_iter().find(|(_, x)| !x.is_finite()) {
+    if let Some((at, x)) = stray(&volume.data) {
         return Err(Error::invalid(place, format!("voxel {at:?}"), x, "a finite attenuation"));
     }
     let mm = job.scan.unit.mm as f32;

@@ -4,11 +4,12 @@ use crate::schedule::{Clock, Ends};
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Executable, StepStats};
 use conefield_core::error::{Error, Result};
+use conefield_core::finite::stray;
 use conefield_core::loss::Loss;
 use conefield_core::method::{Best, DriftRecord, Job, Observer, Record};
 use conefield_core::pipeline::Model;
 use conefield_core::scene::Scene;
-use rayon::prelude::*;
+use ndarray::aview1;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -178,7 +179,7 @@ impl Window {
 pub fn strayed(arena: &Arena) -> Option<String> {
     let parts = [("parameter", &arena.params), ("first moment", &arena.first), ("second moment", &arena.second)];
     parts.into_iter().find_map(|(name, part)| {
-        let (i, x) = part.par_iter().enumerate().find_first(|(_, x)| !x.is_finite())?;
+        let (i, x) = stray(&aview1(part))?;
         Some(format!("{name} {i} is {x}"))
     })
 }

@@ -1,0 +1,46 @@
+//! The search for a value that must not be.
+
+use ndarray::{ArrayBase, Data, Dimension};
+use rayon::prelude::*;
+
+/// Numbers per task.
+const PART: usize = 1 << 16;
+
+/// The first value of `array` that is not finite, with its index.
+pub fn stray<S: Data<Elem = f32>, D: Dimension>(array: &ArrayBase<S, D>) -> Option<(D::Pattern, f32)> {
+    first_not(array, |x| x.is_finite())
+}
+
+/// The first value of `array` that is not `fine`, with its index.
+pub fn first_not<S, D>(array: &ArrayBase<S, D>, fine: impl Fn(f32) -> bool + Sync) -> Option<(D::Pattern, f32)>
+where
+    S: Data<Elem = f32>,
+    D: Dimension,
+{
+    // Nearly all arrays are fine: a fast pass over the memory says so. Only the slow one knows indices.
+    let all = |part: &[f32]| part.iter().fold(true, |all, x| all & fine(*x));
+    if array.as_slice_memory_order().is_some_and(|values| values.par_chunks(PART).all(all)) {
+        return None;
+    }
+    array.indexed_iter().find(|(_, x)| !fine(**x)).map(|(at, x)| (at, *x))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::{Array3, s};
+
+    #[test]
+    fn the_first_stray_value_is_found_in_any_layout() {
+        let mut array = Array3::<f32>::zeros([40, 50, 60]);
+        assert_eq!(stray(&array), None);
+        array[[7, 9, 30]] = f32::NAN;
+        array[[7, 8, 31]] = f32::INFINITY;
+        assert_eq!(stray(&array), Some(((7, 8, 31), f32::INFINITY)));
+        // The transposed array has another first one.
+        assert_eq!(stray(&array.t()).map(|found| found.0), Some((30, 9, 7)));
+        assert_eq!(stray(&array.slice(s![..7, .., ..])), None);
+        assert_eq!(stray(&array.slice(s![.., ..;2, ..])).map(|found| found.0), Some((7, 4, 31)));
+        assert_eq!(first_not(&array, |x| x < 1.0).map(|found| found.0), Some((7, 8, 31)));
+    }
+}
