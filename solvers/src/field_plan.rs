@@ -323,6 +323,7 @@ impl Plan for FieldPlan {
             scene: &scene,
             loss: loss.as_ref(),
             rays: vec![],
+            next: (None, vec![]),
             places: Places::new(&self.priors),
         };
         train(&mut run, &mut task, &mut callbacks)?;
@@ -427,14 +428,25 @@ struct Rays<'a> {
     scene: &'a Scene,
     loss: &'a dyn Loss,
     rays: Vec<TrainRay>,
+    /// The rays of a later step, if they are drawn.
+    next: (Option<u64>, Vec<TrainRay>),
     places: Places<'a>,
 }
 
 impl Task for Rays<'_> {
     fn draw(&mut self, seed: u64, step: u64) -> Draw<'_> {
-        let Self { count, source, scene, loss, rays, places, .. } = self;
-        source.draw(seed, step, *count, rays);
-        Draw { loss: *loss, rays, priors: places.draw(scene, seed, step) }
+        let Self { count, source, scene, loss, rays, next, places, .. } = self;
+        if next.0 == Some(step) {
+            std::mem::swap(rays, &mut next.1);
+        } else {
+            source.draw(seed, step, *count, rays);
+        }
+        let (source, count) = (&*source, *count);
+        let ahead = Box::new(move || {
+            source.draw(seed, step + 1, count, &mut next.1);
+            next.0 = Some(step + 1);
+        });
+        Draw { loss: *loss, rays, priors: places.draw(scene, seed, step), ahead }
     }
 
     fn adam(&self, epoch: f64, share: f64) -> Adam {

@@ -15,7 +15,7 @@ use conefield_core::geometry::{Geometry, sub};
 use conefield_core::resident::{Resident, Volumes};
 use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelView};
 use conefield_core::wgsl::Fragment;
-use ndarray::{ArrayView3, ArrayViewMut3, Axis, s};
+use ndarray::{ArrayView3, ArrayViewMut3, Axis, Ix3, Zip, s};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
@@ -206,8 +206,16 @@ impl Room {
 
     /// Adds the numbers of `name` to those of `part`, in order.
     fn add_to(&mut self, shared: &Shared, name: &str, mut part: ArrayViewMut3<'_, f32>) -> Result<()> {
-        self.read(shared, name, part.len(), |found| part.iter_mut().zip(found).for_each(|(p, f)| *p += f))
+        let shape = part.raw_dim();
+        self.read(shared, name, part.len(), |found| {
+            Zip::from(&mut part).and(shaped(shape, found)).par_for_each(|p, f| *p += f);
+        })
     }
+}
+
+/// Numbers that were read for an array of `shape`.
+fn shaped(shape: Ix3, found: &[f32]) -> ArrayView3<'_, f32> {
+    ArrayView3::from_shape(shape, found).unwrap_or_else(|e| unreachable!("as many numbers as asked for: {e}"))
 }
 
 impl Shared {
@@ -292,7 +300,8 @@ impl Walks {
             fill(room, slab);
             self.walk(room, &self.forward, uniform, slab)?;
         }
-        room.read(&self.shared, "lines", out.len(), |found| out.iter_mut().zip(found).for_each(|(o, l)| *o = *l))
+        let shape = out.raw_dim();
+        room.read(&self.shared, "lines", out.len(), |found| out.assign(&shaped(shape, found)))
     }
 
     /// Adds the adjoint of `lines` for some views that are on the device at once to `volume`, which is `slab`.

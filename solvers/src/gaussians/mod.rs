@@ -401,7 +401,8 @@ struct Whole<'a> {
 
 impl Task for Whole<'_> {
     fn draw(&mut self, seed: u64, step: u64) -> Draw<'_> {
-        Draw { loss: self.loss, rays: &[], priors: self.places.draw(self.scene, seed, step) }
+        let priors = self.places.draw(self.scene, seed, step);
+        Draw { loss: self.loss, rays: &[], priors, ahead: Box::new(|| ()) }
     }
 
     fn adam(&self, epoch: f64, share: f64) -> Adam {

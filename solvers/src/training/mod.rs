@@ -24,6 +24,8 @@ pub struct Draw<'a> {
     pub rays: &'a [TrainRay],
     /// Priors of the field.
     pub priors: Vec<BlockWork<'a>>,
+    /// Prepares the batch of the next step, while this one is computed: a device would wait for it otherwise.
+    pub ahead: Box<dyn FnOnce() + Send + 'a>,
 }
 
 /// The data and the update rule of training.
@@ -71,10 +73,13 @@ pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) 
 /// One step: batch, gradients and, unless a callback refuses it, update.
 fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Result<()> {
     let adam = task.adam(run.epoch(), run.clock.share(run.step));
-    let Draw { loss, rays, priors } = task.draw(run.job.seed, run.step);
+    let Draw { loss, rays, priors, ahead } = task.draw(run.job.seed, run.step);
     let work = Work { step: run.step, seed: run.job.seed, loss, rays, points: &[], priors: &priors };
     let start = Instant::now();
-    let stats = run.exe.step(&mut run.model, &work)?;
+    let stats = rayon::in_place_scope(|scope| {
+        scope.spawn(|_| ahead());
+        run.exe.step(&mut run.model, &work)
+    })?;
     let mut update = Update::Take;
     callbacks.each(|c| {
         if update == Update::Take {
