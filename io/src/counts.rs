@@ -145,7 +145,7 @@ impl CountsReport {
 
 fn check_counts(place: &str, counts: &Array3<f32>) -> Result<()> {
     ensure(!counts.is_empty(), place, "counts", format!("{:?}", counts.shape()), "at least one pixel of one view")?;
-    match stray(&counts) {
+    match stray(counts) {
         Some(((v, r, c), x)) => Err(Error::invalid(place, format!("counts[{v}, {r}, {c}]"), x, "a finite number")),
         None => Ok(()),
     }
@@ -201,7 +201,7 @@ fn check_field(place: &str, field: &str, image: &Array2<f32>, want: [usize; 2]) 
     let expected = format!("{} x {} (rows x columns), as the projections", want[0], want[1]);
     let (rows, columns) = image.dim();
     ensure([rows, columns] == want, place, field, format!("{rows} x {columns}"), expected)?;
-    match stray(&image) {
+    match stray(image) {
         Some(((r, c), x)) => Err(Error::invalid(place, format!("{field}[{r}, {c}]"), x, "a finite number")),
         None => Ok(()),
     }

@@ -267,7 +267,7 @@ const BEST: &str = "best";
 
 /// Refuses a volume with a value that is not finite.
 pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
-    match stray(&volume) {
+    match stray(volume) {
         Some((at, x)) => Err(Error::Diverged { step, what: format!("voxel {at:?} is {x}") }),
         None => Ok(()),
     }
