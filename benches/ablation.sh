@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
 # The parts of the method one after the other on real volumes, at the published rate (1e-3), with the same steps and rays:
-#   bash benches/ablation.sh DATA_FOLDER OUT_FOLDER [STEPS [SEEDS [VOLUMES]]]
+#   bash benches/ablation.sh DATA_FOLDER OUT_FOLDER [STEPS [SEEDS [VOLUMES [BACKEND]]]]
 # DATA_FOLDER holds volumes/*.nii.gz. NAF is the spec naf: 16 levels, leaky ReLU, sigmoid. The others are ni-naf without and with
 # LayerNorm, MCI weights (600 steps on abdomen_128 alone) and the FFT mask. Each has STEPS (900) of 1024 rays with 192 samples inside
 # the volume. Each of SEEDS ("0 1 2") is another noise and another start. OUT_FOLDER/ablation.md has PSNR by steps, mean and half the
-# range over SEEDS; VOLUME.png has the curves. Steps are counted, not timed: other work on the machine changes nothing.
+# range over SEEDS; VOLUME.png has the curves. Steps are counted, not timed: other work on the machine changes nothing. BACKEND "wgpu"
+# trains on a GPU.
 # What is there is not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -14,6 +15,7 @@ out=$2
 steps=${3:-900}
 seeds=${4:-0 1 2}
 volumes=${5:-chest_128 head_256 engine_256}
+backend=${6:-auto}
 cargo build --release --quiet -p conefield
 cargo build --release --quiet -p conefield-benches --bin curves
 bin=${CARGO_TARGET_DIR:-target}/release
@@ -41,7 +43,7 @@ for volume in $volumes; do
             curves+=("$variant=$run")
             [[ -f $run/record.json ]] && continue
             "$bin/conefield" -q reconstruct "$scan" "${set[@]}" "${published[@]}" -o "$run" --force --seed "$seed" --steps "$steps" \
-                --reference truth --set training.report_every=50 >/dev/null
+                --backend "$backend" --reference truth --set training.report_every=50 >/dev/null
             rm -f "$run/volume.nii.gz"
         done
     done
@@ -51,7 +53,7 @@ python3 - "$out" "$steps" "$seeds" "$volumes" "${variants[@]}" <<'PY' | tee "$ou
 import json, statistics, sys
 out, steps, seeds, volumes, *variants = sys.argv[1:]
 steps, seeds = int(steps), seeds.split()
-at = [steps * k // 6 // 50 * 50 for k in range(1, 7)]
+at = [max(50, steps * k // 30 // 50 * 50) for k in (1, 5, 10, 20, 30)]
 print("| | | " + " | ".join(map(str, at)) + " | whole volume | ssim_2d |\n|---|---" + "|---" * (len(at) + 2) + "|")
 for volume in volumes.split():
     for variant in variants:
