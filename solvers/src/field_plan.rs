@@ -436,7 +436,7 @@ struct Rays<'a> {
 impl Task for Rays<'_> {
     fn draw(&mut self, seed: u64, step: u64) -> Draw<'_> {
         let Self { count, source, scene, loss, rays, next, places, .. } = self;
-        if next.0 == Some(step) {
+        if next.0.take() == Some(step) {
             std::mem::swap(rays, &mut next.1);
         } else {
             source.draw(seed, step, *count, rays);
