@@ -54,7 +54,7 @@ import json, statistics, sys
 out, steps, seeds, volumes, *variants = sys.argv[1:]
 steps, seeds = int(steps), seeds.split()
 at = [max(50, steps * k // 30 // 50 * 50) for k in (1, 5, 10, 20, 30)]
-print("| | | " + " | ".join(map(str, at)) + " | whole volume | ssim_2d |\n|---|---" + "|---" * (len(at) + 2) + "|")
+print("| | " + " | ".join(map(str, at)) + " | whole volume | ssim_2d |\n|---" + "|---" * (len(at) + 2) + "|")
 for volume in volumes.split():
     for variant in variants:
         curves, scores = [], []
@@ -65,5 +65,5 @@ for volume in volumes.split():
         of = lambda values: f"{statistics.mean(values):.2f} ± {(max(values) - min(values)) / 2:.2f}"
         cells = [of([curve[step] for curve in curves]) for step in at] + [of([s["psnr"] for s in scores])]
         cells.append(f"{statistics.mean(s['ssim_2d'] for s in scores):.3f}")
-        print(f"| {volume} | {variant} | " + " | ".join(cells) + " |")
+        print(f"| {volume}, {variant} | " + " | ".join(cells) + " |")
 PY

@@ -1,9 +1,9 @@
-"""What one reconstruction knows that another does not: the best mean of the two, found with the reference.
+"""What one reconstruction adds to another: the best mean of the two, found with the reference.
 
 usage: mix.py NAME=A.nii.gz=B.nii.gz=TRUTH.nii.gz ...
 
 Prints a row of a table for each volume: PSNR of A and of B, the correlation of their errors, and the best share of B in a weighted
-mean with its PSNR. A share near 0 means that B's volume holds nothing that A's lacks, whatever weights a method might choose.
+mean with its PSNR. At a share of 0 no weighted mean of the two is better than A.
 """
 import sys
 import nibabel
@@ -27,6 +27,7 @@ for row in sys.argv[1:]:
     dot = lambda x, y: np.sum(x.astype(np.float64) * y)
     correlation = dot(a, b) / np.sqrt(dot(a, a) * dot(b, b))
     difference = b - a
-    share = float(np.clip(-dot(a, difference) / dot(difference, difference), 0, 1))
+    size = dot(difference, difference)
+    share = float(np.clip(-dot(a, difference) / size, 0, 1)) if size > 0 else 0.0
     best = psnr(a + np.float32(share) * difference, peak)
     print(f"| {name} | {psnr(a, peak):.2f} dB | {psnr(b, peak):.2f} dB | {correlation:.2f} | {share:.2f} | {best:.2f} dB |")

@@ -1,4 +1,4 @@
-//! The search for a value that must not be.
+//! Searches arrays for values that are not allowed, such as NaN.
 
 use ndarray::{ArrayBase, Data, Dimension};
 use rayon::prelude::*;

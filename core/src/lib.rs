@@ -7,8 +7,8 @@
 //! - [`loss`], [`prior`]: what training minimizes.
 //! - [`wgsl`]: stages, losses and priors on a GPU.
 //! - [`arena`]: parameters, gradients and optimizer state by name.
-//! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them; [`finite`]: values
-//!   that must not be.
+//! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them; [`finite`]: the
+//!   search for values that are not allowed.
 //! - [`settings`], [`precision`], [`spec`], [`registry`]: what a user writes, and the available types.
 //! - [`host`]: stages on the host, to inspect a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes; [`resident`]: volumes that stay on a device.

@@ -9,7 +9,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
-use ndarray::{Array3, ArrayViewMut3, ShapeBuilder};
+use ndarray::{Array3, ArrayViewMut3, ShapeBuilder, aview1};
 use std::io::Write;
 use std::path::Path;
 
@@ -67,13 +67,13 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels, ord
         let slab = ArrayViewMut3::from_shape(layout, values)
             .map_err(|e| Error::invalid(path.display().to_string(), "shape", e, "a shape that can be addressed"))?;
         voxels.fill(&part, slab)?;
-        if let Some(i) = values.iter().position(|x| !x.is_finite()) {
+        if let Some((i, x)) = stray(&aview1(values)) {
             let at = match order {
                 FileOrder::XFastest => [i % size[0], along + i / size[0] % size[1], from + i / (size[0] * size[1])],
                 FileOrder::ZFastest => [from + i / (size[1] * size[2]), along + i / size[2] % size[1], i % size[2]],
             };
             let place = path.display().to_string();
-            return Err(Error::invalid(place, format!("voxel {at:?}"), values[i], "a finite number"));
+            return Err(Error::invalid(place, format!("voxel {at:?}"), x, "a finite number"));
         }
         number::write(w, values).map_err(|e| Error::io(path, e))?;
     }

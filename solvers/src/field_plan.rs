@@ -428,7 +428,7 @@ struct Rays<'a> {
     scene: &'a Scene,
     loss: &'a dyn Loss,
     rays: Vec<TrainRay>,
-    /// The rays of a later step, if they are drawn.
+    /// The rays of the next step, with its number if they are drawn.
     next: (Option<u64>, Vec<TrainRay>),
     places: Places<'a>,
 }

@@ -80,6 +80,9 @@ impl Sampler {
             format!("{:?}", volume.data.shape()),
             format!("{:?}, the shape of its grid", grid.shape),
         )?;
+        if let Some(((i, j, k), x)) = stray(&volume.data) {
+            return Err(Error::invalid("projection", format!("volume[{i}, {j}, {k}]"), x, "a finite value"));
+        }
         let [nx, ny, nz] = grid.shape;
         let padded = [nx + 2, ny + 2, nz + 2];
         let mut data = Vec::with_capacity(padded[0] * padded[1] * padded[2]);
@@ -90,15 +93,6 @@ impl Sampler {
                 data.extend((0..nz).map(row));
                 data.push(row(nz - 1));
             }
-        }
-        if data.iter().any(|x| !x.is_finite()) {
-            let at = stray(&volume.data);
-            return Err(Error::invalid(
-                "projection",
-                at.map_or("volume".into(), |((i, j, k), _)| format!("volume[{i}, {j}, {k}]")),
-                at.map_or(f32::NAN, |(_, x)| x),
-                "a finite value",
-            ));
         }
         let blocks = padded.map(|n| n.div_ceil(BLOCK));
         let mut occupied = vec![false; blocks.iter().product()];

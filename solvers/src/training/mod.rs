@@ -24,7 +24,7 @@ pub struct Draw<'a> {
     pub rays: &'a [TrainRay],
     /// Priors of the field.
     pub priors: Vec<BlockWork<'a>>,
-    /// Prepares the batch of the next step, while this one is computed: a device would wait for it otherwise.
+    /// Prepares the batch of the next step while this one is computed, so that a device need not wait for it.
     pub ahead: Box<dyn FnOnce() + Send + 'a>,
 }
 
