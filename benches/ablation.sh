@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # The parts of the method one after the other on real volumes, at the published rate (1e-3), with the same steps and rays:
-#   bash benches/ablation.sh DATA_FOLDER OUT_FOLDER [STEPS [SEEDS [VOLUMES [BACKEND]]]]
-# DATA_FOLDER holds volumes/*.nii.gz. NAF is the spec naf: 16 levels, leaky ReLU, sigmoid. The others are ni-naf without and with
-# LayerNorm, MCI weights (600 steps on abdomen_128 alone) and the FFT mask. Each has STEPS (900) of 1024 rays with 192 samples inside
-# the volume. Each of SEEDS ("0 1 2") is another noise and another start. OUT_FOLDER/ablation.md has PSNR by steps, mean and half the
-# range over SEEDS; VOLUME.png has the curves. Steps are counted, not timed: other work on the machine changes nothing. BACKEND "wgpu"
-# trains on a GPU.
+#   bash benches/ablation.sh DATA_FOLDER OUT_FOLDER [STEPS [SEEDS [VOLUMES [BACKEND [VARIANTS]]]]]
+# DATA_FOLDER holds volumes/*.nii.gz. Of VARIANTS, NAF is the spec naf: 16 levels, leaky ReLU, sigmoid. The others are ni-naf without
+# and with LayerNorm (LN), MCI weights and the FFT mask. MCI weights come from 600 steps on abdomen_128, for the abdomen from chest_128;
+# +LN+MCI@VOLUME,VOLUME:STEPS takes others. Each has STEPS (900) of 1024 rays with 192 samples inside the volume. Each of SEEDS
+# ("0 1 2") is another noise and another start. OUT_FOLDER/ablation.md has PSNR by steps, mean and half the range over SEEDS; VOLUME.png
+# has the curves. Steps are counted, not timed: other work on the machine changes nothing. BACKEND "wgpu" trains on a GPU.
 # What is there is not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -20,14 +20,22 @@ cargo build --release --quiet -p conefield
 cargo build --release --quiet -p conefield-benches --bin curves
 bin=${CARGO_TARGET_DIR:-target}/release
 mkdir -p "$out"
-weights=$out/abdomen.safetensors
+read -ra variants <<<"${7:-NAF field +LN +LN+MCI +LN+MCI+mask}"
 whole='callbacks=["rollback"]'
 published=(--set optimizer.lr=1e-3 --set projector.samples=192)
-[[ -f $weights ]] || "$bin/conefield" -q pretrain "$data/volumes/abdomen_128.nii.gz" --spec ni-naf --set "$whole" \
-    "${published[@]}" --steps 600 -o "$weights"
-variants=(NAF field +LN +LN+MCI +LN+MCI+mask)
+# MCI weights of volumes, named VOLUME,VOLUME:STEPS.
+weights() {
+    local file=$out/$1.safetensors from
+    IFS=, read -ra from <<<"${1%:*}"
+    from=("${from[@]/#/$data/volumes/}")
+    [[ -f $file ]] || "$bin/conefield" -q pretrain "${from[@]/%/.nii.gz}" --spec ni-naf --set "$whole" "${published[@]}" \
+        --steps "${1#*:}" -o "$file" >/dev/null
+    echo "$file"
+}
 for volume in $volumes; do
     curves=()
+    mci=abdomen_128:600
+    [[ $volume == abdomen_128 ]] && mci=chest_128:600
     for seed in $seeds; do
         scan=$out/scan-$volume-$seed
         published_scan "$data" "$volume" "$scan" 50 "$seed"
@@ -36,8 +44,12 @@ for volume in $volumes; do
             NAF) set=(--spec naf) ;;
             field) set=(--spec ni-naf --set 'normalizers=[]' --set "$whole") ;;
             +LN) set=(--spec ni-naf --set "$whole") ;;
-            +LN+MCI) set=(--spec ni-naf --set "$whole" --init "$weights") ;;
-            +LN+MCI+mask) set=(--spec ni-naf --init "$weights") ;;
+            +LN+MCI) set=(--spec ni-naf --set "$whole" --init "$(weights "$mci")") ;;
+            +LN+MCI@*) set=(--spec ni-naf --set "$whole" --init "$(weights "${variant#*@}")") ;;
+            +LN+MCI+mask) set=(--spec ni-naf --init "$(weights "$mci")") ;;
+            +LN+mask) set=(--spec ni-naf) ;;
+            field+mask) set=(--spec ni-naf --set 'normalizers=[]') ;;
+            *) echo "$0: no variant $variant" >&2 && exit 2 ;;
             esac
             run=$out/$volume-$seed-$variant
             curves+=("$variant=$run")

@@ -5,11 +5,21 @@
 
 use bytemuck::Pod;
 use memmap2::MmapMut;
+use rayon::prelude::*;
 use std::fmt;
 use std::ops::{Deref, DerefMut};
 
 /// Smaller slices use plain pages.
 const WORTH_IT: usize = 1 << 21;
+
+/// Numbers per task of a copy.
+const PART: usize = 1 << 18;
+
+/// Copies `from` to `to`, of the same length, on all threads.
+pub fn copy<T: Pod + Send + Sync>(to: &mut [T], from: &[T]) {
+    debug_assert_eq!(to.len(), from.len());
+    to.par_chunks_mut(PART).zip(from.par_chunks(PART)).for_each(|(to, from)| to.copy_from_slice(from));
+}
 
 /// A slice of numbers of fixed length, initially zero.
 pub struct Pages<T: Pod = f32>(Storage<T>);
@@ -60,10 +70,10 @@ impl<T: Pod> Default for Pages<T> {
     }
 }
 
-impl<T: Pod> Clone for Pages<T> {
+impl<T: Pod + Send + Sync> Clone for Pages<T> {
     fn clone(&self) -> Self {
         let mut new = Self::zeros(self.len());
-        new.copy_from_slice(self);
+        copy(&mut new, self);
         new
     }
 }

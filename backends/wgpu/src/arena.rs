@@ -7,13 +7,14 @@ use crate::kernel::Buffers;
 use crate::wave::MOST_GROUPS;
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
+use conefield_core::pages::copy;
 use std::ops::Range;
 
 /// The arena's parts, by the names under which kernels know them.
 pub const PARTS: [&str; 4] = ["params", "grads", "first", "second"];
 
 /// Bytes that are copied to or from the device at once.
-const PIECE: u64 = 16 << 20;
+pub const PIECE: u64 = 16 << 20;
 
 /// Which numbers of the arena a buffer holds.
 pub fn segment(chain: &Chain, s: usize, params: usize, size: usize) -> Range<usize> {
@@ -95,10 +96,15 @@ fn copy_dense(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncod
     }
 }
 
-/// Brings the arena back from the device.
-pub fn download(gpu: &Gpu, buffers: &Buffers, chain: &Chain, arena: &mut Arena, size: usize) -> Result<()> {
-    use wgpu::BufferUsages as U;
-    let staging = gpu.buffer("staging", PIECE.min(4 * arena.params.len() as u64), U::MAP_READ | U::COPY_DST)?;
+/// Brings the arena back from the device by way of `staging`, which holds [`PIECE`] bytes or the longest part.
+pub fn download(
+    gpu: &Gpu,
+    buffers: &Buffers,
+    chain: &Chain,
+    arena: &mut Arena,
+    size: usize,
+    staging: &wgpu::Buffer,
+) -> Result<()> {
     let parts = [&mut arena.params, &mut arena.grads, &mut arena.first, &mut arena.second];
     for (part, data) in PARTS.iter().zip(parts) {
         for s in 0..chain.segments() {
@@ -107,9 +113,9 @@ pub fn download(gpu: &Gpu, buffers: &Buffers, chain: &Chain, arena: &mut Arena, 
             for (i, piece) in data[range].chunks_mut(PIECE as usize / 4).enumerate() {
                 let bytes = 4 * piece.len() as u64;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
-                encoder.copy_buffer_to_buffer(buffer, i as u64 * PIECE, &staging, 0, bytes);
+                encoder.copy_buffer_to_buffer(buffer, i as u64 * PIECE, staging, 0, bytes);
                 gpu.queue.submit([encoder.finish()]);
-                gpu.read(&staging, bytes, |found| bytemuck::cast_slice_mut(piece).copy_from_slice(found))?;
+                gpu.read(staging, bytes, |found| copy(bytemuck::cast_slice_mut(piece), found))?;
             }
         }
     }

@@ -15,6 +15,7 @@ use conefield_core::pipeline::Model;
 use conefield_core::prior::Prior;
 use conefield_core::stage::{Projector, UnitRay};
 use conefield_core::wgsl::Fragment;
+use rayon::prelude::*;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
@@ -123,6 +124,8 @@ pub struct Wgpu {
     loaded: bool,
     /// Gradients there are known to be zero.
     clean: bool,
+    /// The last update's commands, submitted with the next ones: a step is one submission.
+    update: Option<wgpu::CommandEncoder>,
     /// Rows that a wave may have.
     pace: Pace,
     /// Rows that it may come to have.
@@ -148,6 +151,7 @@ impl Wgpu {
             buffers: Buffers::default(),
             loaded: false,
             clean: false,
+            update: None,
             pace: Pace::new(FIRST_ROWS.min(most), LEAST_ROWS, most),
             most,
             room: 0,
@@ -234,6 +238,21 @@ impl Wgpu {
         Ok(())
     }
 
+    /// Compiles the kernels of a step at the same time: drivers take up to a second for each.
+    fn compile(&mut self) -> Result<()> {
+        let Shared { gpu, kernels, .. } = &*self.shared;
+        let of_step = |label: &str| !["evaluate", "encode", "lines"].contains(&label);
+        let compiled: Result<Vec<_>> = self
+            .kernels
+            .sources
+            .par_iter()
+            .filter(|(label, _)| of_step(label) && !self.compiled.contains_key(*label))
+            .map(|(label, source)| Ok((label.clone(), kernels.get(gpu, label, source)?)))
+            .collect();
+        self.compiled.extend(compiled?);
+        Ok(())
+    }
+
     /// The kernel called `label`, compiled.
     fn kernel(&mut self, label: &str) -> Result<Arc<Kernel>> {
         if let Some(kernel) = self.compiled.get(label) {
@@ -254,6 +273,16 @@ impl Wgpu {
             self.bound.insert(label.into(), group);
         }
         Ok((kernel, self.bound[label].clone()))
+    }
+
+    /// Binds Adam's kernel to the arena's buffers `s`.
+    fn own(&mut self, kernel: &Kernel, s: usize) -> Result<wgpu::BindGroup> {
+        let label = format!("adam_{s}");
+        if !self.bound.contains_key(&label) {
+            let group = kernel.bind_as(&self.shared.gpu, |part| self.buffers.get(&format!("{part}_{s}")))?;
+            self.bound.insert(label.clone(), group);
+        }
+        Ok(self.bound[&label].clone())
     }
 
     /// Composes the kernels of the work's loss and priors, unless they are those of the step before.
@@ -292,8 +321,17 @@ impl Wgpu {
         Ok(())
     }
 
-    fn encoder(&self) -> wgpu::CommandEncoder {
-        self.gpu().device.create_command_encoder(&Default::default())
+    /// An encoder of commands, which begin with those of an update that waits.
+    fn encoder(&mut self) -> wgpu::CommandEncoder {
+        let waiting = self.update.take();
+        waiting.unwrap_or_else(|| self.gpu().device.create_command_encoder(&Default::default()))
+    }
+
+    /// Submits an update that waits.
+    fn flush(&mut self) {
+        if let Some(update) = self.update.take() {
+            self.gpu().queue.submit([update.finish()]);
+        }
     }
 
     /// Adds a copy of the beginning of `name` to `encoder`, for [`Wgpu::read`].
@@ -450,6 +488,9 @@ impl Executable for Wgpu {
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats> {
         self.learn_by(work)?;
         self.load(model)?;
+        if !self.compiled.contains_key("forward") {
+            self.compile()?;
+        }
         let started = Instant::now();
         let mut encoder = self.encoder();
         if !self.clean {
@@ -497,6 +538,8 @@ impl Executable for Wgpu {
 
     fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()> {
         self.load(model)?;
+        // Its rules, which this one replaces, are written at its submission.
+        self.flush();
         let (bias1, bias2) = (1.0 - adam.beta1.powf(adam.step as f64), 1.0 - adam.beta2.powf(adam.step as f64));
         let size = self.shared.target().segment;
         let kernel = self.kernel("adam")?;
@@ -514,22 +557,15 @@ impl Executable for Wgpu {
                 eps: adam.eps as f32,
             };
             self.write(&format!("rule_{s}"), bytemuck::bytes_of(&rule))?;
-            let own = arena::PARTS.iter().chain(["rule"].iter());
-            let names: Vec<(&str, String)> = own.map(|p| (*p, format!("{p}_{s}"))).collect();
-            let find = |name: &str| {
-                let own = names.iter().find(|(part, _)| *part == name).map_or(name, |(_, own)| own);
-                self.buffers.get(own)
-            };
-            let bound = kernel.bind_as(&self.shared.gpu, find)?;
+            let bound = self.own(&kernel, s)?;
             let timestamp_writes = self.profile.as_mut().and_then(|p| p.around("adam"));
             let mut pass =
                 encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("adam"), timestamp_writes });
             kernel.launch(&mut pass, &bound, count.div_ceil(256).clamp(1, MOST_GROUPS) as u32);
         }
         arena::refresh(&self.shared, &self.buffers, &self.chain, &mut encoder)?;
-        self.gpu().queue.submit([encoder.finish()]);
+        self.update = Some(encoder);
         self.clean = true;
-        self.collect()?;
         self.gpu().fault()
     }
 
@@ -589,12 +625,16 @@ impl Executable for Wgpu {
         if !self.loaded {
             return Ok(());
         }
+        self.flush();
+        let longest = 4 * model.arena.params.len() as u64;
+        self.reserve("staging", arena::PIECE.min(longest), U::MAP_READ | U::COPY_DST)?;
+        let Some(staging) = self.buffers.get("staging") else { return self.gpu().wait() };
         let size = self.shared.target().segment;
-        arena::download(self.gpu(), &self.buffers, &self.chain, &mut model.arena, size)
+        arena::download(self.gpu(), &self.buffers, &self.chain, &mut model.arena, size, staging)
     }
 
     fn renew(&mut self) {
-        self.loaded = false;
+        (self.loaded, self.update) = (false, None);
         self.bound.clear();
     }
 }

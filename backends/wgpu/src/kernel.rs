@@ -24,12 +24,13 @@ pub struct Cache(Mutex<HashMap<String, Arc<Kernel>>>);
 impl Cache {
     /// The kernel of `source`, compiled now unless it has been before.
     pub fn get(&self, gpu: &Gpu, label: &str, source: &Source) -> Result<Arc<Kernel>> {
-        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(kernel) = known.get(source.text()) {
+        let known = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(kernel) = known().get(source.text()) {
             return Ok(kernel.clone());
         }
+        // Others may compile at the same time.
         let kernel = Arc::new(compile(gpu, label, source)?);
-        known.insert(source.text().into(), kernel.clone());
+        known().insert(source.text().into(), kernel.clone());
         Ok(kernel)
     }
 }

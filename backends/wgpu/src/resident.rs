@@ -9,6 +9,7 @@ use crate::source::{Access, Source};
 use crate::voxels::{ARRAY, Room, Walks, each};
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::Geometry;
+use conefield_core::pages::copy;
 use conefield_core::regularizer::Dual;
 use conefield_core::resident::{Factors, Resident, Volumes};
 use conefield_core::wgsl::Fragment;
@@ -207,7 +208,7 @@ impl DeviceVolumes {
     }
 
     fn download(&mut self, name: &str, to: &mut [f32]) -> Result<()> {
-        self.voxels.read(&self.walks.shared, name, to.len(), |found| to.copy_from_slice(found))
+        self.voxels.read(&self.walks.shared, name, to.len(), |found| copy(to, found))
     }
 }
 

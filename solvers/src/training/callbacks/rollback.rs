@@ -16,7 +16,7 @@ use conefield_core::backend::{StepStats, Work};
 use conefield_core::checkpoint::tensors_of;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::loss::Loss;
-use conefield_core::pages::Pages;
+use conefield_core::pages::{Pages, copy};
 use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
 use ndarray::{ArrayView2, Axis};
@@ -226,7 +226,7 @@ impl Guard {
         }
         let Arena { params, first, second, .. } = &run.model.arena;
         match &mut self.copy {
-            Some(copy) => copy.iter_mut().zip([params, first, second]).for_each(|(c, p)| c.copy_from_slice(p)),
+            Some(kept) => kept.iter_mut().zip([params, first, second]).for_each(|(k, p)| copy(k, p)),
             None => self.copy = Some([params, first, second].map(Pages::clone)),
         }
         self.watched.kept = Some([run.step, run.tally.updates]);
@@ -236,7 +236,7 @@ impl Guard {
     /// Restores the last good state and reports it, or gives up.
     fn back(&mut self, what: &str, run: &mut Run<'_>) -> Result<Update> {
         let step = run.step;
-        let (Some(copy), Some([at, updates])) = (&self.copy, self.watched.kept) else {
+        let (Some(kept), Some([at, updates])) = (&self.copy, self.watched.kept) else {
             return Err(Error::Diverged { step, what: format!("{what}; {HINT}") });
         };
         if run.tally.rollbacks >= self.times {
@@ -244,7 +244,7 @@ impl Guard {
             return Err(Error::Diverged { step, what: format!("{what}; {HINT}") });
         }
         let Arena { params, grads, first, second } = &mut run.model.arena;
-        [params, first, second].into_iter().zip(copy).for_each(|(p, c)| p.copy_from_slice(c));
+        [params, first, second].into_iter().zip(kept).for_each(|(p, k)| copy(p, k));
         grads.fill(0.0);
         run.exe.renew();
         run.tally.updates = updates;
