@@ -3,7 +3,8 @@
 #   bash benches/truncated.sh DATA_FOLDER OUT_FOLDER [SECONDS [SPECS]]
 # DATA_FOLDER holds volumes/abdomen_128.nii.gz. The detector is half as wide as the published one, the volume to reconstruct the
 # 64 x 64 x 128 voxels that all views see. Fields train for SECONDS (60); methods on voxels end by themselves. A row each: PSNR and
-# ssim_2d over that volume and the seconds of the command, without and with scene.surround, and with all 128 x 128 x 128 voxels.
+# ssim_2d over that volume and the seconds of the command: without and with scene.surround, with all 128 x 128 x 128 voxels (whole), and
+# with both.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 data=$1
@@ -47,15 +48,15 @@ PY
 cut "$whole/truth.nii.gz" "$out/truth.nii"
 for spec in $specs; do
     case $spec in naf | ni-naf* | nerf | dense | accurate | balanced | fast) ends=(--seconds "${seconds}s") ;; *) ends=() ;; esac
-    for way in without with whole; do
+    for way in without with whole both; do
         scan=$middle
         sets=()
-        [[ $way != with ]] || sets=(--set 'scene.surround={ coarse = {} }')
-        [[ $way != whole ]] || scan=$whole
+        [[ $way != with && $way != both ]] || sets=(--set 'scene.surround={ coarse = {} }')
+        [[ $way != whole && $way != both ]] || scan=$whole
         run=$out/$spec-$way
         "$bin" -q reconstruct "$scan" --spec "$spec" -o "$run" --force "${ends[@]}" "${sets[@]}" >/dev/null
         volume=$run/volume.nii.gz
-        [[ $way != whole ]] || { cut "$volume" "$run/middle.nii" && volume=$run/middle.nii; }
+        [[ $scan != "$whole" ]] || { cut "$volume" "$run/middle.nii" && volume=$run/middle.nii; }
         "$bin" evaluate "$volume" "$out/truth.nii" --json >"$run/scores.json"
         python3 - "$run" <<'PY'
 import json, sys
@@ -65,4 +66,4 @@ json.dump({"scores": scores, "total_s": record["total_s"]}, open(f"{run}/scored.
 PY
     done
 done
-python3 benches/spread.py "$out/{row}-{column}/scored.json" "$specs" "without with whole" 0 | tee "$out/truncated.md"
+python3 benches/spread.py "$out/{row}-{column}/scored.json" "$specs" "without with whole both" 0 | tee "$out/truncated.md"
