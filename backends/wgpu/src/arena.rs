@@ -1,4 +1,4 @@
-//! Parameters, gradients and moments on the device, in as many buffers as its limits ask for.
+//! Parameters, gradients and moments on the device, in one buffer each or in several, as its limits require.
 
 use crate::Shared;
 use crate::compose::{self, Chain};
@@ -10,19 +10,19 @@ use conefield_core::error::Result;
 use conefield_core::pages::copy;
 use std::ops::Range;
 
-/// The arena's parts, by the names under which kernels know them.
+/// The arena's parts, by their names in kernels.
 pub const PARTS: [&str; 4] = ["params", "grads", "first", "second"];
 
 /// Bytes that are copied to or from the device at once.
 pub const PIECE: u64 = 16 << 20;
 
-/// Which numbers of the arena a buffer holds.
+/// The range of the arena in buffer `s`.
 pub fn segment(chain: &Chain, s: usize, params: usize, size: usize) -> Range<usize> {
     debug_assert!(s < chain.segments());
     s * size..((s + 1) * size).min(params)
 }
 
-/// Makes the buffers of `params` parameters, `size` in each.
+/// Creates buffers for `params` parameters, `size` in each.
 pub fn allocate(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, params: usize, size: usize) -> Result<()> {
     use wgpu::BufferUsages as U;
     for part in PARTS {
@@ -43,7 +43,7 @@ pub fn allocate(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, params: usize, 
     Ok(())
 }
 
-/// Takes the arena to the device.
+/// Uploads the arena.
 pub fn upload(shared: &Shared, buffers: &Buffers, chain: &Chain, arena: &Arena) -> Result<()> {
     let (gpu, size) = (&shared.gpu, shared.target().segment);
     let parts = [&arena.params, &arena.grads, &arena.first, &arena.second];
@@ -53,7 +53,7 @@ pub fn upload(shared: &Shared, buffers: &Buffers, chain: &Chain, arena: &Arena) 
             let bytes: &[u8] = bytemuck::cast_slice(&data[segment(chain, s, data.len(), size)]);
             for (i, piece) in bytes.chunks(PIECE as usize).enumerate() {
                 gpu.queue.write_buffer(buffer, i as u64 * PIECE, piece);
-                // Hands the piece over, so that not all of them wait in memory at once.
+                // Submits the piece, so that not all pieces wait in memory at once.
                 gpu.queue.submit([]);
             }
         }
@@ -64,7 +64,7 @@ pub fn upload(shared: &Shared, buffers: &Buffers, chain: &Chain, arena: &Arena) 
     gpu.fault()
 }
 
-/// Renews the copies that kernels read parameters from: those that every row reads, and tables in halves.
+/// Updates the copies from which kernels read parameters: those that every row reads, and half-precision tables.
 pub fn refresh(shared: &Shared, buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder) -> Result<()> {
     let (gpu, size) = (&shared.gpu, shared.target().segment);
     copy_dense(buffers, chain, encoder, size);
@@ -96,7 +96,7 @@ fn copy_dense(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncod
     }
 }
 
-/// Brings the arena back from the device by way of `staging`, which holds [`PIECE`] bytes or the longest part.
+/// Downloads the arena through `staging`, which holds [`PIECE`] bytes or the longest part.
 pub fn download(
     gpu: &Gpu,
     buffers: &Buffers,

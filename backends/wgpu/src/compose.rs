@@ -19,29 +19,29 @@ use conefield_core::wgsl::{self, Fragment, RANDOM, RAY, Sum};
 use std::fmt::Write;
 use std::ops::Range;
 
-/// Rows of a group.
+/// Rows per group.
 pub const GROUP: u32 = 64;
 
-/// Shares of the rows whose partial sums one invocation of `merge` adds up.
+/// Number of partial sums that one invocation of `merge` adds.
 const MERGED: usize = 32;
 
-/// Channels that a stage may keep.
+/// Maximum number of channels that a stage keeps.
 const MOST_KEPT: usize = 1 << 16;
 
-/// What of the device the text of kernels depends on.
+/// Properties of the device on which the text of kernels depends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Target {
-    /// How gradients of scattered parameters are added up.
+    /// How gradients of scattered parameters are added.
     pub atomics: Atomics,
-    /// Whether lanes of a subgroup add up first what goes to the same entry.
+    /// Whether lanes of a subgroup first combine what they add to the same entry.
     pub subgroups: bool,
-    /// Parameters that one buffer holds, a multiple of 64.
+    /// Parameters per buffer, a multiple of 64.
     pub segment: usize,
     /// Bytes of the largest uniform buffer.
     pub uniform_bytes: usize,
 }
 
-/// What stages do in a kernel.
+/// The task of stages in a kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Pass {
     /// Forward, keeping nothing.
@@ -52,19 +52,19 @@ enum Pass {
     Backward,
 }
 
-/// A stage on its way into kernels.
+/// A stage as kernels include it.
 #[derive(Debug, Clone)]
 pub struct Link {
     /// Its name and type, for messages.
     pub name: String,
-    /// How its functions' names begin.
+    /// Prefix of its functions' names.
     prefix: String,
     fragment: Fragment,
     /// Widths and counts.
     pub info: Info,
     /// Its parameters in the arena.
     range: Range<usize>,
-    /// Where its parameters stand among those that every row reads; `None` where rows read few of them.
+    /// Position of its parameters among those that every row reads; `None` if a row reads few of them.
     dense: Option<usize>,
     /// Its first channel on the tape.
     tape: usize,
@@ -80,11 +80,11 @@ struct RowSum {
     partial: usize,
 }
 
-/// The stages that do work, in order, with all that kernels need of them.
+/// The stages that do work, in order, and what kernels need to know about them.
 #[derive(Debug, Clone)]
 pub struct Chain {
     links: Vec<Link>,
-    /// Whether the first link is the encoder, or the encoder hands on positions as they are.
+    /// Whether the first link is the encoder; otherwise the encoder passes positions on unchanged.
     encoder: bool,
     /// Parameters that every row reads.
     dense: usize,
@@ -96,12 +96,12 @@ pub struct Chain {
     blocks: Vec<String>,
     /// Parameters of the arena.
     params: usize,
-    /// How parameters are read whose gradients are scattered.
+    /// Storage precision of parameters with scattered gradients.
     tables: Tables,
     target: Target,
 }
 
-/// The fragment that the stage called `name` offers; refuses one without, and one whose names could meet those of another.
+/// The WGSL of the stage called `name`. Refuses a stage without WGSL, and names that could collide with another stage's.
 pub(crate) fn fragment_of(name: &str, fragment: Option<Fragment>) -> Result<Fragment> {
     let refused = |why: &str| Error::unsupported(format!("{name} on the wgpu backend"), why);
     let fragment = fragment.ok_or_else(|| refused("the stage offers no WGSL; it runs with --backend cpu"))?;
@@ -114,7 +114,7 @@ pub(crate) fn fragment_of(name: &str, fragment: Option<Fragment>) -> Result<Frag
 }
 
 impl Chain {
-    /// The stages of a pipeline; refuses those that cannot run on a GPU.
+    /// The stages of a pipeline. Refuses stages that cannot run on a GPU.
     pub fn new(pipeline: &Pipeline, target: Target) -> Result<Self> {
         let mut chain = Self {
             links: vec![],
@@ -139,7 +139,7 @@ impl Chain {
         Ok(chain)
     }
 
-    /// One stage alone, with all that it can do.
+    /// One stage alone, with all its functions.
     pub fn single(stage: &dyn Stage, tables: Tables, target: Target) -> Result<Self> {
         let params = stage.info().params;
         let (links, sums, blocks) = (vec![], vec![], vec![]);
@@ -197,13 +197,13 @@ impl Chain {
         &self.links
     }
 
-    /// How the copy of the parameters is rounded that tables are read from; `None` where they are read as they are.
+    /// Precision of the copy from which tables are read; `None` if there is no copy.
     pub fn halves(&self) -> Option<Tables> {
         let scattered = self.links.iter().any(|l| l.info.grads == GradKind::Scatter);
         (scattered && self.tables != Tables::F32).then_some(self.tables)
     }
 
-    /// The ranges of the arena that the copy for every row holds, each with its place there.
+    /// The ranges of the arena in the copy that every row reads, each with its position in the copy.
     pub fn dense_ranges(&self) -> impl Iterator<Item = (usize, Range<usize>)> {
         self.links.iter().filter_map(|l| Some((l.dense?, l.range.clone())))
     }
@@ -213,12 +213,12 @@ impl Chain {
         16 * self.dense.div_ceil(4) as u64
     }
 
-    /// Buffers that the arena is cut into.
+    /// Number of buffers per part of the arena.
     pub fn segments(&self) -> usize {
         self.params.div_ceil(self.target.segment).max(1)
     }
 
-    /// Channels of the features that `forward` keeps for `backward`; 0 where the encoder has no parameters.
+    /// Number of feature channels that `forward` keeps for `backward`; 0 if the encoder has no parameters.
     pub fn kept(&self) -> usize {
         let first = self.links.first().filter(|l| self.encoder && l.info.params > 0);
         first.map_or(0, |l| l.info.output)
@@ -229,17 +229,17 @@ impl Chain {
         self.params
     }
 
-    /// Channels out of the encoder.
+    /// Number of the encoder's output channels.
     pub fn features(&self) -> usize {
         self.links.first().filter(|_| self.encoder).map_or(3, |l| l.info.output)
     }
 
-    /// `backward` has something to do.
+    /// Whether `backward` has anything to do.
     pub fn learns(&self) -> bool {
         self.params > 0
     }
 
-    /// Binds the arena, and the copy of the parameters that every row reads if one of `links` has any.
+    /// Binds the arena and, if one of `links` needs it, the copy of the parameters that every row reads.
     fn declare(&self, source: &mut Source, links: &[Link], gradients: bool) {
         for s in 0..self.segments() {
             source.bind(&format!("params_{s}"), Access::Read, "array<vec2<f32>>");
@@ -284,7 +284,7 @@ impl Chain {
         source.add("the arena", &text);
     }
 
-    /// What to do in each segment with the entry's place in it.
+    /// Adds `line` for each segment to `text`. It runs for entries `i` of the segment and gets their position in it.
     fn each_segment(&self, text: &mut String, line: impl Fn(usize, &str) -> String) {
         let size = self.target.segment;
         for s in 0..self.segments() {
@@ -297,7 +297,7 @@ impl Chain {
         }
     }
 
-    /// What `link` may call, and its own functions.
+    /// The functions of `link` and those that it calls.
     fn include(&self, source: &mut Source, link: &Link, pass: Pass) {
         let Link { name, prefix, fragment, info, range, dense, tape, wants_dx } = link;
         let first = range.start;
@@ -356,7 +356,7 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
         source.bind("step", Access::Uniform, "Step");
     }
 
-    /// From positions to μ; writes features and what stages keep where `keep`.
+    /// From positions to μ. With `keep` it writes the features and the channels that stages keep.
     pub fn forward(&self, keep: bool) -> Source {
         let mut source = Source::default();
         Self::step(&mut source);
@@ -422,7 +422,7 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
         source
     }
 
-    /// From the derivative by μ to gradients and to what `sums` adds up.
+    /// From the derivative with respect to μ to gradients and to the inputs of `sums`.
     pub fn backward(&self) -> Source {
         let mut source = Source::default();
         Self::step(&mut source);
@@ -465,24 +465,24 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
         source
     }
 
-    /// Whether the encoder's gradients are a kernel of their own, to which `backward` hands the derivatives by the features in
-    /// place of these: it takes few registers, so that more of its rows wait for memory at the same time.
+    /// Whether the encoder's gradients have a kernel of their own. `backward` then overwrites the features with their
+    /// derivatives. The second kernel needs few registers, so more of its rows wait for memory at the same time.
     pub fn scatters(&self) -> bool {
         let scattered = |l: &Link| l.info.grads == GradKind::Scatter && l.fragment.keeps() == 0;
         self.kept() > 0 && self.links.len() > 1 && self.links.first().is_some_and(scattered)
     }
 
-    /// Whether `backward` may leave out a row. Where lanes add up together, it may not.
+    /// Whether `backward` may skip a row: not if lanes add together.
     fn skips(&self) -> bool {
         self.scatters() || !self.together()
     }
 
-    /// Leaves out a row that is not `live`, where `backward` may.
+    /// Skips a row that is not `live`, if `backward` may skip rows.
     fn skip(&self) -> &'static str {
         if self.skips() { "if !live { continue; }" } else { "" }
     }
 
-    /// From derivatives by the features to the encoder's gradients.
+    /// From the derivatives with respect to the features to the encoder's gradients.
     pub fn scatter(&self) -> Source {
         let mut source = Source::default();
         Self::step(&mut source);
@@ -511,7 +511,7 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
         source
     }
 
-    /// Calls of `backward`, from the last link as far as there are parameters.
+    /// Calls of `backward`, from the last link to the first with parameters.
     fn back(&self, body: &mut String) {
         for (i, l) in self.links.iter().enumerate().skip(usize::from(self.scatters())).rev() {
             if l.info.params == 0 && !l.wants_dx {
@@ -552,7 +552,7 @@ fn main(
         )
     }
 
-    /// How rows add to the arena's gradients.
+    /// The functions by which rows add to the arena's gradients.
     fn additions(&self, source: &mut Source) {
         let text = match self.together() {
             true => include_str!("kernels/together.wgsl"),
@@ -564,8 +564,8 @@ fn arena_scatter_pair(i: u32, v: vec2<f32>) { arena_grad(i, v.x); arena_grad(i +
         source.add("scattered gradients", text);
     }
 
-    /// Whether lanes of a subgroup add up first what goes to the same entry. They do it together, which a plugin's stage may
-    /// call from a branch that some take.
+    /// Whether lanes of a subgroup first combine what they add to the same entry. All lanes must call together, but a
+    /// plugin's stage may call from a branch.
     pub fn together(&self) -> bool {
         self.target.subgroups && !self.links.iter().any(|l| l.fragment.source.contains(wgsl::FOREIGN))
     }
@@ -812,17 +812,17 @@ pub fn blocks() -> Source {
     source
 }
 
-/// The line integrals themselves, from which nothing learns.
+/// Line integrals alone, without derivatives.
 pub fn lines() -> Source {
     of_rays("fn loss_at(predicted: f32, measured: f32) -> vec2<f32> { return vec2<f32>(predicted, 0.0); }")
 }
 
-/// The loss of rays and its derivative by μ.
+/// The loss of rays and its derivative with respect to μ.
 pub fn loss_of_rays(loss: &dyn Loss) -> Result<Source> {
     Ok(of_rays(&loss_at(loss)?))
 }
 
-/// The loss of known points and its derivative by μ.
+/// The loss of known points and its derivative with respect to μ.
 pub fn loss_of_points(loss: &dyn Loss) -> Result<Source> {
     let mut source = derivatives();
     source.add("loss", &loss_at(loss)?);
@@ -831,7 +831,7 @@ pub fn loss_of_points(loss: &dyn Loss) -> Result<Source> {
     Ok(source)
 }
 
-/// The penalty of a prior's blocks and its derivative by μ.
+/// The penalty of a prior's blocks and its derivative with respect to μ.
 pub fn penalty_of_blocks(prior: &dyn Prior) -> Result<Source> {
     let name = titled("prior", &prior.describe());
     let mut source = derivatives();
@@ -855,7 +855,7 @@ fn loss_at(loss: &dyn Loss) -> Result<String> {
     Ok(fragment_of(&titled("loss", &loss.describe()), loss.wgsl())?.named("loss_"))
 }
 
-/// What every kernel has that makes derivatives by μ.
+/// Common parts of the kernels that compute derivatives with respect to μ.
 fn derivatives() -> Source {
     let mut source = Source::default();
     Chain::step(&mut source);
@@ -866,13 +866,13 @@ fn derivatives() -> Source {
     source
 }
 
-/// Rounds parameters to halves, two in a word.
+/// Rounds parameters to half precision, two per word.
 pub fn halve(tables: Tables) -> Source {
     let mut source = Source::default();
     source.bind("params", Access::Read, "array<f32>");
     source.bind("halves", Access::Write, "array<u32>");
     let pack = match tables {
-        // What is finite stays finite.
+        // Finite values stay finite.
         Tables::F16 => {
             "fn within(x: f32) -> f32 {
     let finite = (bitcast<u32>(x) & 0x7fffffffu) < 0x7f800000u;

@@ -1,4 +1,4 @@
-//! Adapters and what they can do; an open device and its errors.
+//! Adapters and their features; an open device and its errors.
 
 use conefield_core::error::{Error, Result};
 use serde::Serialize;
@@ -6,13 +6,13 @@ use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::time::Duration;
 
-/// How gradients of scattered parameters are added up.
+/// How gradients of scattered parameters are added.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Atomics {
     /// The device adds `f32` atomically.
     Native,
-    /// Compare and exchange, again until nobody was faster: what every device can do.
+    /// Compare and exchange, repeated until it succeeds. Every device can do this.
     CompareExchange,
 }
 
@@ -51,10 +51,10 @@ impl fmt::Display for Atomics {
     }
 }
 
-/// A device that can be asked for, and its limits.
+/// An available device and its limits.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Adapter {
-    /// Its place in the list, by which it is chosen.
+    /// Its position in the list, by which users choose it.
     pub index: usize,
     /// Name of the device.
     pub name: String,
@@ -76,9 +76,9 @@ pub struct Adapter {
     pub storage_buffers: u32,
     /// Bytes of workgroup memory.
     pub workgroup_bytes: u32,
-    /// How gradients of scattered parameters would be added up.
+    /// How gradients of scattered parameters are added.
     pub atomics: Atomics,
-    /// Fewest and most lanes of a subgroup, where kernels may use subgroup operations.
+    /// Minimum and maximum number of lanes of a subgroup, if kernels may use subgroup operations.
     pub subgroups: Option<[u32; 2]>,
     /// Whether kernels can be timed on the device.
     pub timestamps: bool,
@@ -129,7 +129,7 @@ impl Adapter {
         self.binding_bytes.min(self.buffer_bytes)
     }
 
-    /// Which to prefer: the largest number.
+    /// Preference among adapters; the highest number wins.
     pub fn rank(&self) -> u32 {
         match self.kind.as_str() {
             "discrete GPU" => 4,
@@ -154,12 +154,12 @@ fn found() -> Vec<wgpu::Adapter> {
     pollster::block_on(instance.enumerate_adapters(wgpu::Backends::all()))
 }
 
-/// Every adapter here.
+/// All adapters of this machine.
 pub fn adapters() -> Vec<Adapter> {
     found().iter().enumerate().map(|(i, a)| Adapter::of(i, a)).collect()
 }
 
-/// What a device is to do without, to try what others have to do, and whether to time it.
+/// Artificial limits, which make a device behave like a lesser one in tests, and timing.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Limits {
     /// Sums of scattered gradients by compare and exchange, even where the device adds by itself.
@@ -176,16 +176,16 @@ pub struct Limits {
 
 /// An open device.
 pub struct Gpu {
-    /// What it is.
+    /// The adapter.
     pub adapter: Adapter,
     pub(crate) device: wgpu::Device,
     pub(crate) queue: wgpu::Queue,
-    /// The first thing that went wrong and was not asked for where it happened.
+    /// The first error outside of an error scope.
     failed: Arc<Mutex<Option<String>>>,
 }
 
 impl Gpu {
-    /// Opens adapter `index`, or the one that promises most.
+    /// Opens adapter `index`, or the preferred one.
     pub fn open(index: Option<usize>, limits: Limits) -> Result<Self> {
         let all = found();
         let described: Vec<_> = all.iter().enumerate().map(|(i, a)| Adapter::of(i, a)).collect();
@@ -240,7 +240,7 @@ impl Gpu {
         Ok(Self { adapter, device, queue, failed })
     }
 
-    /// What has gone wrong on the device since this was last asked.
+    /// The first error on the device since the last call.
     pub fn fault(&self) -> Result<()> {
         match self.failed.lock().unwrap_or_else(PoisonError::into_inner).take() {
             Some(what) => Err(self.error(what)),
@@ -252,14 +252,14 @@ impl Gpu {
         Error::Device { device: self.adapter.to_string(), what: what.into() }
     }
 
-    /// Waits until everything handed to the device is done.
+    /// Waits until the device has finished all submitted work.
     pub fn wait(&self) -> Result<()> {
         let polled = self.device.poll(wgpu::PollType::wait_indefinitely());
         self.fault()?;
         polled.map(drop).map_err(|e| self.error(e.to_string()))
     }
 
-    /// Runs `make`; what goes wrong in it is its error.
+    /// Runs `make` and returns its errors on the device.
     pub(crate) fn checked<T>(&self, what: &str, make: impl FnOnce() -> T) -> Result<T> {
         let scopes = [wgpu::ErrorFilter::OutOfMemory, wgpu::ErrorFilter::Validation, wgpu::ErrorFilter::Internal]
             .map(|filter| self.device.push_error_scope(filter));
@@ -289,7 +289,7 @@ impl Gpu {
         })
     }
 
-    /// Hands `bytes` of `from` to `read`, once the device has come to them.
+    /// Calls `read` with the first `bytes` of `from` when the device has written them.
     pub(crate) fn read(&self, from: &wgpu::Buffer, bytes: u64, read: impl FnOnce(&[u8])) -> Result<()> {
         if bytes == 0 {
             return self.wait();
@@ -298,7 +298,7 @@ impl Gpu {
         let (sender, receiver) = mpsc::channel();
         slice.map_async(wgpu::MapMode::Read, move |r| drop(sender.send(r)));
         self.wait()?;
-        // Another thread's wait may be what calls back, and a moment later than this one's ends.
+        // The callback may come from another thread's wait, shortly after this thread's wait ends.
         let mapped = loop {
             match receiver.recv_timeout(CALLBACK) {
                 Err(mpsc::RecvTimeoutError::Timeout) => self.wait()?,
@@ -309,7 +309,7 @@ impl Gpu {
         match mapped {
             Some(Ok(())) => {}
             Some(Err(e)) => return Err(self.error(e.to_string())),
-            None => return Err(self.error("what it computed cannot be read back")),
+            None => return Err(self.error("its result cannot be read back")),
         }
         let view = slice.get_mapped_range().map_err(|e| self.error(e.to_string()))?;
         read(&view);
@@ -329,7 +329,7 @@ fn note(keep: &Mutex<Option<String>>, what: String) {
 fn in_words(e: &wgpu::Error) -> String {
     match e {
         wgpu::Error::OutOfMemory { .. } => {
-            "out of memory on the device; smaller tables or fewer rays a step may fit".into()
+            "out of memory on the device; smaller tables or fewer rays per step may fit".into()
         }
         other => other.to_string(),
     }

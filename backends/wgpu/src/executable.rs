@@ -1,4 +1,4 @@
-//! A pipeline at work on a device: steps, updates, evaluation.
+//! A pipeline on a device: steps, updates, evaluation.
 
 use crate::arena;
 use crate::compose::{self, Chain, GROUP};
@@ -23,7 +23,7 @@ use wgpu::BufferUsages as U;
 
 /// Bytes that all partial sums may take together.
 const PARTIAL_BYTES: usize = 64 << 20;
-/// Shares of the rows with partial sums of their own, on a software device and on others.
+/// Maximum number of partial sums of the rows, on a software device and on others.
 const SHARES: [usize; 2] = [4, 256];
 /// Bytes that the rows of a wave may keep, on a software device and on others.
 const TAPE_BYTES: [u64; 2] = [16 << 20, 512 << 20];
@@ -32,7 +32,7 @@ const FIRST_ROWS: u32 = 1 << 14;
 const LEAST_ROWS: u32 = 1 << 12;
 const MOST_ROWS: u32 = 1 << 20;
 
-/// What is the same for all of a launch: `Step` in `kernels/step.wgsl`.
+/// Uniform values of a launch: `Step` in `kernels/step.wgsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Step {
@@ -66,14 +66,14 @@ struct Rule {
     eps: f32,
 }
 
-/// The kernels of a pipeline, composed and checked; compiled when they are first used. Those of the loss and the priors
-/// come with the first step that has them.
+/// The kernels of a pipeline, composed and checked; they are compiled at their first use. The first step adds those of
+/// loss and priors.
 pub struct Kernels {
     sources: HashMap<String, Source>,
 }
 
 impl Kernels {
-    /// Composes every kernel and refuses what is no valid WGSL or needs more than the device has.
+    /// Composes all kernels. Refuses invalid WGSL and kernels that exceed the device's limits.
     pub fn new(shared: &Shared, chain: &Chain, projector: &dyn Projector) -> Result<Self> {
         let mut kernels = Self { sources: HashMap::new() };
         let sources = [
@@ -101,7 +101,7 @@ impl Kernels {
         Ok(kernels)
     }
 
-    /// Adds a kernel, in place of one that had the label.
+    /// Adds a kernel, or replaces the one with this label.
     fn add(&mut self, shared: &Shared, label: &str, source: Source) -> Result<()> {
         source.validate()?;
         fits(&shared.gpu, label, &source)?;
@@ -117,20 +117,20 @@ pub struct Wgpu {
     kernels: Kernels,
     compiled: HashMap<String, Arc<Kernel>>,
     bound: HashMap<String, wgpu::BindGroup>,
-    /// The WGSL of the loss and of the priors whose kernels there are, with the edges of blocks.
+    /// The WGSL of the current kernels of loss and priors, with the edges of blocks.
     learned: Vec<(Option<Fragment>, usize)>,
     buffers: Buffers,
-    /// The arena is on the device.
+    /// Whether the arena is on the device.
     loaded: bool,
-    /// Gradients there are known to be zero.
+    /// Whether the gradients on the device are known to be zero.
     clean: bool,
     /// The last update's commands, submitted with the next ones: a step is one submission.
     update: Option<wgpu::CommandEncoder>,
-    /// Rows that a wave may have.
+    /// Maximum number of rows of a wave now.
     pace: Pace,
-    /// Rows that it may come to have.
+    /// Maximum number of rows of a wave at any time.
     most: u32,
-    /// Rows for which there is room.
+    /// Rows for which buffers have room.
     room: u32,
     profile: Option<Profile>,
 }
@@ -159,25 +159,25 @@ impl Wgpu {
         }
     }
 
-    /// Bytes that it comes to hold on the device.
+    /// Peak memory on the device in bytes.
     pub fn device_bytes(&self) -> u64 {
         let rows = u64::from(self.most) * self.row_bytes();
         let halves = self.chain.halves().map_or(0, |_| 2);
         (16 + halves) * self.chain.params() as u64 + rows + self.partial_bytes()
     }
 
-    /// Bytes that it comes to hold in the machine's memory for copies.
+    /// Peak host memory for copies in bytes.
     pub fn host_bytes(&self) -> usize {
         self.most as usize * 20 + (32 << 20)
     }
 
-    /// Positions and weights, μ and its derivative, targets, features, kept channels.
+    /// Bytes per row: position and weight, μ and its derivative, target, features, kept channels.
     fn row_bytes(&self) -> u64 {
         let channels = self.chain.kept().max(self.chain.features()) + self.chain.tape();
         16 + 4 + 4 + 4 + 4 * channels as u64
     }
 
-    /// Shares of the rows that `sums` adds up on their own.
+    /// Number of partial sums of the rows in `sums`.
     fn shares(&self) -> usize {
         let each = 4 * self.chain.summed().max(1);
         (PARTIAL_BYTES / each).clamp(1, SHARES[usize::from(!self.gpu().adapter.software)])
@@ -191,7 +191,7 @@ impl Wgpu {
         &self.shared.gpu
     }
 
-    /// Takes the arena to the device unless it is there.
+    /// Uploads the arena unless it is on the device.
     fn load(&mut self, model: &Model) -> Result<()> {
         if self.loaded {
             return Ok(());
@@ -238,7 +238,7 @@ impl Wgpu {
         Ok(())
     }
 
-    /// Compiles the kernels of a step at the same time: drivers take up to a second for each.
+    /// Compiles the kernels of a step in parallel, because drivers compile slowly.
     fn compile(&mut self) -> Result<()> {
         let Shared { gpu, kernels, .. } = &*self.shared;
         let of_step = |label: &str| !["evaluate", "encode", "lines"].contains(&label);
@@ -265,7 +265,7 @@ impl Wgpu {
         Ok(kernel)
     }
 
-    /// The same with its buffers.
+    /// The kernel called `label`, compiled, with its buffers.
     fn ready(&mut self, label: &str) -> Result<(Arc<Kernel>, wgpu::BindGroup)> {
         let kernel = self.kernel(label)?;
         if !self.bound.contains_key(label) {
@@ -285,7 +285,7 @@ impl Wgpu {
         Ok(self.bound[&label].clone())
     }
 
-    /// Composes the kernels of the work's loss and priors, unless they are those of the step before.
+    /// Composes the kernels of the work's loss and priors, unless the last step had the same.
     fn learn_by(&mut self, work: &Work<'_>) -> Result<()> {
         let mut fragments = vec![(work.loss.wgsl(), 0)];
         fragments.extend(work.priors.iter().map(|p| (p.prior.wgsl(), p.prior.blocks().edge)));
@@ -321,7 +321,7 @@ impl Wgpu {
         Ok(())
     }
 
-    /// An encoder of commands, which begin with those of an update that waits.
+    /// A command encoder. It begins with the commands of an update that waits.
     fn encoder(&mut self) -> wgpu::CommandEncoder {
         let waiting = self.update.take();
         waiting.unwrap_or_else(|| self.gpu().device.create_command_encoder(&Default::default()))
@@ -334,7 +334,7 @@ impl Wgpu {
         }
     }
 
-    /// Adds a copy of the beginning of `name` to `encoder`, for [`Wgpu::read`].
+    /// Adds a copy of the first `bytes` of `name` into the staging buffer, for [`Wgpu::read`].
     fn copy(&mut self, encoder: &mut wgpu::CommandEncoder, name: &str, bytes: u64, at: u64) -> Result<()> {
         let from = self.buffers.get(name).cloned().ok_or_else(|| self.gpu().error(format!("no buffer {name}")))?;
         if let Some(to) = self.buffers.get("staging")
@@ -352,7 +352,7 @@ impl Wgpu {
         }
     }
 
-    /// Evaluates the field in waves: `samples` of each are written, `label` is run on them.
+    /// Runs the kernel `label` on `points`, in waves.
     fn in_pieces(
         &mut self,
         points: &[[f32; 3]],
@@ -371,7 +371,7 @@ impl Wgpu {
             let stride = self.room;
             let bytes = 4 * u64::from(stride) * width as u64;
             self.reserve(result, bytes, U::STORAGE | U::COPY_SRC)?;
-            // What is read back ends with the last channel's rows.
+            // The result ends with the last channel's rows.
             let wanted = 4 * (u64::from(stride) * (width as u64 - 1) + u64::from(rows));
             self.reserve("staging", wanted, U::MAP_READ | U::COPY_DST)?;
             samples.clear();
@@ -390,7 +390,7 @@ impl Wgpu {
         Ok(())
     }
 
-    /// Adds up the times of kernels that have run.
+    /// Collects the times of finished kernels.
     fn collect(&mut self) -> Result<()> {
         self.profile.as_mut().map_or(Ok(()), |p| p.collect(&self.shared.gpu))
     }
@@ -460,11 +460,11 @@ impl Wgpu {
     }
 }
 
-/// Labels of the kernels that make derivatives by μ.
+/// Labels of the kernels that compute derivatives with respect to μ.
 const OF_RAYS: &str = "loss of rays";
 const OF_POINTS: &str = "loss of points";
 
-/// The kernels that learning takes, by their labels.
+/// The kernels of loss and priors, by their labels.
 fn sources<'a>(loss: &dyn Loss, priors: impl Iterator<Item = &'a dyn Prior>) -> Result<Vec<(String, Source)>> {
     let mut all = vec![
         (OF_RAYS.to_owned(), compose::loss_of_rays(loss)?),
@@ -506,7 +506,7 @@ impl Executable for Wgpu {
         let mut at = 0;
         for (i, wave) in waves.iter().enumerate() {
             if i > 0 {
-                // What the host writes for this wave replaces that of the last one.
+                // The host overwrites the inputs of the last wave.
                 let last = std::mem::replace(&mut encoder, self.encoder());
                 self.gpu().queue.submit([last.finish()]);
             }
@@ -538,7 +538,7 @@ impl Executable for Wgpu {
 
     fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()> {
         self.load(model)?;
-        // Its rules, which this one replaces, are written at its submission.
+        // An update that waits uses the buffers that this one is about to overwrite.
         self.flush();
         let (bias1, bias2) = (1.0 - adam.beta1.powf(adam.step as f64), 1.0 - adam.beta2.powf(adam.step as f64));
         let size = self.shared.target().segment;

@@ -1,4 +1,4 @@
-//! Compiled kernels, kept by their text, and their launch on named buffers.
+//! A cache of compiled kernels, and their launch on named buffers.
 
 use crate::device::Gpu;
 use crate::source::{Access, Source};
@@ -22,13 +22,13 @@ pub struct Kernel {
 pub struct Cache(Mutex<HashMap<String, Arc<Kernel>>>);
 
 impl Cache {
-    /// The kernel of `source`, compiled now unless it has been before.
+    /// The kernel of `source`, compiled unless it is in the cache.
     pub fn get(&self, gpu: &Gpu, label: &str, source: &Source) -> Result<Arc<Kernel>> {
         let known = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(kernel) = known().get(source.text()) {
             return Ok(kernel.clone());
         }
-        // Others may compile at the same time.
+        // The lock is free, so that other threads can compile.
         let kernel = Arc::new(compile(gpu, label, source)?);
         known().insert(source.text().into(), kernel.clone());
         Ok(kernel)
@@ -47,8 +47,8 @@ pub fn fits(gpu: &Gpu, label: &str, source: &Source) -> Result<()> {
     ))
 }
 
-/// What is checked while a kernel runs. A counter that ends every loop keeps drivers from unrolling it: only kernels with a
-/// plugin's text have it.
+/// Run-time checks of a kernel. A counter that ends every loop keeps drivers from unrolling it, so only kernels with a
+/// plugin's text have one.
 fn checks(source: &Source) -> wgpu::ShaderRuntimeChecks {
     wgpu::ShaderRuntimeChecks {
         force_loop_bounding: source.text().contains(FOREIGN),
@@ -112,12 +112,12 @@ fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
     })
 }
 
-/// Buffers by the names that kernels know them by.
+/// Buffers by their names in kernels.
 #[derive(Default)]
 pub struct Buffers(HashMap<String, wgpu::Buffer>);
 
 impl Buffers {
-    /// Adds a buffer, in place of one that had the name.
+    /// Adds a buffer, or replaces the one with this name.
     pub fn insert(&mut self, name: impl Into<String>, buffer: wgpu::Buffer) {
         self.0.insert(name.into(), buffer);
     }
@@ -127,7 +127,7 @@ impl Buffers {
         self.0.get(name)
     }
 
-    /// Makes sure of a buffer `name` of at least `bytes`; whether it is a new one.
+    /// Ensures a buffer `name` of at least `bytes`. Returns whether it is new.
     pub fn reserve(&mut self, gpu: &Gpu, name: &str, bytes: u64, usage: wgpu::BufferUsages) -> Result<bool> {
         if self.get(name).is_some_and(|b| b.size() >= bytes) {
             return Ok(false);
@@ -137,19 +137,19 @@ impl Buffers {
         Ok(true)
     }
 
-    /// Bytes of all.
+    /// Total size in bytes.
     pub fn bytes(&self) -> u64 {
         self.0.values().map(wgpu::Buffer::size).sum()
     }
 }
 
 impl Kernel {
-    /// Its buffers, bound.
+    /// A bind group of its buffers.
     pub fn bind(&self, gpu: &Gpu, buffers: &Buffers) -> Result<wgpu::BindGroup> {
         self.bind_as(gpu, |name| buffers.get(name))
     }
 
-    /// Its buffers, each the one that `find` has for its name, bound.
+    /// A bind group of the buffers that `find` returns for its names.
     pub fn bind_as<'a>(&self, gpu: &Gpu, find: impl Fn(&str) -> Option<&'a wgpu::Buffer>) -> Result<wgpu::BindGroup> {
         let mut entries = vec![];
         for (i, name) in self.buffers.iter().enumerate() {
@@ -170,7 +170,7 @@ impl Kernel {
         &self.label
     }
 
-    /// Puts a launch of `groups` groups into a pass.
+    /// Adds a launch of `groups` groups to a pass.
     pub fn launch(&self, pass: &mut wgpu::ComputePass<'_>, bound: &wgpu::BindGroup, groups: u32) {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, bound, &[]);

@@ -1,19 +1,18 @@
-//! The wgpu backend: a pipeline as a few kernels, on any GPU that Vulkan, Metal or DX12 reaches.
+//! The wgpu backend: runs a pipeline as a few kernels on any GPU with Vulkan, Metal or DX12.
 //!
-//! - [`device`]: adapters and what they can do.
+//! - [`device`]: adapters and their features.
 //! - [`compose`], [`source`]: the text of kernels, put together from the stages' fragments.
 //! - [`kernel`]: compiled kernels and the buffers that they use.
 //! - [`arena`]: parameters, gradients and moments on the device.
 //! - [`wave`]: a step's work cut into pieces of bounded size.
 //! - [`executable`]: steps, updates, evaluation.
-//! - [`measure`]: what a device can do at most.
+//! - [`measure`]: measured limits of a device.
 //! - [`profile`]: time on the device.
-//! - [`single`]: one stage alone, by which it is compared with the CPU.
+//! - [`single`]: one stage alone, to compare it with the CPU.
 //! - [`voxels`]: projection of voxel volumes and FDK's back-projection.
 //! - `resident`: proximal gradient updates of volumes that stay on the device.
 //!
-//! Sums have no fixed order where many rows touch one parameter: results agree with the CPU's to rounding, and two runs
-//! with each other.
+//! Sums over rows have no fixed order. Results agree with the CPU's within rounding, and so do two runs.
 
 pub mod arena;
 pub mod compose;
@@ -49,7 +48,7 @@ pub struct Wgpu {
     shared: Arc<Shared>,
 }
 
-/// What every executable of a backend shares.
+/// State shared by all executables of a backend.
 pub struct Shared {
     /// The device.
     pub gpu: Gpu,
@@ -60,7 +59,7 @@ pub struct Shared {
 }
 
 impl Shared {
-    /// What the text of kernels depends on.
+    /// Properties of the device on which the text of kernels depends.
     pub fn target(&self) -> Target {
         let adapter = &self.gpu.adapter;
         let bytes = adapter.bound_bytes();
@@ -74,12 +73,12 @@ impl Shared {
 }
 
 impl Wgpu {
-    /// Opens adapter `index`, or the one that promises most.
+    /// Opens adapter `index`, or the preferred one.
     pub fn open(index: Option<usize>) -> Result<Self> {
         Self::with_limits(index, Limits::default())
     }
 
-    /// The same, set otherwise than the adapter's defaults.
+    /// The same with other limits than the adapter's.
     pub fn with_limits(index: Option<usize>, limits: Limits) -> Result<Self> {
         let gpu = Gpu::open(index, limits)?;
         Ok(Self { shared: Arc::new(Shared { gpu, kernels: Cache::default(), profile: limits.profile }) })
@@ -90,7 +89,7 @@ impl Wgpu {
         &self.shared.gpu.adapter
     }
 
-    /// What runs single stages on this device.
+    /// The state for running single stages on this device.
     pub fn shared(&self) -> &Arc<Shared> {
         &self.shared
     }
@@ -150,7 +149,7 @@ impl Backend for Wgpu {
         let explain = Explain {
             backend: format!("wgpu, {adapter}"),
             notes,
-            // A software device works in the memory of the machine.
+            // A software device uses the machine's memory.
             scratch_bytes: running.host_bytes() + if adapter.software { device_bytes as usize } else { 0 },
         };
         Ok((Box::new(running), explain))

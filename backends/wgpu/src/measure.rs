@@ -1,4 +1,4 @@
-//! What a device can do at most, measured: the yardstick beside a kernel's own speed.
+//! Measured limits of a device, to compare the speed of kernels with.
 
 use crate::Shared;
 use crate::device::{Atomics, Gpu};
@@ -44,7 +44,7 @@ const READS: u32 = 64;
 const SMALL: u64 = 32 << 20;
 /// Bytes of a transfer.
 const TRANSFER: u64 = 64 << 20;
-/// A measurement lasts this long at least, in seconds: submission then costs no more than a few thousandths of it.
+/// Minimum duration of a measurement in seconds. Submission then takes at most a few thousandths of it.
 const LONG: f64 = 0.05;
 /// Pseudo-random numbers, one after the other: the quotient of the recurrence by 256 is used, since its low bits repeat soon.
 const NEXT: &str = "h = h * 1664525u + 1013904223u;";
@@ -62,7 +62,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
     var d = a + 3.0;
 {body}
     let sum = a + b + c + d;
-    // Never so, but the compiler cannot know.
+    // Never true, but the compiler cannot know that.
     if sum.x == 1.2345e30 {{ data[0] = sum; }}
 }}
 "
@@ -120,7 +120,7 @@ impl Shared {
     pub fn ceiling(&self) -> Result<Ceiling> {
         let gpu = &self.gpu;
         let software = gpu.adapter.software;
-        // A software device has a few lanes, and no memory of its own.
+        // A software device has few lanes and no memory of its own.
         let groups = if software { 64 } else { 1 << 14 };
         let large_bytes = if software { SMALL } else { gpu.adapter.bound_bytes().min(1 << 30) };
         let best = |source: &Source, bytes: u64| -> Result<f64> {

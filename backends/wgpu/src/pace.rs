@@ -1,7 +1,7 @@
-//! How much one launch takes on, by how long the last ones took.
+//! Adapts the size of launches to the time that earlier launches took.
 
-/// A launch should take less than the second, of the half second after which a watchdog may step in, and may grow where it
-/// takes less than the first.
+/// Launches grow if they take less than the first time, and shrink if they take more than the second. A watchdog may end
+/// launches after half a second.
 const SECONDS: [f64; 2] = [0.06, 0.25];
 
 /// The size of launches: rows, rays or voxels.
@@ -18,12 +18,12 @@ impl Pace {
         Self { size: first, least, most }
     }
 
-    /// What a launch may take on now.
+    /// The maximum size of a launch now.
     pub fn size(&self) -> u32 {
         self.size
     }
 
-    /// Hears that `launches`, the largest of which took on `largest`, took `seconds`.
+    /// Takes note that `launches`, the largest of size `largest`, took `seconds`.
     pub fn heard(&mut self, seconds: f64, launches: usize, largest: u32) {
         let each = seconds / launches.max(1) as f64;
         if each > SECONDS[1] && self.size > self.least {
@@ -45,7 +45,7 @@ mod tests {
         assert_eq!(pace.size(), 1 << 13);
         (0..5).for_each(|_| pace.heard(1.0, 1, 1 << 13));
         assert_eq!(pace.size(), 1 << 12);
-        // One that was not full says little.
+        // A launch that was not full says little.
         pace.heard(0.01, 1, 100);
         assert_eq!(pace.size(), 1 << 12);
         (0..9).for_each(|_| pace.heard(0.01, 1, pace.size()));

@@ -1,4 +1,4 @@
-//! Time on the device, kernel by kernel.
+//! Time on the device for each kernel.
 
 use crate::device::Gpu;
 use conefield_core::error::Result;
@@ -17,7 +17,7 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// A profile, where the device has timestamps.
+    /// A profile, if the device has timestamps.
     pub fn new(gpu: &Gpu) -> Result<Option<Self>> {
         use wgpu::BufferUsages as U;
         if !gpu.adapter.timestamps {
@@ -55,7 +55,7 @@ impl Profile {
         })
     }
 
-    /// Adds up what has been timed. Waits for the device.
+    /// Collects the measured times. Waits for the device.
     pub fn collect(&mut self, gpu: &Gpu) -> Result<()> {
         let n = self.waiting.len() as u32;
         if n == 0 {
@@ -75,7 +75,7 @@ impl Profile {
         })
     }
 
-    /// Seconds of each kernel since this was last asked.
+    /// Seconds of each kernel since the last call.
     pub fn take(&mut self) -> Vec<(String, f64)> {
         std::mem::take(&mut self.seconds).into_iter().collect()
     }

@@ -1,12 +1,12 @@
-//! The text of a kernel, piece by piece, and whose fault it is when it cannot be compiled.
+//! The text of a kernel in pieces. An error names the piece that causes it.
 
 use conefield_core::error::{Error, Result};
 use wgpu::naga;
 
-/// How a kernel reaches a buffer.
+/// How a kernel accesses a buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// A few numbers, the same for all.
+    /// Uniform values.
     Uniform,
     /// Read only.
     Read,
@@ -17,13 +17,13 @@ pub enum Access {
 /// A buffer that a kernel uses.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Binding {
-    /// Its name in the text, and among the buffers.
+    /// Its name in the text and among the buffers.
     pub name: String,
-    /// How it is reached.
+    /// How the kernel accesses it.
     pub access: Access,
 }
 
-/// The text of a kernel with the buffers that it uses.
+/// The text of a kernel and the buffers that it uses.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Source {
     text: String,
@@ -33,7 +33,7 @@ pub struct Source {
 }
 
 impl Source {
-    /// Appends a piece; `name` is said when it is at fault.
+    /// Appends a piece. Errors in it name `name`.
     pub fn add(&mut self, name: &str, text: &str) {
         self.text += text;
         self.text.push('\n');
@@ -67,7 +67,7 @@ impl Source {
         self.bindings.iter().filter(|b| b.access != Access::Uniform).count() as u32
     }
 
-    /// Refuses what is no valid WGSL, with the piece and the line in it.
+    /// Refuses invalid WGSL; the error names the piece and the line in it.
     pub fn validate(&self) -> Result<()> {
         let module = match naga::front::wgsl::parse_str(&self.text) {
             Ok(module) => module,

@@ -1,5 +1,5 @@
-//! Kernels in the languages of other systems' drivers, HLSL for DX12 and Metal's, to find what cannot be said in them. No
-//! driver of those systems compiles the result here.
+//! Translates kernels to HLSL (for DX12) and to Metal's language, to find constructs that these lack. No driver of those
+//! systems compiles the result here.
 
 use wgpu::naga::back::{hlsl, msl};
 use wgpu::naga::valid::ModuleInfo;

@@ -1,7 +1,7 @@
 //! Projection of voxel volumes, its adjoint, and FDK's back-projection, on the device.
 //!
-//! A volume that is larger than a buffer may be is gone through slab by slab along x, projections view by view. The
-//! adjoint adds to voxels atomically: sums have no fixed order.
+//! A volume larger than a buffer is processed in slabs along x, projections in groups of views. The adjoint adds to
+//! voxels atomically, so its sums have no fixed order.
 
 use crate::Shared;
 use crate::compose::{GROUP, fragment_of};
@@ -23,7 +23,7 @@ use wgpu::BufferUsages as U;
 
 /// Bytes of projections on the device at once.
 const LINES_BYTES: u64 = 64 << 20;
-/// How kernels and the host use an array.
+/// Usage of arrays by kernels and the host.
 pub(crate) const ARRAY: U = U::STORAGE.union(U::COPY_SRC).union(U::COPY_DST);
 /// Views that one uniform buffer holds for back-projection.
 const VIEWS: usize = 128;
@@ -133,7 +133,7 @@ fn walk_visit(voxel: vec3<u32>, weight: f32) {{
     source
 }
 
-/// What a launch works on: buffers that are used again, and how many rays or voxels it may take.
+/// Buffers that launches share, and the size of launches.
 pub(crate) struct Room {
     pub(crate) buffers: Buffers,
     pace: Pace,
@@ -192,7 +192,7 @@ impl Room {
         shared.gpu.queue.submit([encoder.finish()]);
     }
 
-    /// Hands the first `count` numbers of `name` to `take`.
+    /// Calls `take` with the first `count` numbers of `name`.
     pub(crate) fn read(&mut self, shared: &Shared, name: &str, count: usize, take: impl FnOnce(&[f32])) -> Result<()> {
         let gpu = &shared.gpu;
         let bytes = 4 * count as u64;
@@ -213,7 +213,7 @@ impl Room {
     }
 }
 
-/// Numbers that were read for an array of `shape`.
+/// Read numbers as an array of `shape`.
 fn shaped(shape: Ix3, found: &[f32]) -> ArrayView3<'_, f32> {
     ArrayView3::from_shape(shape, found).unwrap_or_else(|e| unreachable!("as many numbers as asked for: {e}"))
 }

@@ -6,10 +6,10 @@ use conefield_core::random::mix;
 use conefield_core::stage::{Projector, UnitRay};
 use std::ops::Range;
 
-/// Groups that one launch may have along one side, on every device.
+/// Maximum number of groups of a launch along one side, on every device.
 pub const MOST_GROUPS: usize = 65_535;
 
-/// A ray as kernels see it: `Ray` in [`conefield_core::wgsl::RAY`].
+/// A ray in kernels: `Ray` in [`conefield_core::wgsl::RAY`].
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct GpuRay {
@@ -32,31 +32,31 @@ impl GpuRay {
     }
 }
 
-/// What one pass through the kernels takes on. Rows: samples of the rays, then points, then blocks.
+/// The work of one pass through the kernels. Its rows are samples of rays, then points, then blocks.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Wave {
     /// The rays.
     pub rays: Vec<GpuRay>,
-    /// Rows of their samples.
+    /// Number of their samples.
     pub ray_rows: u32,
-    /// Which of the points.
+    /// Range of the points.
     pub points: Range<usize>,
-    /// The number of the prior that blocks are of, and which of them.
+    /// Index of the prior of the blocks.
     pub prior: usize,
-    /// See `prior`.
+    /// Range of the prior's blocks.
     pub blocks: Range<usize>,
-    /// All rows.
+    /// Number of rows.
     pub rows: u32,
 }
 
 impl Wave {
-    /// Partial losses that its kernels leave: one a ray, one for 64 points, one a block.
+    /// Number of partial losses from its kernels: one per ray, per 64 points and per block.
     pub fn losses(&self) -> usize {
         self.rays.len() + self.points.len().div_ceil(GROUP as usize) + self.blocks.len()
     }
 }
 
-/// Puts rays into waves of at most `most` rows, or one ray that has more.
+/// Puts rays into waves of at most `most` rows. A longer ray gets a wave of its own.
 fn cast<'a>(projector: &dyn Projector, rays: impl Iterator<Item = (&'a UnitRay, f32, u64)>, most: u32) -> Vec<Wave> {
     let mut waves = vec![Wave::default()];
     for (ray, measured, seed) in rays {
@@ -76,7 +76,7 @@ fn cast<'a>(projector: &dyn Projector, rays: impl Iterator<Item = (&'a UnitRay, 
     waves
 }
 
-/// The waves of a step, each of at most `most` rows where one ray or block has no more.
+/// The waves of a step, each of at most `most` rows. A longer ray or block gets a wave of its own.
 pub fn of_step(projector: &dyn Projector, work: &Work<'_>, most: u32) -> Vec<Wave> {
     let seed = mix(work.seed, work.step);
     let rays = work.rays.iter().enumerate();
@@ -102,7 +102,7 @@ pub fn of_step(projector: &dyn Projector, work: &Work<'_>, most: u32) -> Vec<Wav
     waves
 }
 
-/// Adds blocks to the last wave and to further ones. The blocks of a wave are of one prior.
+/// Adds blocks to the last wave and to new ones. All blocks of a wave belong to one prior.
 fn place_blocks(waves: &mut Vec<Wave>, prior: usize, blocks: &BlockWork<'_>, most: u32) {
     let each = blocks.prior.blocks().points() as u32;
     let count = blocks.corners.len();
@@ -130,7 +130,7 @@ fn place_blocks(waves: &mut Vec<Wave>, prior: usize, blocks: &BlockWork<'_>, mos
     }
 }
 
-/// The waves in which rays are rendered.
+/// The waves for rendering rays.
 pub fn of_rays(projector: &dyn Projector, rays: &[UnitRay], most: u32) -> Vec<Wave> {
     cast(projector, rays.iter().map(|r| (r, 0.0, 0)), most)
 }
@@ -142,7 +142,7 @@ mod tests {
     use conefield_core::prior::{Blocks, Prior};
     use conefield_core::stage::Samples;
 
-    /// A loss, and a prior with blocks of this edge, that nothing asks for values.
+    /// A loss without values, and a prior without values whose blocks have this edge.
     struct Named(usize);
     impl Loss for Named {
         fn at(&self, _: f64, _: f64) -> (f64, f64) {

@@ -18,7 +18,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
         let m = first[i] * rule.beta1 + g * rule.rest1;
         let v = second[i] * rule.beta2 + g * g * rule.rest2;
         params[i] -= m * rule.rate / (sqrt(v) * rule.root + rule.eps);
-        // Moments that decay towards nothing end at zero, not among the denormals.
+        // Decaying moments end at zero, not at denormal numbers.
         first[i] = select(0.0, m, abs(m) > 1e-30);
         second[i] = select(0.0, v, v > 1e-36);
         grads[i] = 0.0;

@@ -1,4 +1,4 @@
-// Voxel-driven, distance-weighted back-projection (Feldkamp, Davis and Kress 1984): four voxels an invocation. Neighbouring
+// Voxel-driven, distance-weighted back-projection (Feldkamp, Davis and Kress 1984): four voxels per invocation. Neighbouring
 // lanes have neighbouring z and so neighbouring rows of a view, which `padded` holds one after the other.
 
 fn share(v: u32, at: vec4<f32>) -> f32 {

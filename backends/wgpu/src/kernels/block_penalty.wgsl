@@ -1,4 +1,4 @@
-// A prior's penalty of each block and its derivative by every point: a group a block.
+// A prior's penalty of each block and its derivative with respect to every point: one group per block.
 
 var<private> base: u32;
 

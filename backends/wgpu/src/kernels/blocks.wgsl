@@ -1,4 +1,4 @@
-// Points of blocks: a row each, z fastest.
+// Points of blocks: one row each, z fastest.
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     let edge = step.edge;

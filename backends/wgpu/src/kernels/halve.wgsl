@@ -1,4 +1,4 @@
-// A copy of the parameters in halves.
+// A copy of the parameters in half precision.
 @compute @workgroup_size(256)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     let n = arrayLength(&params);

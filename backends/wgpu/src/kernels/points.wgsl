@@ -1,4 +1,4 @@
-// The loss of known points and its derivative: 64 points a group.
+// The loss of known points and its derivative: 64 points per group.
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let i = group.x * 64u + lane;

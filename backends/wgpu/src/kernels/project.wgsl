@@ -1,4 +1,4 @@
-// Line integrals of a slab of voxels: a ray an invocation. `held` and `held_end` are the planes of x in the buffer.
+// Line integrals of a slab of voxels: one ray per invocation. `held` and `held_end` are the planes of x in the buffer.
 
 struct VoxelRay {
     source: vec3<f32>,
@@ -25,7 +25,7 @@ struct Projection {
     held_end: u32,
     // Pixels of a view.
     pixels: u32,
-    // First pixel of this launch, and the one after its last.
+    // First pixel of this launch, and the first after it.
     begin: u32,
     end: u32,
 }

@@ -1,8 +1,8 @@
-// A proximal gradient update of a volume: a voxel an invocation.
+// A proximal gradient update of a volume: one voxel per invocation.
 
 struct Proximal {
     shape: vec3<u32>,
-    // First voxel of this launch, and the one after its last.
+    // First voxel of this launch, and the first after it.
     begin: u32,
     // Weights of differences, times τ for the primal and over L·τ for the dual.
     down: vec3<f32>,
@@ -13,7 +13,7 @@ struct Proximal {
     pull: f32,
 }
 
-// A voxel's place along y and z.
+// A voxel's position along y and z.
 fn place(i: u32) -> vec2<u32> {
     return vec2<u32>(i / proximal.shape.z % proximal.shape.y, i % proximal.shape.z);
 }

@@ -1,4 +1,4 @@
-// Beer-Lambert line integrals, their loss, and its derivative by every sample: a group a ray.
+// Beer-Lambert line integrals, their loss, and its derivative with respect to every sample: one group per ray.
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let first = rays[group.x].first;

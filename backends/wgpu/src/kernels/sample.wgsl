@@ -1,4 +1,4 @@
-// Samples of all rays: a row each.
+// Samples of all rays: one row each.
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     for (var row = id.x; row < step.ray_rows; row += groups.x * 64u) {

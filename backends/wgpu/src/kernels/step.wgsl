@@ -1,5 +1,5 @@
 struct Step {
-    // Rows: first the samples of rays, then points, then those of blocks.
+    // Rows: samples of rays, then points, then points of blocks.
     rows: u32,
     ray_rows: u32,
     rays: u32,
@@ -11,7 +11,7 @@ struct Step {
     stride: u32,
     // Whether random positions are random.
     training: u32,
-    // What the loss of a ray, the loss of a point and the penalty of a block count by.
+    // Factors of the loss of a ray, the loss of a point and the penalty of a block.
     ray_scale: f32,
     point_scale: f32,
     block_scale: f32,
@@ -19,5 +19,5 @@ struct Step {
     spacing: vec3<f32>,
 }
 
-// The row that an invocation is at.
+// The row of an invocation.
 var<private> row: u32;

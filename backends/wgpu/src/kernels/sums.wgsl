@@ -1,9 +1,9 @@
-// Sums over rows. A group takes one block of products over its share of the rows. Rows hand 32 channels of each side over
+// Sums over rows. A group takes one block of products over its share of the rows. Rows pass 32 channels of each side
 // through workgroup memory, 64 rows at a time, four channels to a vector; every lane sums a block of 4 × 4 products. Vector q of
-// row r stands at place q xor (r mod 8) of the row, so that neither writing nor reading meets the same bank twice.
+// row r has position q xor (r mod 8) in the row, so that neither writes nor reads conflict in a bank.
 
 struct Block {
-    // First kept channel on the left, and channels.
+    // First kept channel on the left, and number of channels.
     left: u32,
     outputs: u32,
     right: u32,

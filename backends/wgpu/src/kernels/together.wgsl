@@ -1,5 +1,5 @@
-// Lanes of a subgroup add up first what goes to the same entry: the samples of a ray that follow each other often lie in the
-// same cell. All lanes call together.
+// Lanes of a subgroup first combine what they add to the same entry, because neighbouring samples of a ray often lie in the
+// same cell. All lanes must call together.
 
 var<private> together_lane: u32;
 var<private> together_size: u32;

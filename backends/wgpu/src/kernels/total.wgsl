@@ -1,6 +1,6 @@
 var<workgroup> parts: array<f32, 64>;
 
-// The sum of `v` over the 64 of a group, in one order.
+// The sum of `v` over the 64 invocations of a group, in a fixed order.
 fn total(lane: u32, v: f32) -> f32 {
     parts[lane] = v;
     workgroupBarrier();
