@@ -54,10 +54,11 @@ for row in sys.argv[1:]:
     by_part = np.empty_like(a)
     for part, voxels in parts(truth).items():
         own = a[voxels], b[voxels]
-        by_part[voxels] = mean(*own, best_share(*own))
+        own_share = best_share(*own)
+        by_part[voxels] = mean(*own, own_share)
         second.append(
             f"| {name}, {part} | {100 * voxels.mean():.0f} % | {100 * dot(own[0], own[0]) / dot(a, a):.0f} % "
-            f"| {psnr(own[0], peak):.2f} dB | {psnr(own[1], peak):.2f} dB | {best_share(*own):.2f} |"
+            f"| {psnr(own[0], peak):.2f} dB | {psnr(own[1], peak):.2f} dB | {own_share:.2f} |"
         )
     print(
         f"| {name} | {psnr(a, peak):.2f} dB | {psnr(b, peak):.2f} dB | {correlation:.2f} | {share:.2f} "

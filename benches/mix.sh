@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # What a field adds to total variation:
 #   bash benches/mix.sh DATA_FOLDER OUT_FOLDER PYTHON [FIELD [STEPS [TV [VOLUMES]]]]
-# Runs the specs TV (smooth-tv) and FIELD (balanced, STEPS = 2500) on 50 noisy views of each of VOLUMES, then prints the table of mix.py,
+# Runs the specs TV (smooth-tv) and FIELD (balanced, STEPS = 2500) on 50 noisy views of each of VOLUMES, then prints the tables of mix.py,
 # with TV as A and FIELD as B. PYTHON has numpy and nibabel. Steps are counted, not timed. What is there is not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."

@@ -51,8 +51,8 @@ for spec in $specs; do
     for way in without with whole both; do
         scan=$middle
         sets=()
-        [[ $way != with && $way != both ]] || sets=(--set 'scene.surround={ coarse = {} }')
-        [[ $way != whole && $way != both ]] || scan=$whole
+        case $way in with | both) sets=(--set 'scene.surround={ coarse = {} }') ;; esac
+        case $way in whole | both) scan=$whole ;; esac
         run=$out/$spec-$way
         "$bin" -q reconstruct "$scan" --spec "$spec" -o "$run" --force "${ends[@]}" "${sets[@]}" >/dev/null
         volume=$run/volume.nii.gz

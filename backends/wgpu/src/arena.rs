@@ -14,7 +14,7 @@ use std::ops::Range;
 pub const PARTS: [&str; 4] = ["params", "grads", "first", "second"];
 
 /// Bytes that are copied to or from the device at once.
-pub const PIECE: u64 = 16 << 20;
+const PIECE: u64 = 16 << 20;
 
 /// The range of the arena in buffer `s`.
 pub fn segment(chain: &Chain, s: usize, params: usize, size: usize) -> Range<usize> {
@@ -96,15 +96,9 @@ fn copy_dense(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncod
     }
 }
 
-/// Downloads the arena through `staging`, which holds [`PIECE`] bytes or the longest part.
-pub fn download(
-    gpu: &Gpu,
-    buffers: &Buffers,
-    chain: &Chain,
-    arena: &mut Arena,
-    size: usize,
-    staging: &wgpu::Buffer,
-) -> Result<()> {
+/// Downloads the arena.
+pub fn download(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, arena: &mut Arena, size: usize) -> Result<()> {
+    let staging = buffers.staging(gpu, PIECE.min(4 * arena.params.len() as u64))?;
     let parts = [&mut arena.params, &mut arena.grads, &mut arena.first, &mut arena.second];
     for (part, data) in PARTS.iter().zip(parts) {
         for s in 0..chain.segments() {
@@ -113,9 +107,9 @@ pub fn download(
             for (i, piece) in data[range].chunks_mut(PIECE as usize / 4).enumerate() {
                 let bytes = 4 * piece.len() as u64;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
-                encoder.copy_buffer_to_buffer(buffer, i as u64 * PIECE, staging, 0, bytes);
+                encoder.copy_buffer_to_buffer(buffer, i as u64 * PIECE, &staging, 0, bytes);
                 gpu.queue.submit([encoder.finish()]);
-                gpu.read(staging, bytes, |found| copy(bytemuck::cast_slice_mut(piece), found))?;
+                gpu.read(&staging, bytes, |found| copy(bytemuck::cast_slice_mut(piece), found))?;
             }
         }
     }

@@ -265,24 +265,20 @@ impl Wgpu {
         Ok(kernel)
     }
 
+    /// The buffers of `kernel`, bound once under `label`. `name` returns the name of the buffer for one in the kernel.
+    fn bind(&mut self, kernel: &Kernel, label: &str, name: impl Fn(&str) -> String) -> Result<wgpu::BindGroup> {
+        if !self.bound.contains_key(label) {
+            let group = kernel.bind_as(&self.shared.gpu, |buffer| self.buffers.get(&name(buffer)))?;
+            self.bound.insert(label.into(), group);
+        }
+        Ok(self.bound[label].clone())
+    }
+
     /// The kernel called `label`, compiled, with its buffers.
     fn ready(&mut self, label: &str) -> Result<(Arc<Kernel>, wgpu::BindGroup)> {
         let kernel = self.kernel(label)?;
-        if !self.bound.contains_key(label) {
-            let group = kernel.bind(&self.shared.gpu, &self.buffers)?;
-            self.bound.insert(label.into(), group);
-        }
-        Ok((kernel, self.bound[label].clone()))
-    }
-
-    /// Binds Adam's kernel to the arena's buffers `s`.
-    fn own(&mut self, kernel: &Kernel, s: usize) -> Result<wgpu::BindGroup> {
-        let label = format!("adam_{s}");
-        if !self.bound.contains_key(&label) {
-            let group = kernel.bind_as(&self.shared.gpu, |part| self.buffers.get(&format!("{part}_{s}")))?;
-            self.bound.insert(label.clone(), group);
-        }
-        Ok(self.bound[&label].clone())
+        let bound = self.bind(&kernel, label, str::to_owned)?;
+        Ok((kernel, bound))
     }
 
     /// Composes the kernels of the work's loss and priors, unless the last step had the same.
@@ -373,7 +369,7 @@ impl Wgpu {
             self.reserve(result, bytes, U::STORAGE | U::COPY_SRC)?;
             // The result ends with the last channel's rows.
             let wanted = 4 * (u64::from(stride) * (width as u64 - 1) + u64::from(rows));
-            self.reserve("staging", wanted, U::MAP_READ | U::COPY_DST)?;
+            self.buffers.staging(&self.shared.gpu, wanted)?;
             samples.clear();
             samples.extend(piece.iter().map(|p| [p[0], p[1], p[2], 0.0]));
             self.write("samples", bytemuck::cast_slice(&samples))?;
@@ -502,7 +498,7 @@ impl Executable for Wgpu {
         self.clean = false;
         let waves = wave::of_step(model.pipeline.projector.as_ref(), work, self.pace.size());
         let losses: usize = waves.iter().map(Wave::losses).sum();
-        self.reserve("staging", 4 * losses.max(1) as u64, U::MAP_READ | U::COPY_DST)?;
+        self.buffers.staging(&self.shared.gpu, 4 * losses.max(1) as u64)?;
         let mut at = 0;
         for (i, wave) in waves.iter().enumerate() {
             if i > 0 {
@@ -557,7 +553,7 @@ impl Executable for Wgpu {
                 eps: adam.eps as f32,
             };
             self.write(&format!("rule_{s}"), bytemuck::bytes_of(&rule))?;
-            let bound = self.own(&kernel, s)?;
+            let bound = self.bind(&kernel, &format!("adam_{s}"), |part| format!("{part}_{s}"))?;
             let timestamp_writes = self.profile.as_mut().and_then(|p| p.around("adam"));
             let mut pass =
                 encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("adam"), timestamp_writes });
@@ -599,7 +595,7 @@ impl Executable for Wgpu {
         for wave in &waves {
             self.place(wave)?;
             let bytes = 4 * wave.rays.len() as u64;
-            self.reserve("staging", bytes, U::MAP_READ | U::COPY_DST)?;
+            self.buffers.staging(&self.shared.gpu, bytes)?;
             let (rows, rays) = (wave.rows, wave.rays.len() as u32);
             let step = Step { rows, ray_rows: rows, rays, stride: self.room, ..Step::default() };
             self.write("step", bytemuck::bytes_of(&step))?;
@@ -626,11 +622,8 @@ impl Executable for Wgpu {
             return Ok(());
         }
         self.flush();
-        let longest = 4 * model.arena.params.len() as u64;
-        self.reserve("staging", arena::PIECE.min(longest), U::MAP_READ | U::COPY_DST)?;
-        let Some(staging) = self.buffers.get("staging") else { return self.gpu().wait() };
         let size = self.shared.target().segment;
-        arena::download(self.gpu(), &self.buffers, &self.chain, &mut model.arena, size, staging)
+        arena::download(&self.shared.gpu, &mut self.buffers, &self.chain, &mut model.arena, size)
     }
 
     fn renew(&mut self) {

@@ -137,6 +137,13 @@ impl Buffers {
         Ok(true)
     }
 
+    /// The buffer `staging`, of at least `bytes`, through which results come back to the host.
+    pub fn staging(&mut self, gpu: &Gpu, bytes: u64) -> Result<wgpu::Buffer> {
+        use wgpu::BufferUsages as U;
+        self.reserve(gpu, "staging", bytes, U::MAP_READ | U::COPY_DST)?;
+        self.get("staging").cloned().ok_or_else(|| gpu.error("no buffer staging"))
+    }
+
     /// Total size in bytes.
     pub fn bytes(&self) -> u64 {
         self.0.values().map(wgpu::Buffer::size).sum()

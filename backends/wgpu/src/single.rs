@@ -66,8 +66,7 @@ impl Shared {
             run("sums", &chain.sums(), step, chain.summing(shares).min(MOST_GROUPS))?;
             run("merge", &chain.merge(), step, chain.merging(shares).min(MOST_GROUPS))?;
         }
-        let staging = gpu.buffer("staging", arena::PIECE, U::MAP_READ | U::COPY_DST)?;
-        arena::download(gpu, &buffers, &chain, &mut arena, target.segment, &staging)?;
+        arena::download(gpu, &mut buffers, &chain, &mut arena, target.segment)?;
         let [y, dx] =
             [("y", info.output * rows), ("dx", info.input * rows)].map(|(name, n)| self.fetch(&buffers, name, n));
         Ok([y?, arena.grads.to_vec(), dx?])

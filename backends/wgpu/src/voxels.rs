@@ -196,12 +196,12 @@ impl Room {
     pub(crate) fn read(&mut self, shared: &Shared, name: &str, count: usize, take: impl FnOnce(&[f32])) -> Result<()> {
         let gpu = &shared.gpu;
         let bytes = 4 * count as u64;
-        self.buffers.reserve(gpu, "staging", bytes, U::MAP_READ | U::COPY_DST)?;
-        let (Some(from), Some(staging)) = (self.buffers.get(name), self.buffers.get("staging")) else { return Ok(()) };
+        let staging = self.buffers.staging(gpu, bytes)?;
+        let Some(from) = self.buffers.get(name) else { return Ok(()) };
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        encoder.copy_buffer_to_buffer(from, 0, staging, 0, bytes);
+        encoder.copy_buffer_to_buffer(from, 0, &staging, 0, bytes);
         gpu.queue.submit([encoder.finish()]);
-        gpu.read(staging, bytes, |found| take(bytemuck::cast_slice(found)))
+        gpu.read(&staging, bytes, |found| take(bytemuck::cast_slice(found)))
     }
 
     /// Adds the numbers of `name` to those of `part`, in order.

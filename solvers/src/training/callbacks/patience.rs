@@ -6,7 +6,7 @@ use conefield_core::arena::Layout;
 use conefield_core::checkpoint::tensors_of;
 use conefield_core::error::{Result, ensure};
 use conefield_core::method::{Best, Record};
-use conefield_core::pages::Pages;
+use conefield_core::pages::{Pages, copy};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -92,8 +92,8 @@ impl Callback for Waiting {
 
     /// Restores the best state.
     fn finish(&mut self, run: &mut Run<'_>) -> Result<()> {
-        if let (Some(copy), Some(best)) = (&self.copy, self.waited.best) {
-            run.model.arena.params.copy_from_slice(copy);
+        if let (Some(kept), Some(best)) = (&self.copy, self.waited.best) {
+            copy(&mut run.model.arena.params, kept);
             run.best = Some(best);
         }
         Ok(())
@@ -139,7 +139,7 @@ impl Waiting {
         }
         let params = &run.model.arena.params;
         match &mut self.copy {
-            Some(copy) => copy.copy_from_slice(params),
+            Some(kept) => copy(kept, params),
             None => self.copy = Some(params.clone()),
         }
         Ok(true)
