@@ -3,7 +3,7 @@
 #   bash benches/ablation.sh DATA_FOLDER OUT_FOLDER [STEPS [SEEDS [VOLUMES [BACKEND [VARIANTS]]]]]
 # DATA_FOLDER holds volumes/*.nii.gz. Of VARIANTS, NAF is the spec naf: 16 levels, leaky ReLU, sigmoid. The others are ni-naf without
 # and with LayerNorm (LN), MCI weights and the FFT mask. MCI weights come from 600 steps on abdomen_128, for the abdomen from chest_128;
-# +LN+MCI@VOLUME,VOLUME:STEPS takes others. Each has STEPS (900) of 1024 rays with 192 samples inside the volume. Each of SEEDS
+# +LN+MCI@VOLUME,VOLUME:STEPS[:RATE] takes others. Each has STEPS (900) of 1024 rays with 192 samples inside the volume. Each of SEEDS
 # ("0 1 2") is another noise and another start. OUT_FOLDER/ablation.md has PSNR by steps, mean and half the range over SEEDS; VOLUME.png
 # has the curves. Steps are counted, not timed: other work on the machine changes nothing. BACKEND "wgpu" trains on a GPU.
 # What is there is not run again.
@@ -23,13 +23,14 @@ mkdir -p "$out"
 read -ra variants <<<"${7:-NAF field +LN +LN+MCI +LN+MCI+mask}"
 whole='callbacks=["rollback"]'
 published=(--set optimizer.lr=1e-3 --set projector.samples=192)
-# MCI weights of volumes, named VOLUME,VOLUME:STEPS.
+# MCI weights of volumes, named VOLUME,VOLUME:STEPS[:RATE].
 weights() {
-    local file=$out/$1.safetensors from
-    IFS=, read -ra from <<<"${1%:*}"
+    local file=$out/$1.safetensors from steps rate
+    IFS=: read -r from steps rate <<<"$1"
+    IFS=, read -ra from <<<"$from"
     from=("${from[@]/#/$data/volumes/}")
     [[ -f $file ]] || "$bin/conefield" -q pretrain "${from[@]/%/.nii.gz}" --spec ni-naf --set "$whole" "${published[@]}" \
-        --steps "${1#*:}" -o "$file" >/dev/null
+        --set "optimizer.lr=${rate:-1e-3}" --steps "$steps" -o "$file" >/dev/null
     echo "$file"
 }
 for volume in $volumes; do
