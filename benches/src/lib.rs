@@ -34,6 +34,7 @@ pub fn times(runs: usize, mut f: impl FnMut()) -> [f64; 3] {
 pub fn multiply_adds() -> f64 {
     struct Layer<'a>(&'a [f32], &'a [f32], &'a mut [f32]);
     impl Op for Layer<'_> {
+        type Number = f32;
         type Out = ();
         #[inline(always)]
         fn call<S: Simd>(self, s: S) {

@@ -353,6 +353,7 @@ mod tests {
     }
 
     impl<R: Real> Op for All<'_, R> {
+        type Number = R;
         type Out = [Vec<R>; 4];
         #[inline(always)]
         fn call<S: Simd>(self, s: S) -> Self::Out {

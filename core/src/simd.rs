@@ -74,6 +74,8 @@ pub trait Real:
     fn sin_cos(self) -> (Self, Self);
     /// Natural logarithm of `1 + exp(x)` without overflow.
     fn softplus(self) -> Self;
+    /// Runs `op` with the instructions for which its kernels are compiled.
+    fn dispatch<O: Op>(op: O) -> O::Out;
 }
 
 /// 2^r for |r| ≤ ½, highest power first (Remez, relative error 8e-8).
@@ -261,6 +263,16 @@ impl Real for f32 {
     fn softplus(self) -> Self {
         self.max(0.0) + (-self.abs()).exp().ln_1p()
     }
+    #[inline]
+    fn dispatch<O: Op>(op: O) -> O::Out {
+        #[cfg(target_arch = "x86_64")]
+        match level() {
+            Level::Avx512(s) => return with(s, op),
+            Level::Avx2(s) => return with(s, op),
+            _ => (),
+        }
+        at_baseline(op)
+    }
 }
 
 impl Real for f64 {
@@ -339,6 +351,10 @@ impl Real for f64 {
     fn softplus(self) -> Self {
         self.max(0.0) + (-self.abs()).exp().ln_1p()
     }
+    #[inline]
+    fn dispatch<O: Op>(op: O) -> O::Out {
+        at_baseline(op)
+    }
 }
 
 /// Single instructions of AVX-512 that take several on other instruction sets.
@@ -398,19 +414,43 @@ fn one_by_one<S: Simd, R: Real, const K: usize>(s: S, line: &[R], at: V<S, R>) -
     all
 }
 
-/// Work compiled for every instruction set. `call` must be `#[inline(always)]`.
+/// Work on numbers of one type, compiled for several instruction sets. `call` must be `#[inline(always)]`.
 pub trait Op {
+    /// The numbers worked on. `f32` has three sets of instructions: the baseline, AVX2 and AVX-512. `f64` checks the
+    /// arithmetic and has the baseline only.
+    type Number: Real;
     /// Result of the work.
     type Out;
     /// Does the work with the instructions of `s`.
     fn call<S: Simd>(self, s: S) -> Self::Out;
 }
 
-/// Runs `op` with the best instruction set of this machine, or the one named by `CONEFIELD_SIMD` (`avx512`, `avx2`,
-/// `sse4.2`, `baseline`) if the machine has it.
+/// Runs `op` with the best instructions that it has for this machine, or those named by `CONEFIELD_SIMD` (`avx512`,
+/// `avx2`, `baseline`) if the machine has them.
 #[inline]
 pub fn run<O: Op>(op: O) -> O::Out {
-    fearless_simd::dispatch!(level(), s => op.call(s))
+    O::Number::dispatch(op)
+}
+
+#[inline(always)]
+fn with<S: Simd, O: Op>(s: S, op: O) -> O::Out {
+    s.vectorize(
+        #[inline(always)]
+        || op.call(s),
+    )
+}
+
+#[inline(always)]
+fn at_baseline<O: Op>(op: O) -> O::Out {
+    #[cfg(target_arch = "x86_64")]
+    match level().as_sse2() {
+        Some(s) => with(s, op),
+        None => unreachable!("every x86-64 processor has SSE2"),
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    {
+        fearless_simd::dispatch!(level(), s => op.call(s))
+    }
 }
 
 /// The instruction set that [`run`] uses.
@@ -422,7 +462,6 @@ pub fn level() -> Level {
         {
             let wanted = match std::env::var("CONEFIELD_SIMD").as_deref() {
                 Ok("avx2") => best.as_avx2().map(Level::Avx2),
-                Ok("sse4.2") => best.as_sse4_2().map(Level::Sse4_2),
                 Ok("baseline") => best.as_sse2().map(Level::Sse2),
                 _ => None,
             };
@@ -440,8 +479,6 @@ pub fn level_name() -> &'static str {
         Level::Avx512(_) => "avx512",
         #[cfg(target_arch = "x86_64")]
         Level::Avx2(_) => "avx2",
-        #[cfg(target_arch = "x86_64")]
-        Level::Sse4_2(_) => "sse4.2",
         _ => "baseline",
     }
 }
@@ -501,6 +538,7 @@ mod tests {
 
     struct Normal<'a, R>(&'a [R]);
     impl<R: Real> Op for Normal<'_, R> {
+        type Number = R;
         type Out = Vec<[f64; 5]>;
         #[inline(always)]
         fn call<S: Simd>(self, s: S) -> Self::Out {
@@ -549,6 +587,7 @@ mod tests {
 
     struct Neighbours<'a, R>(&'a [R], f64);
     impl<R: Real> Op for Neighbours<'_, R> {
+        type Number = R;
         type Out = Vec<[f64; 3]>;
         #[inline(always)]
         fn call<S: Simd>(self, s: S) -> Self::Out {

@@ -203,6 +203,7 @@ mod tests {
 
     struct At<'a>(&'a Grid, &'a [f64]);
     impl Op for At<'_> {
+        type Number = f64;
         type Out = Located<f64>;
         #[inline(always)]
         fn call<S: Simd>(self, s: S) -> Located<f64> {

@@ -147,6 +147,7 @@ struct Forward<'a, R> {
 }
 
 impl<R: Real> Op for Forward<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(mut self, s: S) {
@@ -179,6 +180,7 @@ struct Backward<'a, R> {
 }
 
 impl<R: Real> Op for Backward<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(mut self, s: S) {

@@ -435,6 +435,7 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
 }
 
 impl<R: Real, P: Stored<R>> Op for Forward<'_, R, P> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -586,6 +587,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
 }
 
 impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -707,6 +709,7 @@ mod tests {
 
     struct Locate<'a, R>(&'a mut Located<R>, &'a Level, [u32; 3], Tile<'a, R>);
     impl<R: Real> Op for Locate<'_, R> {
+        type Number = R;
         type Out = ();
         #[inline(always)]
         fn call<S: Simd>(self, s: S) {

@@ -26,6 +26,7 @@ pub fn start(seed: u64, params: &mut [f32]) {
 macro_rules! by_features {
     ($op:ident) => {
         impl<R: Real, P: Stored<R>> Op for $op<'_, R, P> {
+            type Number = R;
             type Out = ();
             #[inline(always)]
             fn call<S: Simd>(self, s: S) {

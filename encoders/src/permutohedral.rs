@@ -549,6 +549,7 @@ mod tests {
 
     struct Locate<'a, R>(&'a mut Located<R>, &'a Level, Tile<'a, R>);
     impl<R: Real> Op for Locate<'_, R> {
+        type Number = R;
         type Out = ();
         #[inline(always)]
         fn call<S: Simd>(self, s: S) {

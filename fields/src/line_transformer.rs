@@ -134,6 +134,7 @@ struct First<'a, R> {
 }
 
 impl<R: Real> Op for First<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -154,6 +155,7 @@ struct Tail<'a, 'b, R> {
 }
 
 impl<R: Real> Op for Tail<'_, '_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -185,6 +187,7 @@ struct TailBackward<'a, 'b, R> {
 }
 
 impl<R: Real> Op for TailBackward<'_, '_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -218,6 +221,7 @@ struct FirstBack<'a, R> {
 }
 
 impl<R: Real> Op for FirstBack<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

@@ -130,6 +130,7 @@ fn split<R>(data: &mut [R], range: Range<usize>, rows: usize) -> (&[R], &mut [R]
 }
 
 impl<R: Real> Op for Forward<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -165,6 +166,7 @@ struct Backward<'a, R> {
 }
 
 impl<R: Real> Op for Backward<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

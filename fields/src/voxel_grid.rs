@@ -115,6 +115,7 @@ struct Forward<'a, R, P> {
 }
 
 impl<R: Real, P: Stored<R>> Op for Forward<'_, R, P> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -143,6 +144,7 @@ struct Backward<'a, R, P> {
 }
 
 impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(mut self, s: S) {

@@ -87,6 +87,7 @@ struct Forward<'a, R> {
 }
 
 impl<R: Real> Op for Forward<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(mut self, s: S) {
@@ -163,6 +164,7 @@ impl<R: Real> Backward<'_, R> {
 }
 
 impl<R: Real> Op for Backward<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(mut self, s: S) {

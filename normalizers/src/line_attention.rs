@@ -226,6 +226,7 @@ struct Attend<'a, 'b, R> {
 }
 
 impl<R: Real> Op for Attend<'_, '_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -322,6 +323,7 @@ struct Feed<'a, 'b, R> {
 }
 
 impl<R: Real> Op for Feed<'_, '_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -349,6 +351,7 @@ struct FeedBack<'a, 'b, R> {
 }
 
 impl<R: Real> Op for FeedBack<'_, '_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -375,6 +378,7 @@ struct AttendBack<'a, 'b, R> {
 }
 
 impl<R: Real> Op for AttendBack<'_, '_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

@@ -60,6 +60,7 @@ struct Block<'a, H> {
 }
 
 impl<H: Half> Op for Block<'_, H> {
+    type Number = f32;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

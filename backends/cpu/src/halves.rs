@@ -65,6 +65,7 @@ struct Round<'a, H> {
 }
 
 impl<H: Half> Op for Round<'_, H> {
+    type Number = f32;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, _: S) {

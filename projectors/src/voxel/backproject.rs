@@ -45,6 +45,7 @@ struct Planes<'a, R> {
 }
 
 impl<R: Real> Op for Planes<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

@@ -186,6 +186,7 @@ struct Forward<'a, R> {
 }
 
 impl<R: Real> Op for Forward<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -263,6 +264,7 @@ struct Adjoint<'a, R> {
 }
 
 impl<R: Real> Op for Adjoint<'_, R> {
+    type Number = R;
     type Out = Vec<R>;
     #[inline(always)]
     fn call<S: Simd>(self, s: S) -> Vec<R> {

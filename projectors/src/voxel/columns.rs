@@ -254,6 +254,7 @@ impl<R> Plane<R> {
 }
 
 impl<R: Real> Op for Forward<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -448,6 +449,7 @@ pub fn adjoint<R: Real>(
 struct Lengthen<'a, R>(&'a Column, &'a mut [R]);
 
 impl<R: Real> Op for Lengthen<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, _: S) {
@@ -472,6 +474,7 @@ struct Adjoint<'a, R> {
 }
 
 impl<R: Real> Op for Adjoint<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

@@ -118,6 +118,7 @@ struct Paint<'a, R> {
 }
 
 impl<R: Real> Op for Paint<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -164,6 +165,7 @@ struct Collect<'a, R> {
 }
 
 impl<R: Real> Op for Collect<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

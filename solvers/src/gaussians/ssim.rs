@@ -131,6 +131,7 @@ struct Weighted<'a> {
 }
 
 impl Op for Weighted<'_> {
+    type Number = f32;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

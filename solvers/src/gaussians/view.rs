@@ -359,6 +359,7 @@ struct Splat<'a, R> {
 }
 
 impl<R: Real> Op for Splat<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
@@ -406,6 +407,7 @@ struct Gather<'a, R> {
 }
 
 impl<R: Real> Op for Gather<'_, R> {
+    type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

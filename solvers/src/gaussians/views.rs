@@ -295,6 +295,7 @@ struct AdamStep<'a> {
 }
 
 impl Op for AdamStep<'_> {
+    type Number = f32;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {

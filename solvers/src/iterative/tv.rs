@@ -51,6 +51,7 @@ struct Variation<'a> {
 }
 
 impl Op for Variation<'_> {
+    type Number = f32;
     type Out = f64;
     #[inline(always)]
     fn call<S: Simd>(self, s: S) -> f64 {
@@ -345,6 +346,7 @@ struct Sweep<'a, L> {
 struct Sweeping<'a, L>(Sweep<'a, L>, Scale);
 
 impl<L: Lines> Op for Sweeping<'_, L> {
+    type Number = f32;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
