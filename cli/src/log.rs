@@ -3,14 +3,17 @@
 
 use crate::out::{LONGEST_LINE, plain_line};
 use crate::progress;
-use std::fmt;
+use std::fmt::Debug;
 use std::io::{self, IsTerminal, Write};
 use tracing::field::Field;
+use tracing::level_filters::LevelFilter;
 use tracing::warn;
-use tracing_subscriber::EnvFilter;
 use tracing_subscriber::field::MakeExt as _;
-use tracing_subscriber::fmt::format;
-use tracing_subscriber::fmt::format::Writer;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::fmt;
+use tracing_subscriber::fmt::format::{self, Writer};
+use tracing_subscriber::layer::{Layer as _, SubscriberExt as _};
+use tracing_subscriber::util::SubscriberInitExt as _;
 
 /// The environment variable for the log level without --verbose and --quiet.
 const VARIABLE: &str = "RUST_LOG";
@@ -19,31 +22,31 @@ const VARIABLE: &str = "RUST_LOG";
 /// in `RUST_LOG`.
 pub fn start(verbose: u8, quiet: bool) {
     let level = match (quiet, verbose) {
-        (true, _) => "error",
-        (_, 0) => "info",
-        (_, 1) => "debug",
-        _ => "trace",
+        (true, _) => LevelFilter::ERROR,
+        (_, 0) => LevelFilter::INFO,
+        (_, 1) => LevelFilter::DEBUG,
+        _ => LevelFilter::TRACE,
     };
     let asked = std::env::var(VARIABLE).ok().filter(|a| !a.is_empty() && !quiet && verbose == 0);
-    let filter = asked.as_deref().map(EnvFilter::try_new);
-    let _ = tracing_subscriber::fmt()
-        .with_env_filter(match &filter {
-            Some(Ok(_)) => EnvFilter::new(asked.as_deref().unwrap_or(level)),
-            _ => EnvFilter::new(level),
-        })
+    let filter = asked.as_deref().map(str::parse::<Targets>);
+    let written = fmt::layer()
         .fmt_fields(format::debug_fn(field).delimited(", "))
         .with_writer(|| Stderr)
         .log_internal_errors(false)
         .with_ansi(io::stderr().is_terminal())
-        .with_target(false)
-        .try_init();
+        .with_target(false);
+    let kept = match &filter {
+        Some(Ok(targets)) => targets.clone(),
+        _ => Targets::new().with_default(level),
+    };
+    let _ = tracing_subscriber::registry().with(written.with_filter(kept)).try_init();
     if let Some(Err(e)) = filter {
         warn!("{VARIABLE}: {e}; it is ignored");
     }
 }
 
 /// Formats one field of an event; the message has no name.
-fn field(writer: &mut Writer<'_>, field: &Field, value: &dyn fmt::Debug) -> fmt::Result {
+fn field(writer: &mut Writer<'_>, field: &Field, value: &dyn Debug) -> std::fmt::Result {
     let text = plain_line(&format!("{value:?}"), LONGEST_LINE);
     if field.name() == "message" { write!(writer, "{text}") } else { write!(writer, "{}={text}", field.name()) }
 }

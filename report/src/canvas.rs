@@ -1,10 +1,9 @@
 //! A drawing canvas: rectangles, text in DejaVu Sans, and colour maps.
 
+use crate::pixels::{Pixels, Rgb};
 use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
 use conefield_core::{Error, Result};
 use conefield_io::write_atomic;
-use image::{ExtendedColorType, ImageEncoder, Rgb, RgbImage};
-use std::io::Write;
 use std::path::Path;
 
 /// Alignment of a text along its line.
@@ -17,16 +16,16 @@ pub(crate) enum Align {
 
 /// Pixels and the font.
 pub(crate) struct Canvas {
-    pub image: RgbImage,
+    pub image: Pixels,
     font: FontRef<'static>,
 }
 
 impl Canvas {
     /// A picture filled with one colour.
-    pub fn new(width: u32, height: u32, colour: Rgb<u8>) -> Result<Self> {
+    pub fn new(width: u32, height: u32, colour: Rgb) -> Result<Self> {
         let font = FontRef::try_from_slice(dejavu::sans::regular())
             .map_err(|e| Error::invalid("the embedded font", "DejaVu Sans", e, "a font"))?;
-        Ok(Self { image: RgbImage::from_pixel(width, height, colour), font })
+        Ok(Self { image: Pixels::new(width, height, colour), font })
     }
 
     /// Width of `text` at `size` pixels a line.
@@ -58,7 +57,7 @@ impl Canvas {
     }
 
     /// Draws one line of text; `y` is its top.
-    pub fn text(&mut self, at: (f32, f32), align: Align, size: f32, colour: Rgb<u8>, text: &str) {
+    pub fn text(&mut self, at: (f32, f32), align: Align, size: f32, colour: Rgb, text: &str) {
         let width = self.text_width(text, size);
         let mut x = match align {
             Align::Left => at.0,
@@ -82,44 +81,36 @@ impl Canvas {
                 if px < 0.0 || py < 0.0 {
                     return;
                 }
-                if let Some(p) = self.image.get_pixel_mut_checked(px as u32, py as u32) {
-                    for k in 0..3 {
-                        let (a, b) = (f32::from(p.0[k]), f32::from(colour.0[k]));
-                        p.0[k] = (a + (b - a) * cover.clamp(0.0, 1.0)).round() as u8;
-                    }
+                let (px, py) = (px as u32, py as u32);
+                if px < self.image.width && py < self.image.height {
+                    let under = self.image.get(px, py).0;
+                    self.image.set(px, py, Rgb(std::array::from_fn(|k| {
+                        let (a, b) = (f32::from(under[k]), f32::from(colour.0[k]));
+                        (a + (b - a) * cover.clamp(0.0, 1.0)).round() as u8
+                    })));
                 }
             });
         }
     }
 
     /// Fills a rectangle, clipped to the picture.
-    pub fn fill(&mut self, x: u32, y: u32, width: u32, height: u32, mut colour: impl FnMut(u32, u32) -> Rgb<u8>) {
-        for dy in 0..height.min(self.image.height().saturating_sub(y)) {
-            for dx in 0..width.min(self.image.width().saturating_sub(x)) {
-                self.image.put_pixel(x + dx, y + dy, colour(dx, dy));
+    pub fn fill(&mut self, x: u32, y: u32, width: u32, height: u32, mut colour: impl FnMut(u32, u32) -> Rgb) {
+        for dy in 0..height.min(self.image.height.saturating_sub(y)) {
+            for dx in 0..width.min(self.image.width.saturating_sub(x)) {
+                self.image.set(x + dx, y + dy, colour(dx, dy));
             }
         }
     }
 
     /// Writes the picture as PNG.
     pub fn write_png(&self, path: &Path) -> Result<()> {
-        write_png(path, self.image.width(), self.image.height(), self.image.as_raw())
+        write_png(path, &self.image)
     }
 }
 
-/// Writes 8-bit RGB pixels as PNG.
-pub(crate) fn write_png(path: &Path, width: u32, height: u32, rgb: &[u8]) -> Result<()> {
-    write_atomic(path, |w| encode_png(w, path, width, height, rgb))
-}
-
-/// Encodes 8-bit RGB pixels as PNG; `place` is the name in errors.
-pub(crate) fn encode_png(out: impl Write, place: &Path, width: u32, height: u32, rgb: &[u8]) -> Result<()> {
-    image::codecs::png::PngEncoder::new(out).write_image(rgb, width, height, ExtendedColorType::Rgb8).map_err(|e| {
-        match e {
-            image::ImageError::IoError(e) => Error::io(place, e),
-            e => Error::invalid(place.display().to_string(), "picture", e, "pixels that PNG can hold"),
-        }
-    })
+/// Writes a picture as PNG.
+pub(crate) fn write_png(path: &Path, picture: &Pixels) -> Result<()> {
+    write_atomic(path, |w| picture.write_png(w, path))
 }
 
 /// A round number that bounds all but half a percent of `sizes`.
@@ -138,26 +129,26 @@ pub(crate) fn round_above(mut sizes: Vec<f32>) -> f32 {
 }
 
 /// Black at 0, white at 1.
-pub(crate) fn grey(x: f32) -> Rgb<u8> {
+pub(crate) fn grey(x: f32) -> Rgb {
     Rgb([(x.clamp(0.0, 1.0) * 255.0).round() as u8; 3])
 }
 
 /// Blue at −1, white at 0, red at 1, so that equality and sign are easy to see.
-pub(crate) fn diverging(x: f32) -> Rgb<u8> {
+pub(crate) fn diverging(x: f32) -> Rgb {
     const ENDS: [[f32; 3]; 5] =
         [[10.0, 40.0, 110.0], [67.0, 140.0, 195.0], [250.0, 250.0, 250.0], [225.0, 110.0, 80.0], [110.0, 5.0, 30.0]];
     between(&ENDS, (x.clamp(-1.0, 1.0) + 1.0) / 2.0)
 }
 
 /// From dark violet at 0 over blue and green to yellow at 1, with lightness increasing with the value (after viridis).
-pub(crate) fn sequential(x: f32) -> Rgb<u8> {
+pub(crate) fn sequential(x: f32) -> Rgb {
     const ENDS: [[f32; 3]; 5] =
         [[68.0, 1.0, 84.0], [59.0, 82.0, 139.0], [33.0, 145.0, 140.0], [94.0, 201.0, 98.0], [253.0, 231.0, 37.0]];
     between(&ENDS, x.clamp(0.0, 1.0))
 }
 
 /// The colour at `x`, from 0 to 1, interpolated between equidistant colours.
-fn between(ends: &[[f32; 3]; 5], x: f32) -> Rgb<u8> {
+fn between(ends: &[[f32; 3]; 5], x: f32) -> Rgb {
     let at = x * 4.0;
     let low = (at as usize).min(3);
     let part = at - low as f32;
@@ -204,7 +195,7 @@ mod tests {
     fn text_is_drawn_and_cut() {
         let mut c = Canvas::new(200, 30, Rgb([255; 3])).unwrap();
         c.text((-20.0, 2.0), Align::Left, 20.0, Rgb([0; 3]), "outside µ −1.5 and further than the picture is wide");
-        assert!(c.image.pixels().any(|p| p.0[0] < 60));
+        assert!(c.image.colours().any(|p| p.0[0] < 60));
         let short = c.shortened("a very long caption", 20.0, 60.0);
         assert!(short.ends_with('…') && c.text_width(&short, 20.0) <= 60.0, "{short}");
     }

@@ -1,6 +1,7 @@
 //! Line plots: quality against time, loss against step.
 
 use crate::canvas::{number, write_png};
+use crate::pixels::{Pixels, Rgb};
 use conefield_core::{Error, Result};
 use plotters::coord::ranged1d::{AsRangedCoord, ValueFormatter};
 use plotters::prelude::*;
@@ -114,16 +115,16 @@ pub fn panels_png(path: impl AsRef<Path>, panels: &[Panel<'_>]) -> Result<()> {
     let width: u32 = panels.iter().map(|p| p.options.size[0]).sum();
     let height = panels.iter().map(|p| p.options.size[1]).max().unwrap_or(0);
     register();
-    let mut pixels = vec![255u8; 3 * width as usize * height as usize];
+    let mut picture = Pixels::new(width, height, Rgb([255; 3]));
     {
-        let mut area = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
+        let mut area = BitMapBackend::with_buffer(&mut picture.bytes, (width, height)).into_drawing_area();
         for panel in panels {
             let (left, right) = area.split_horizontally(panel.options.size[0]);
             panel.draw(&place, &left)?;
             area = right;
         }
     }
-    write_png(path, width, height, &pixels)
+    write_png(path, &picture)
 }
 
 impl Panel<'_> {
@@ -320,10 +321,10 @@ mod tests {
         let (_dir, folder) = folder();
         let path = folder.join("curves.png");
         curves_png(&path, "Engine, 50 views", "time (s)", "PSNR (dB)", &series()).unwrap();
-        let image = image::open(&path).unwrap().to_rgb8();
-        assert_eq!(image.dimensions(), (1200, 800));
+        let image = Pixels::open(&path).unwrap();
+        assert_eq!((image.width, image.height), (1200, 800));
         for colour in &COLOURS[..4] {
-            assert!(image.pixels().any(|p| p.0 == [colour.0, colour.1, colour.2]), "{colour:?} is not there");
+            assert!(image.colours().any(|p| p.0 == [colour.0, colour.1, colour.2]), "{colour:?} is not there");
         }
         let options = CurveOptions { log_x: true, ..Default::default() };
         let path = folder.join("curves_log.png");
@@ -340,10 +341,10 @@ mod tests {
         let (series, options) = (series(), CurveOptions { size: [600, 400], ..Default::default() });
         let panel = |title| Panel { title, labels: ["x", "y"], series: &series, options: &options };
         panels_png(&path, &[panel("left"), panel("right")]).unwrap();
-        let image = image::open(&path).unwrap().to_rgb8();
-        assert_eq!(image.dimensions(), (1200, 400));
+        let image = Pixels::open(&path).unwrap();
+        assert_eq!((image.width, image.height), (1200, 400));
         // Both halves are equal, except for the titles.
-        let same = (60..400).all(|y| (0..600).all(|x| image.get_pixel(x, y) == image.get_pixel(x + 600, y)));
+        let same = (60..400).all(|y| (0..600).all(|x| image.get(x, y) == image.get(x + 600, y)));
         assert!(same);
         let nothing = vec![];
         let empty = Panel { title: "", labels: ["", ""], series: &nothing, options: &options };
@@ -361,12 +362,12 @@ mod tests {
             let path = folder.join("bands.png");
             let options = CurveOptions { bands, log_x: true, ..Default::default() };
             curves_png_with(&path, "", "", "", &series, &options).unwrap();
-            image::open(&path).unwrap().to_rgb8()
+            Pixels::open(&path).unwrap()
         };
         // The second colour, lightened.
         let [r, g, b] = [213.0f64, 94.0, 0.0].map(|c| (255.0 + (c - 255.0) * 0.18).round());
         let like = |p: &[u8; 3]| [r, g, b].iter().zip(p).all(|(a, b)| (a - f64::from(*b)).abs() < 6.0);
-        let count = |image: &image::RgbImage| image.pixels().filter(|p| like(&p.0)).count();
+        let count = |image: &Pixels| image.colours().filter(|p| like(&p.0)).count();
         let (with, without) = (picture(vec![("high".into(), band)]), picture(vec![]));
         assert!(count(&with) > 20_000 && count(&without) < 500, "{} {}", count(&with), count(&without));
         // A gap if one side cannot be shown.

@@ -11,6 +11,7 @@
 mod canvas;
 mod curves;
 pub mod page;
+mod pixels;
 mod slices;
 mod survey;
 mod table;
@@ -20,6 +21,7 @@ pub mod text;
 mod testing;
 
 pub use curves::{Band, Corner, CurveOptions, Panel, curves_png, curves_png_with, panels_png};
+pub use pixels::{Pixels, Rgb};
 pub use slices::{MiddleSlices, compare_png, features_png, result_png, slices_png};
 pub use survey::survey_png;
 pub use table::Table;

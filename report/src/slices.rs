@@ -1,17 +1,17 @@
 //! Pictures of volumes: middle slices side by side, with differences.
 
 use crate::canvas::{Align, Canvas, diverging, grey, number, round_above};
+use crate::pixels::Rgb;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Part;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
-use image::Rgb;
 use ndarray::{Array2, ArrayView3, Axis, s};
 use std::ops::Range;
 use std::path::Path;
 
-const INK: Rgb<u8> = Rgb([20; 3]);
-const PAPER: Rgb<u8> = Rgb([255; 3]);
+const INK: Rgb = Rgb([20; 3]);
+const PAPER: Rgb = Rgb([255; 3]);
 /// Width in pixels to which small volumes are enlarged, and maximum width of large ones.
 const WIDTH: [f64; 2] = [1000.0, 4000.0];
 const GAP: u32 = 8;
@@ -346,7 +346,7 @@ fn draw_cell(
 }
 
 /// Red, green and blue from 0 to 1; paper colour if one is unknown.
-fn mixed(colours: [f32; 3]) -> Rgb<u8> {
+fn mixed(colours: [f32; 3]) -> Rgb {
     if colours.iter().all(|c| c.is_finite()) { Rgb(colours.map(|c| grey(c).0[0])) } else { PAPER }
 }
 
@@ -356,7 +356,7 @@ fn draw_bar(
     [x, y, width, height]: [u32; 4],
     text: f32,
     ends: [f64; 2],
-    colour: impl Fn(f32) -> Rgb<u8>,
+    colour: impl Fn(f32) -> Rgb,
 ) {
     let height = height.min((text * 22.0) as u32).max((text * 6.0) as u32);
     canvas.fill(x, y, width, height, |dx, dy| {
@@ -372,6 +372,7 @@ fn draw_bar(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::pixels::Pixels;
     use crate::testing::{data, folder};
     use ndarray::Array3;
 
@@ -395,13 +396,13 @@ mod tests {
         // Thick slices: half as many voxels along z for the same ball.
         let (a, b) = (ball([48, 48, 24], [1.0, 1.0, 2.0], 0.3), ball([48, 48, 24], [1.0, 1.0, 2.0], 1.5));
         slices_png(&path, &[("reference", &a), ("result 31.2 dB", &b)], [0.0, 1.0], Some(0)).unwrap();
-        let image = image::open(&path).unwrap().to_rgb8();
-        assert!(image.width() >= 900, "{}", image.width());
+        let image = Pixels::open(&path).unwrap();
+        assert!(image.width >= 900, "{}", image.width);
         // Equal sides in mm are equal sides in pixels: three square rows.
-        assert!(image.height() > 1000 && image.height() < 1200, "{}", image.height());
+        assert!(image.height > 1000 && image.height < 1200, "{}", image.height);
         // The difference contains red and blue.
-        assert!(image.pixels().any(|p| p.0[0] > 150 && p.0[2] < 120));
-        assert!(image.pixels().any(|p| p.0[2] > 150 && p.0[0] < 120));
+        assert!(image.colours().any(|p| p.0[0] > 150 && p.0[2] < 120));
+        assert!(image.colours().any(|p| p.0[2] > 150 && p.0[0] < 120));
     }
 
     #[test]
@@ -409,11 +410,11 @@ mod tests {
         let (_dir, folder) = folder();
         let path = folder.join("alone.png");
         result_png(&path, None, &ball([40, 40, 20], [1.0; 3], 0.5)).unwrap();
-        let image = image::open(&path).unwrap().to_rgb8();
+        let image = Pixels::open(&path).unwrap();
         // Three of the same width, the axial one twice as high as the others.
-        assert!(image.width() > 900 && image.height() < image.width() / 2, "{:?}", image.dimensions());
-        let black = |x: u32| (0..image.height()).filter(|y| image.get_pixel(x, *y).0.iter().all(|c| *c < 60)).count();
-        let (axial, coronal) = (black(20), black(20 + image.width() * 3 / 10));
+        assert!(image.width > 900 && image.height < image.width / 2, "{:?}", (image.width, image.height));
+        let black = |x: u32| (0..image.height).filter(|y| image.get(x, *y).0.iter().all(|c| *c < 60)).count();
+        let (axial, coronal) = (black(20), black(20 + image.width * 3 / 10));
         assert!(coronal > 50 && axial > coronal * 3 / 2, "{axial} {coronal}");
     }
 
@@ -424,7 +425,7 @@ mod tests {
         let (a, b, c) = (ball([40; 3], [1.3; 3], 0.3), ball([40; 3], [1.3; 3], 1.0), ball([40; 3], [1.3; 3], 2.5));
         let results = [("NAF 28.1 dB", &b), ("FDK 21.0 dB, a caption that is too long for its column", &c)];
         compare_png(&path, ("reference", &a), &results, [0.0, 1.0]).unwrap();
-        assert!(image::open(&path).unwrap().width() >= 900);
+        assert!(Pixels::open(&path).unwrap().width >= 900);
     }
 
     #[test]
@@ -439,14 +440,15 @@ mod tests {
         let sizes = [4, 8].map(|n| {
             let path = folder.join(format!("compare{n}.png"));
             compare_png(&path, ("reference", &ball([24; 3], [2.0; 3], 0.3)), &results[..n], [0.0, 1.0]).unwrap();
-            image::open(&path).unwrap().to_rgb8().dimensions()
+            let image = Pixels::open(&path).unwrap();
+            (image.width, image.height)
         });
         // A second band below the first, with columns of the same width.
         assert_eq!((sizes[1].0, sizes[1].1), (sizes[0].0, 2 * sizes[0].1));
         assert!(sizes[0].0 >= 1000, "{sizes:?}");
         let path = folder.join("slices8.png");
         slices_png(&path, &results, [0.0, 1.0], None).unwrap();
-        assert!(image::open(&path).unwrap().width() >= 1000);
+        assert!(Pixels::open(&path).unwrap().width >= 1000);
     }
 
     #[test]
@@ -471,8 +473,8 @@ mod tests {
         let red = values(|x, _, _| if x == 7 { f32::NAN } else { f32::from(u8::from(x < 4)) });
         let (green, blue) = (values(|_, y, _| f32::from(u8::from(y < 4))), values(|_, _, _| 0.5));
         features_png(&path, &values(|x, y, z| (x + y + z) as f32), [&red, &green, &blue]).unwrap();
-        let image = image::open(&path).unwrap().to_rgb8();
-        let count = |c: [u8; 3]| image.pixels().filter(|p| p.0 == c).count();
+        let image = Pixels::open(&path).unwrap();
+        let count = |c: [u8; 3]| image.colours().filter(|p| p.0 == c).count();
         for colour in [[255, 255, 128], [255, 0, 128], [0, 255, 128], [0, 0, 128]] {
             assert!(count(colour) > 1000, "{colour:?}");
         }

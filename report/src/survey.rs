@@ -1,19 +1,18 @@
 //! A picture of a scan's geometry: source path, detector, volume, and the part of it seen by the views.
 
 use crate::canvas::{number, sequential, write_png};
+use crate::pixels::{Pixels, Rgb};
 use crate::curves::{FONT, register};
 use conefield_core::geometry::{Geometry, Vec3, View};
 use conefield_core::{Error, Result};
 use conefield_diagnosis::{Setup, setup, share_of_views};
-use image::imageops::{FilterType, resize};
-use image::{Rgb, RgbImage};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use std::ops::Range;
 use std::path::Path;
 
-/// Pixels of the picture, and the supersampling factor of the drawing.
+/// Pixels of the picture, and the supersampling factor of the drawing: [`Pixels::halved`] takes it back.
 const SIZE: [u32; 2] = [1480, 1180];
 const FINER: u32 = 2;
 /// Height of a line of text.
@@ -46,23 +45,21 @@ fn text_of<E: std::error::Error + Send + Sync>(e: DrawingAreaErrorKind<E>) -> St
 pub fn survey_png(path: impl AsRef<Path>, title: &str, geometry: &Geometry) -> Result<()> {
     let path = path.as_ref();
     let picture = survey_picture(&path.display().to_string(), title, geometry)?;
-    write_png(path, picture.width(), picture.height(), picture.as_raw())
+    write_png(path, &picture)
 }
 
 /// The picture of [`survey_png`]; `place` is the name in errors.
-pub(crate) fn survey_picture(place: &str, title: &str, geometry: &Geometry) -> Result<RgbImage> {
+pub(crate) fn survey_picture(place: &str, title: &str, geometry: &Geometry) -> Result<Pixels> {
     geometry.validate(place)?;
     register();
     let [width, height] = SIZE.map(|n| n * FINER);
-    let mut pixels = vec![255u8; 3 * width as usize * height as usize];
+    let mut fine = Pixels::new(width, height, Rgb([255; 3]));
     {
-        let area = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
+        let area = BitMapBackend::with_buffer(&mut fine.bytes, (width, height)).into_drawing_area();
         let picture = Picture { geometry, setup: setup(geometry) };
         picture.draw(&area, title).map_err(|e| Error::invalid(place, "picture", e, "a geometry that can be drawn"))?;
     }
-    let fine: RgbImage = image::ImageBuffer::<Rgb<u8>, _>::from_raw(width, height, pixels)
-        .ok_or_else(|| Error::invalid(place, "picture", "too few pixels", "a whole picture"))?;
-    Ok(resize(&fine, SIZE[0], SIZE[1], FilterType::Triangle))
+    Ok(fine.halved())
 }
 
 struct Picture<'g> {

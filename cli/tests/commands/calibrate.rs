@@ -1,5 +1,6 @@
 //! `conefield calibrate`: a wrong geometry is corrected, and a right one is unchanged.
 
+use conefield_report::Pixels;
 use crate::common::{conefield, done, json, refused, text};
 use conefield_core::geometry::{norm, sub};
 use conefield_core::orbit::CircularOrbit;
@@ -63,7 +64,7 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
     assert!((pixels - 3.0).abs() < 0.1 && deviation < 0.1, "{pixels} ± {deviation}");
     let held_out = &found["held_out"];
     assert!(number(&held_out["after"]) < 0.5 * number(&held_out["before"]), "{held_out}");
-    assert!(image::open(at("curves.png")).unwrap().width() > 1000);
+    assert!(Pixels::open(at("curves.png")).unwrap().width > 1000);
     // The curve has its minimum at the estimate.
     let curve = u["curve"].as_array().unwrap();
     let lowest = curve.iter().min_by(|a, b| number(&a[1]).total_cmp(&number(&b[1]))).unwrap();

@@ -1,5 +1,6 @@
 //! `compare`: one table in three forms, one picture, and runs that can be used alone.
 
+use conefield_report::Pixels;
 use crate::common::{conefield, done, json, refused, text};
 use serde_json::Value;
 use std::fs;
@@ -112,8 +113,8 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
     assert_eq!([&methods[0]["samples_per_s"], &methods[0]["loss"]], [&Value::Null; 2]);
     assert!(methods[0]["held_out"].as_f64().is_some_and(|e| e > 0.0) && rows[1][5] != "-");
     assert_eq!([&methods[1]["steps"], &methods[2]["steps"]], [3, 3]);
-    let picture = image::open(out.join("compare.png")).unwrap();
-    assert!((1000..3000).contains(&picture.width()) && (600..3000).contains(&picture.height()));
+    let picture = Pixels::open(out.join("compare.png")).unwrap();
+    assert!((1000..3000).contains(&picture.width) && (600..3000).contains(&picture.height));
 
     // A run that was interrupted before its first checkpoint, and an added one; the others stay unchanged.
     let before = times(&out.join("fdk"));
@@ -169,7 +170,7 @@ fn a_method_that_fails_leaves_the_others_their_rows() {
     assert_eq!(&rows[3][..2], ["off", "failed"]);
     assert!(shown.contains(&format!("off failed: {why}")), "{shown}");
     assert!(said.contains("methods failed: ") && said.contains("off"), "{said}");
-    assert!(image::open(out.join("compare.png")).is_ok());
+    assert!(Pixels::open(out.join("compare.png")).is_ok());
     // Failed runs are repeated, finished ones are not.
     let before = times(&out.join("fdk"));
     let line = arguments(&scan, &specs, &out, &["--reference", "truth", "--resume"]);

@@ -1,5 +1,6 @@
 //! Further analyses: drift, features as colours, label maps, an end by held-out views, live slices.
 
+use conefield_report::Pixels;
 use crate::common::{done, json, refused, text};
 use ndarray::Array3;
 use serde_json::Value;
@@ -73,8 +74,8 @@ fn live_slices_are_drawn_and_change_nothing() {
     assert_eq!(count("loss"), records(&watched).len());
     // The last live picture and the final one.
     assert!(count("\x04live") > 0 && count("slices") == 1 && count("IHDR") == count("\x04live") + 1);
-    let picture = image::open(watched.join("live.png")).unwrap();
-    assert!(picture.width() > 300 && picture.height() > 300);
+    let picture = Pixels::open(watched.join("live.png")).unwrap();
+    assert!(picture.width > 300 && picture.height > 300);
     let volume = |run: &Path| fs::read(run.join("volume.nii.gz")).unwrap();
     assert!(volume(&plain) == volume(&watched));
 }
@@ -89,8 +90,8 @@ fn features_are_drawn_and_their_variance_reported() {
     assert_eq!((shares.len(), &found["channels"], &found["after"]), (3, &Value::from(6), &Value::from("encoder")));
     assert!(shares.windows(2).all(|w| w[0] >= w[1]) && shares.iter().sum::<f64>() <= 1.0 + 1e-12, "{shares:?}");
     assert_eq!(found["points"], 3 * 24 * 24);
-    let image = image::open(&picture).unwrap().to_rgb8();
-    let coloured = image.pixels().filter(|p| p.0.iter().max().unwrap() - p.0.iter().min().unwrap() > 60).count();
+    let image = Pixels::open(&picture).unwrap();
+    let coloured = image.colours().filter(|p| p.0.iter().max().unwrap() - p.0.iter().min().unwrap() > 60).count();
     assert!(coloured > 10_000, "{coloured}");
     // Existing output is kept unless --force is given.
     assert!(refused(1, &["features", &run, "--out", &out]).contains("--force"));

@@ -1,5 +1,6 @@
 //! `conefield report`: the page contains the data of the runs' files, and a browser shows it.
 
+use conefield_report::Pixels;
 use crate::common::{done, json, refused, text};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -122,8 +123,8 @@ fn the_page_holds_what_the_files_have_and_fetches_nothing() {
         assert_eq!(image["rms"], projected["residual_rms_of_views"][i]);
         for kind in ["predicted", "residual"] {
             let png = STANDARD.decode(image[kind].as_str().unwrap().strip_prefix("data:image/png;base64,").unwrap());
-            let picture = image::load_from_memory(&png.unwrap()).unwrap();
-            assert_eq!((picture.width(), picture.height()), (28, 20));
+            let picture = Pixels::read_png(std::io::Cursor::new(png.unwrap()), "a page".as_ref()).unwrap();
+            assert_eq!((picture.width, picture.height), (28, 20));
         }
     }
     assert!(page.data["scans"][0]["geometry"].as_str().unwrap().starts_with("data:image/png;base64,"));

@@ -1,5 +1,6 @@
 //! `study`: methods on scans with several seeds, interrupted, shared and repeated.
 
+use conefield_report::Pixels;
 use crate::common::{conefield, done, json, refused, text};
 use serde_json::Value;
 use std::fs;
@@ -114,7 +115,7 @@ fn tables_pictures_and_records_agree_and_resume_repeats_nothing() {
     assert!(shown.contains(&cell) && markdown.contains(&cell), "{cell}\n{shown}\n{markdown}");
     assert!(markdown.contains("| head-6views-seed1/SIRT |") && markdown.contains("PSNR dB − fdk's"), "{markdown}");
     for picture in ["slices/head-6views.png", "slices/head-8views.png", "curves/head-6views.png"] {
-        assert!(image::open(out.join(picture)).unwrap().width() > 500, "{picture}");
+        assert!(Pixels::open(out.join(picture)).unwrap().width > 500, "{picture}");
     }
 
     // A run that was interrupted before its first checkpoint, an added seed and an added method; the rest stays

@@ -1,5 +1,6 @@
 //! `tradeoff`: halving, a front without dominated points, specs that run, and `--resume` without repetition.
 
+use conefield_report::Pixels;
 use crate::common::{conefield, done, json, refused, text};
 use serde_json::Value;
 use std::fs;
@@ -101,8 +102,8 @@ fn halving_front_and_specs_agree() {
         assert_eq!(r["trials"], both.count());
         assert!(r["spearman"].is_null() || (-1.0..=1.0).contains(&number(r, "spearman")));
     }
-    let picture = image::open(out.join("front.png")).unwrap();
-    assert_eq!((picture.width(), picture.height()), (2000, 750));
+    let picture = Pixels::open(out.join("front.png")).unwrap();
+    assert_eq!((picture.width, picture.height), (2000, 750));
     let table = fs::read_to_string(out.join("tradeoff.md")).unwrap();
     assert!(table.starts_with("| front | budget | PSNR dB |") && table.contains("rank correlation"), "{table}");
 

@@ -1,5 +1,6 @@
 //! A geometry with nothing square, even or centred, through every command.
 
+use conefield_report::Pixels;
 use crate::common::{conefield, done, json, refused, text};
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::scan::Volume;
@@ -114,8 +115,8 @@ fn info_says_what_was_asked_for() {
     done(&["info", &b.at("scan"), "--png", &png]);
     done(&["info", &b.at("truth.mha"), "--png", &other]);
     for path in [png, other] {
-        let image = image::open(path).unwrap().to_rgb8();
-        assert!(image.width() > 900 && image.pixels().any(|p| p.0 != [255; 3]));
+        let image = Pixels::open(path).unwrap();
+        assert!(image.width > 900 && image.colours().any(|p| p.0 != [255; 3]));
     }
 }
 

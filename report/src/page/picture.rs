@@ -1,6 +1,7 @@
 //! Pictures in a page: PNG as `data:` URLs.
 
-use crate::canvas::{diverging, encode_png, grey, round_above};
+use crate::canvas::{diverging, grey, round_above};
+use crate::pixels::Pixels;
 use crate::survey::survey_picture;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -28,20 +29,19 @@ pub fn picture_url(values: ArrayView2<'_, f32>, scale: Scale) -> Result<String> 
     let shown = Array2::from_shape_fn(shape, |(row, column)| {
         values.slice(s![block(row, 0), block(column, 1)]).mean().unwrap_or(0.0)
     });
-    let rgb: Vec<u8> = shown
+    let bytes: Vec<u8> = shown
         .iter()
         .flat_map(|x| match scale {
             Scale::Grey([low, high]) => grey((x - low) / (high - low)).0,
             Scale::Signed(span) => diverging(x / span).0,
         })
         .collect();
-    url(shape[1] as u32, shape[0] as u32, &rgb)
+    url(&Pixels { width: shape[1] as u32, height: shape[0] as u32, bytes })
 }
 
 /// The picture of [`survey_png`](crate::survey_png), as a URL.
 pub fn geometry_url(title: &str, geometry: &Geometry) -> Result<String> {
-    let picture = survey_picture("a picture of the geometry", title, geometry)?;
-    url(picture.width(), picture.height(), picture.as_raw())
+    url(&survey_picture("a picture of the geometry", title, geometry)?)
 }
 
 /// A round number that bounds all but half a percent of the `values`.
@@ -49,9 +49,9 @@ pub fn spread(values: impl Iterator<Item = f32>) -> f32 {
     round_above(values.map(f32::abs).filter(|x| x.is_finite()).collect())
 }
 
-fn url(width: u32, height: u32, rgb: &[u8]) -> Result<String> {
+fn url(picture: &Pixels) -> Result<String> {
     let mut png = vec![];
-    encode_png(&mut png, "a picture in a page".as_ref(), width, height, rgb)?;
+    picture.write_png(&mut png, "a picture in a page".as_ref())?;
     Ok(png_url(&png))
 }
 
@@ -72,12 +72,12 @@ mod tests {
         values[(3, 0)] = 9.0;
         let url = picture_url(values.view(), Scale::Grey([0.0, 1.0])).unwrap();
         let bytes = STANDARD.decode(url.strip_prefix("data:image/png;base64,").unwrap()).unwrap();
-        let image = image::load_from_memory(&bytes).unwrap().to_rgb8();
+        let image = Pixels::read_png(std::io::Cursor::new(bytes), "a page".as_ref()).unwrap();
         // Blocks of 3; the last ones are smaller.
-        assert_eq!((image.width(), image.height()), (344, 2));
-        assert_eq!(image.get_pixel(343, 0).0, [85; 3], "one of three rows");
-        assert_eq!(image.get_pixel(0, 1).0, [255; 3]);
-        assert_eq!(image.get_pixel(5, 1).0, [0; 3]);
+        assert_eq!((image.width, image.height), (344, 2));
+        assert_eq!(image.get(343, 0).0, [85; 3], "one of three rows");
+        assert_eq!(image.get(0, 1).0, [255; 3]);
+        assert_eq!(image.get(5, 1).0, [0; 3]);
         assert_eq!(spread([0.1, -2.5, -2.4, f32::NAN].into_iter()), 3.0);
     }
 }
