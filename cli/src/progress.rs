@@ -187,6 +187,10 @@ impl Observer for Progress {
         info!("{text}");
     }
 
+    fn warn(&mut self, text: &str) {
+        warn!("{text}");
+    }
+
     fn cancelled(&self) -> bool {
         signals::caught().is_some()
     }

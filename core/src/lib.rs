@@ -1,6 +1,6 @@
 //! The contracts between conefield's stages, backends and methods.
 //!
-//! - [`geometry`], [`orbit`], [`scan`], [`parts`]: measurements in millimetres, and the resulting volumes.
+//! - [`geometry`], [`orbit`], [`scan`], [`outside`], [`parts`]: measurements in millimetres, and the resulting volumes.
 //! - [`simd`], [`half`], [`dense`], [`activation`], [`trilinear`], [`stage`]: the arithmetic of stages.
 //! - [`by_row`]: stages written for one row at a time; [`prelude`]: imports for their authors.
 //! - [`support`]: where the object can be; [`scene`]: the mapping between the world and the stages.
@@ -35,6 +35,7 @@ pub mod loss;
 pub mod method;
 pub mod opened;
 pub mod orbit;
+pub mod outside;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;

@@ -137,6 +137,10 @@ pub trait Observer {
     fn record(&mut self, record: &Record);
     /// Receives a message for the log.
     fn note(&mut self, text: &str);
+    /// Receives a warning for the log.
+    fn warn(&mut self, text: &str) {
+        self.note(text);
+    }
     /// Whether to stop after this step, with [`crate::Error::Interrupted`].
     fn cancelled(&self) -> bool {
         false

@@ -1,6 +1,7 @@
-//! Circular orbits of source and detector, described by a few numbers.
+//! Circular orbits of source and detector, described by a few numbers, and the arcs that views cover.
 
 use crate::geometry::{Millimetres, Radians, View, dot, norm, sub};
+use std::f64::consts::TAU;
 
 /// Views on one circle about z, all with the same distances and detector.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,6 +76,109 @@ impl CircularOrbit {
     }
 }
 
+/// Angular positions of views on a circle: the step that each view stands for, and the arcs that the views cover. Whole
+/// turns do not count: a second turn makes the first one denser.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Arcs {
+    /// Each view's angle in [0, 2π), rad.
+    pub angles: Vec<f64>,
+    /// Each view's angular step, rad. Views at one angle share the step equally. The sum is the arc covered.
+    pub steps: Vec<f64>,
+    /// Views in the order of their angles.
+    pub order: Vec<usize>,
+    /// Start and length of each arc, rad; empty if no gap interrupts the whole turn.
+    pub arcs: Vec<[f64; 2]>,
+}
+
+/// Gaps end arcs if they exceed the mean of the others by this factor: one gap, and several. The mean is weighted by
+/// the width, so that repeated angles do not change it.
+const ENDS: [f64; 2] = [2.5, 5.0];
+/// Most gaps that end arcs.
+const MOST: usize = 8;
+/// Views closer than this share of such a mean are at one angle.
+const SAME: f64 = 0.1;
+
+impl Arcs {
+    /// The arcs of views at `angles` (rad).
+    pub fn of(angles: &[f64]) -> Self {
+        let angles: Vec<f64> = angles.iter().map(|a| a.rem_euclid(TAU)).collect();
+        let mut order: Vec<usize> = (0..angles.len()).collect();
+        order.sort_by(|&a, &b| angles[a].total_cmp(&angles[b]));
+        let n = order.len();
+        // The gap after each view, in the order of angles.
+        let gaps: Vec<f64> = (0..n).map(|i| (angles[order[(i + 1) % n]] - angles[order[i]]).rem_euclid(TAU)).collect();
+        let gaps = if n == 1 { vec![TAU] } else { gaps };
+        let ends = ends(&gaps);
+        let within = |g: &usize| !ends.contains(g);
+        let [sum, squares] = (0..n).filter(within).fold([0.0, 0.0], |[s, q], g| [s + gaps[g], q + gaps[g] * gaps[g]]);
+        let same = if sum > 0.0 { SAME * squares / sum } else { 0.0 };
+        let apart = |g: usize| ends.contains(&g) || gaps[g] > same;
+        let rest = sum / (0..n).filter(|g| within(g) && apart(*g)).count().max(1) as f64;
+        let side = |g: usize| if ends.contains(&g) { rest } else { gaps[g] };
+        let mut steps = vec![0.0; n];
+        // Runs of views at one angle, from one that a gap precedes.
+        let first = (0..n).find(|&i| apart((i + n - 1) % n)).unwrap_or(0);
+        let mut i = 0;
+        while i < n {
+            let start = (first + i) % n;
+            let mut run = 1;
+            while i + run < n && !apart((start + run - 1) % n) {
+                run += 1;
+            }
+            let before = side((start + n - 1) % n);
+            let inner: f64 = (0..run - 1).map(|k| gaps[(start + k) % n]).sum();
+            let step = 0.5 * (before + side((start + run - 1) % n)) + inner;
+            (0..run).for_each(|k| steps[order[(start + k) % n]] = step / run as f64);
+            i += run;
+        }
+        let arcs = ends.iter().map(|&end| {
+            let start = angles[order[(end + 1) % n]];
+            let last = ends.iter().map(|&e| (angles[order[e]] - start).rem_euclid(TAU)).fold(TAU, f64::min);
+            [start - 0.5 * rest, last + rest]
+        });
+        let mut arcs: Vec<[f64; 2]> = arcs.collect();
+        arcs.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        Self { angles, steps, order, arcs }
+    }
+
+    /// Whether the views cover the whole turn.
+    pub fn whole(&self) -> bool {
+        self.arcs.is_empty()
+    }
+
+    /// The angle covered, rad.
+    pub fn covered(&self) -> f64 {
+        if self.whole() { TAU } else { self.arcs.iter().map(|a| a[1]).sum() }
+    }
+
+    /// The view whose angle is nearest to `angle` (rad).
+    pub fn nearest(&self, angle: f64) -> usize {
+        let angle = angle.rem_euclid(TAU);
+        let n = self.order.len();
+        let after = self.order.partition_point(|&v| self.angles[v] < angle);
+        let far = |v: usize| {
+            let d = (self.angles[v] - angle).abs();
+            d.min(TAU - d)
+        };
+        let [a, b] = [self.order[(after + n - 1) % n], self.order[after % n]];
+        if far(a) < far(b) { a } else { b }
+    }
+}
+
+/// Indices of the gaps that end an arc, ascending: as many of the widest as exceed all others clearly.
+fn ends(gaps: &[f64]) -> Vec<usize> {
+    let mut wide: Vec<usize> = (0..gaps.len()).collect();
+    wide.sort_by(|&a, &b| gaps[b].total_cmp(&gaps[a]));
+    let clear = |k: &usize| {
+        let [sum, squares] = wide[*k..].iter().fold([0.0, 0.0], |[s, q], &g| [s + gaps[g], q + gaps[g] * gaps[g]]);
+        gaps[wide[k - 1]] * sum > ENDS[usize::from(*k > 1)] * squares
+    };
+    let k = (1..=MOST.min(gaps.len() / 3)).rev().find(clear).unwrap_or(0);
+    let mut found = wide[..k].to_vec();
+    found.sort_unstable();
+    found
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -113,5 +217,46 @@ mod tests {
         views.iter_mut().for_each(|v| v.u = v.u.map(|x| -x));
         assert_eq!(CircularOrbit::fit(&views), None);
         assert_eq!(CircularOrbit::fit(&[]), None);
+    }
+
+    /// Angles of `n` views from `start` over `arc` degrees.
+    fn degrees(start: f64, arc: f64, n: usize) -> Vec<f64> {
+        (0..n).map(|i| (start + arc * i as f64 / n as f64).to_radians()).collect()
+    }
+
+    fn found(angles: &[f64]) -> (Vec<[f64; 2]>, f64) {
+        let a = Arcs::of(angles);
+        assert!((a.steps.iter().sum::<f64>() - a.covered()).abs() < 1e-9, "{a:?}");
+        (a.arcs.iter().map(|a| a.map(f64::to_degrees)).collect(), a.covered().to_degrees())
+    }
+
+    #[test]
+    fn arcs_are_found_with_gaps_turns_and_repeated_angles() {
+        let near = |found: (Vec<[f64; 2]>, f64), want: &[[f64; 2]]| {
+            assert_eq!(found.0.len(), want.len(), "{found:?}");
+            for (a, b) in found.0.iter().zip(want) {
+                assert!((0..2).all(|k| (a[k] - b[k]).abs() < 1e-6), "{found:?}");
+            }
+        };
+        near(found(&degrees(20.0, 360.0, 90)), &[]);
+        near(found(&degrees(20.0, -360.0, 3)), &[]);
+        near(found(&degrees(10.0, 200.0, 200)), &[[9.5, 200.0]]);
+        let two = [degrees(0.0, 60.0, 60), degrees(180.0, 100.0, 100)].concat();
+        near(found(&two), &[[-0.5, 60.0], [179.5, 100.0]]);
+        // Four turns, exact and jittered, and both ends of one turn.
+        near(found(&degrees(0.0, 1440.0, 720)), &[]);
+        let jitter: Vec<f64> =
+            degrees(0.0, 1440.0, 720).iter().enumerate().map(|(i, a)| a + 1e-4 * (i % 7) as f64).collect();
+        near(found(&jitter), &[]);
+        near(found(&degrees(0.0, 361.0, 361)), &[]);
+        let over = Arcs::of(&degrees(0.0, 400.0, 400));
+        assert!(over.whole() && (over.steps[0] / over.steps[100] - 0.5).abs() < 1e-9, "{over:?}");
+        // One missing view does not end an arc; many do.
+        let without = |k: usize| degrees(0.0, 360.0, 90).into_iter().skip(k).collect::<Vec<_>>();
+        near(found(&without(1)), &[]);
+        assert_eq!(found(&without(10)).0.len(), 1);
+        assert_eq!(Arcs::of(&degrees(0.0, 200.0, 200)).nearest(-0.3), 0);
+        assert_eq!(Arcs::of(&degrees(0.0, 360.0, 90)).nearest(359.0f64.to_radians()), 0);
+        assert_eq!(Arcs::of(&[1.0]).steps, [TAU]);
     }
 }

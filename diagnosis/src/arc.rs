@@ -7,6 +7,9 @@ use std::f64::consts::TAU;
 /// A gap this wide, in degrees, is the open part of a short scan.
 const OPENING: f64 = 60.0;
 
+/// Gaps below this share of their mean, weighted by their width, lie between views at one angle.
+const SAME: f64 = 0.01;
+
 /// The views' directions from the axis, in degrees.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ScanArc {
@@ -40,6 +43,9 @@ pub(crate) fn scan_arc(views: &[View]) -> ScanArc {
             if i + 1 < n { [sorted[i + 1] - sorted[i], sorted[i]] } else { [sorted[0] + 360.0 - sorted[i], sorted[i]] }
         })
         .collect();
+    // Further turns repeat angles: they leave no gaps.
+    let [sum, squares] = gaps.iter().fold([0.0, 0.0], |[s, q], g| [s + g[0], q + g[0] * g[0]]);
+    gaps.retain(|g| g[0] * sum > SAME * squares);
     gaps.sort_unstable_by(|a, b| b[0].total_cmp(&a[0]));
     let wide = |i: usize| gaps.get(i).map_or(0.0, |g| g[0]);
     // The views of a short scan are close to each other, or too few to decide.

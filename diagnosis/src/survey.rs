@@ -5,6 +5,7 @@ use crate::line_integrals::{LineIntegralCheck, check_line_integrals};
 use crate::setup::{Setup, setup};
 use crate::truncation::{Truncation, truncation};
 use crate::warnings::{Warning, warnings};
+use conefield_core::outside::Outside;
 use conefield_core::scan::Scan;
 use serde::Serialize;
 
@@ -17,6 +18,8 @@ pub struct Survey {
     pub coverage: VolumeCoverage,
     /// Whether the object extends beyond the detector's sides.
     pub truncation: Truncation,
+    /// What rays beside the volume measure, as far as it exceeds `truncation.threshold`.
+    pub outside: Outside,
     /// Whether the projections look like line integrals.
     pub check: LineIntegralCheck,
     /// The order of magnitude of the attenuation in 1/mm: the highest line integrals (99.9 % quantile) divided by the
@@ -33,9 +36,10 @@ pub fn survey(scan: &Scan) -> Survey {
     let coverage = volume_coverage(g, &setup);
     let check = check_line_integrals(scan.projections.view());
     let truncation = truncation(scan.projections.view(), &setup, &check);
+    let outside = Outside::of(scan, truncation.threshold);
     let size = g.volume.size();
     let attenuation_per_mm = f64::from(check.typical_range[1]) / size[0].max(size[1]);
-    let mut survey = Survey { setup, coverage, truncation, check, attenuation_per_mm, warnings: Vec::new() };
+    let mut survey = Survey { setup, coverage, truncation, outside, check, attenuation_per_mm, warnings: Vec::new() };
     survey.warnings = warnings(scan, &survey);
     survey
 }

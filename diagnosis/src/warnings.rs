@@ -14,6 +14,8 @@ pub enum WarningKind {
     Values,
     /// An object that extends beyond the detector's sides.
     Truncated,
+    /// An object that extends beyond the volume.
+    Outside,
     /// A volume that some views see only partly.
     Coverage,
     /// A detector that the axis misses or barely hits.
@@ -85,6 +87,7 @@ pub(crate) fn warnings(scan: &Scan, s: &Survey) -> Vec<Warning> {
         warn(WarningKind::Values, complaint.clone(), String::new());
     }
     truncated(s, &mut warn);
+    outside(s, &mut warn);
     covered(scan, s, &mut warn);
     offset(s, &mut warn);
     angles(scan, s, &mut warn);
@@ -119,6 +122,25 @@ fn truncated(s: &Survey, warn: Warn) {
     );
 }
 
+fn outside(s: &Survey, warn: Warn) {
+    if !s.outside.is_seen() || !s.check.complaints.is_empty() {
+        return;
+    }
+    let along: Vec<&str> = ["x", "y", "z"].into_iter().zip(s.outside.along).filter(|a| a.1).map(|a| a.0).collect();
+    warn(
+        WarningKind::Outside,
+        format!(
+            "rays that pass beside the volume measure up to {:.3} in {} of the views: the object extends beyond it along {}",
+            s.outside.most,
+            percent(s.outside.views),
+            along.join(" and ")
+        ),
+        "every method but fdk puts that attenuation into the volume: make the volume as large as the object, or set \
+         scene.surround = { coarse = {} }"
+            .into(),
+    );
+}
+
 fn covered(scan: &Scan, s: &Survey, warn: Warn) {
     let (c, fov) = (&s.coverage, &s.setup.field_of_view);
     if c.complete >= 0.995 {
@@ -128,6 +150,11 @@ fn covered(scan: &Scan, s: &Survey, warn: Warn) {
     let radius = if c.needed < 1.0 { fov.one_sided_radius_mm } else { fov.radius_mm };
     let none = if c.unseen > 0.0 { format!(", no view sees {}", percent(c.unseen)) } else { String::new() };
     let enough = if c.needed < 1.0 { "half the views" } else { "all views" };
+    // A smaller volume would leave out even more of the object.
+    let advice = match s.outside.is_seen() || s.truncation.views > 0.02 {
+        true => "trust the parts outside less; conefield info --png shows them",
+        false => "make the volume smaller, or trust the parts outside less; conefield info --png shows them",
+    };
     warn(
         WarningKind::Coverage,
         format!(
@@ -140,7 +167,7 @@ fn covered(scan: &Scan, s: &Survey, warn: Warn) {
             size[2],
             fov.height_mm
         ),
-        "make the volume smaller, or trust the parts outside less; conefield info --png shows them".into(),
+        advice.into(),
     );
 }
 

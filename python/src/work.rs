@@ -14,7 +14,7 @@ use pyo3::types::PyList;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use tracing::info;
+use tracing::{info, warn};
 
 /// Interval between two checks for signals, which acquire the GIL.
 const LOOK: Duration = Duration::from_millis(20);
@@ -147,6 +147,10 @@ impl Observer for Progress<'_> {
 
     fn note(&mut self, text: &str) {
         info!("{text}");
+    }
+
+    fn warn(&mut self, text: &str) {
+        warn!("{text}");
     }
 
     fn cancelled(&self) -> bool {

@@ -84,10 +84,14 @@ impl Canvas {
                 let (px, py) = (px as u32, py as u32);
                 if px < self.image.width && py < self.image.height {
                     let under = self.image.get(px, py).0;
-                    self.image.set(px, py, Rgb(std::array::from_fn(|k| {
-                        let (a, b) = (f32::from(under[k]), f32::from(colour.0[k]));
-                        (a + (b - a) * cover.clamp(0.0, 1.0)).round() as u8
-                    })));
+                    self.image.set(
+                        px,
+                        py,
+                        Rgb(std::array::from_fn(|k| {
+                            let (a, b) = (f32::from(under[k]), f32::from(colour.0[k]));
+                            (a + (b - a) * cover.clamp(0.0, 1.0)).round() as u8
+                        })),
+                    );
                 }
             });
         }

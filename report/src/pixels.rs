@@ -65,7 +65,8 @@ impl Pixels {
         let mut encoder = png::Encoder::new(out, self.width, self.height);
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
-        let written = encoder.write_header().and_then(|mut w| w.write_image_data(&self.bytes).and_then(|()| w.finish()));
+        let written =
+            encoder.write_header().and_then(|mut w| w.write_image_data(&self.bytes).and_then(|()| w.finish()));
         written.map_err(|e| match e {
             png::EncodingError::IoError(e) => Error::io(place, e),
             e => Error::invalid(place.display().to_string(), "picture", e, "pixels that PNG can hold"),

@@ -1,8 +1,8 @@
 //! A picture of a scan's geometry: source path, detector, volume, and the part of it seen by the views.
 
 use crate::canvas::{number, sequential, write_png};
-use crate::pixels::{Pixels, Rgb};
 use crate::curves::{FONT, register};
+use crate::pixels::{Pixels, Rgb};
 use conefield_core::geometry::{Geometry, Vec3, View};
 use conefield_core::{Error, Result};
 use conefield_diagnosis::{Setup, setup, share_of_views};

@@ -244,6 +244,10 @@ impl Observer for LinkObserver<'_> {
         self.observer.note(text);
     }
 
+    fn warn(&mut self, text: &str) {
+        self.observer.warn(text);
+    }
+
     fn cancelled(&self) -> bool {
         self.observer.cancelled()
     }

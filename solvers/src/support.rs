@@ -38,6 +38,8 @@ pub struct CarvedSupport {
 pub(crate) struct Blocks {
     /// Pixels along a block's side.
     size: usize,
+    /// Each of so many views has blocks.
+    every: usize,
     /// Block means of each view.
     means: Vec<Array2<f32>>,
     /// Standard deviation of their noise.
@@ -51,14 +53,37 @@ pub(crate) struct Blocks {
 impl Blocks {
     /// The blocks of all views.
     pub(crate) fn of(scan: &Scan) -> Self {
+        Self::of_every(scan, 1)
+    }
+
+    /// The blocks of one in `every` views. Views are counted among these.
+    pub(crate) fn of_every(scan: &Scan, every: usize) -> Self {
         let g = &scan.geometry;
         let size = g.detector[1].div_ceil(BLOCKS).max(2);
-        let means: Vec<Array2<f32>> =
-            (0..g.views.len()).into_par_iter().map(|v| block_means(scan.view(v), size)).collect();
-        let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
+        let views: Vec<usize> = (0..g.views.len()).step_by(every).collect();
+        let means: Vec<Array2<f32>> = views.par_iter().map(|&v| block_means(scan.view(v), size)).collect();
+        let largest = |v: &usize| scan.view(*v).iter().copied().fold(0.0f32, f32::max);
+        let top = views.par_iter().map(largest).reduce(|| 0.0, f32::max);
         let deviation = deviation(&means, top);
         let air = air(&means, deviation, top);
-        Self { size, means, deviation, top, air }
+        Self { size, every, means, deviation, top, air }
+    }
+
+    /// The views in which some block shows the object, each with the first column of the object and the one after the
+    /// last. Without air, all columns of all views.
+    pub(crate) fn columns(&self) -> Vec<(usize, [usize; 2])> {
+        let ends = |(i, means): (usize, &Array2<f32>)| {
+            let shows = |c: &usize| self.air.is_none_or(|air| reached(means.column(*c), air, self.deviation, self.top));
+            let first = (0..means.ncols()).find(shows)?;
+            let last = (0..means.ncols()).rev().find(shows)?;
+            Some((i * self.every, [first * self.size, (last + 1) * self.size]))
+        };
+        self.means.iter().enumerate().filter_map(ends).collect()
+    }
+
+    /// A mean of pixels that is surely not air: 5 % of the largest pixel above it, or four deviations of a block.
+    pub(crate) fn object(&self) -> f32 {
+        self.air.unwrap_or(0.0) + (4.0 * self.deviation).max(0.05 * self.top)
     }
 
     /// Whether the object reaches a border of a view along `axis`: 0 for the first and last row, 1 for the first and

@@ -13,6 +13,7 @@ use crate::support::Blocks;
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::{Geometry, View, VoxelGrid, norm};
 use conefield_core::method::{Job, Observer, Record};
+use conefield_core::outside::Outside;
 use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::scene::{CoarseSurround, SurroundRule};
 use conefield_projectors::voxel::Joseph;
@@ -107,10 +108,12 @@ impl Around {
         let n = g.views.len();
         let cut: Vec<[bool; 2]> = (0..n).map(|v| [blocks.cut(v, 0), blocks.cut(v, 1)]).collect();
         let some = cut.iter().filter(|c| c.contains(&true)).count();
-        if some == 0 {
-            return Ok((None, "nothing, as the object reaches the sides of no view".into()));
+        let outside = Outside::of(scan, blocks.object());
+        if some == 0 && !outside.is_seen() {
+            let said = "nothing, as the object reaches the sides of no view and lies within the volume";
+            return Ok((None, said.into()));
         }
-        let mut along = [false; 3];
+        let mut along = if outside.is_seen() { outside.along } else { [false; 3] };
         for (view, [rows, columns]) in g.views.iter().zip(cut) {
             for (axis, reached) in [(view.v, rows), (view.u, columns)] {
                 (0..3).for_each(|k| along[k] |= reached && axis[k].abs() > ALONG * norm(axis));
@@ -134,8 +137,10 @@ impl Around {
             return Err(Error::invalid("spec", "scene.surround.coarse", found, expected));
         }
         let mm = cells.spacing.into_iter().fold(0.0, f64::max);
+        let beside = if outside.is_seen() { ", as rays beside it are attenuated too" } else { "" };
         let said = format!(
-            "the object reaches the sides of {some} of {n} views: {x} x {y} x {z} cells of {mm:.3} mm in and around the volume"
+            "the object reaches the sides of {some} of {n} views: {x} x {y} x {z} cells of {mm:.3} mm in and around the volume\
+             {beside}"
         );
         Ok((Some(Self { cells, margin }), said))
     }

@@ -172,6 +172,7 @@ pub fn facts(s: &Scan, survey: &Survey) -> Value {
         },
         "coverage": survey.coverage,
         "truncation": survey.truncation,
+        "outside": survey.outside,
         "unit": s.unit,
         "attenuation_per_mm": survey.attenuation_per_mm,
         "warnings": survey.warnings,

@@ -1,10 +1,10 @@
 //! `conefield calibrate`: a wrong geometry is corrected, and a right one is unchanged.
 
-use conefield_report::Pixels;
 use crate::common::{conefield, done, json, refused, text};
 use conefield_core::geometry::{norm, sub};
 use conefield_core::orbit::CircularOrbit;
 use conefield_projectors::simulate::{Ellipsoid, scan_ellipsoids};
+use conefield_report::Pixels;
 use serde_json::Value;
 use std::fs;
 use std::path::Path;

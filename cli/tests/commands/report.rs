@@ -1,10 +1,10 @@
 //! `conefield report`: the page contains the data of the runs' files, and a browser shows it.
 
-use conefield_report::Pixels;
 use crate::common::{done, json, refused, text};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use conefield_io::{read_volume, write_volume};
+use conefield_report::Pixels;
 use ndarray::Array3;
 use serde_json::Value;
 use std::fs;

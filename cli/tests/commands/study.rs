@@ -1,7 +1,7 @@
 //! `study`: methods on scans with several seeds, interrupted, shared and repeated.
 
-use conefield_report::Pixels;
 use crate::common::{conefield, done, json, refused, text};
+use conefield_report::Pixels;
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,10 +1,10 @@
 //! A geometry with nothing square, even or centred, through every command.
 
-use conefield_report::Pixels;
 use crate::common::{conefield, done, json, refused, text};
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::scan::Volume;
 use conefield_io::{read_data_set, read_scan, read_volume, write_r2, write_scan, write_volume};
+use conefield_report::Pixels;
 use ndarray::Array3;
 use serde_json::{Value, json};
 use std::fs;

@@ -66,7 +66,8 @@ impl Axis {
         self.axes.map(|axis| dot(a, axis))
     }
 
-    fn point(&self, a: Vec3) -> Vec3 {
+    /// A point in the circle's own axes.
+    pub fn point(&self, a: Vec3) -> Vec3 {
         self.direction(sub(a, self.center))
     }
 

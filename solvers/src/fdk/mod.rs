@@ -11,12 +11,13 @@ pub mod weights;
 
 use crate::iterative::drive::finite;
 use crate::iterative::monitor::VolumeMonitor;
+use crate::support::Blocks;
 use crate::surround::{self, Within};
 use axis::{Axis as OrbitAxis, upright};
 use conefield_core::Error;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::{Geometry, dot, norm, sub};
+use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, dot, norm, sub};
 use conefield_core::method::{
     Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
 };
@@ -34,7 +35,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::time::Instant;
-use weights::{Coverage, FdkOrbit, lean, place};
+use weights::{Disc, FdkOrbit, lean, place};
 
 /// Settings of `fdk`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -95,8 +96,10 @@ impl Plan for Fdk {
         let axis = OrbitAxis::of(&job.scan.geometry);
         let upright = upright(&job.scan.geometry, axis.as_ref());
         let orbit = FdkOrbit::of(&upright);
-        check(&orbit, &upright)?;
-        said(axis.as_ref(), &orbit).iter().for_each(|line| observer.note(line));
+        check(&orbit, &upright, job.scan.geometry.volume, axis.as_ref())?;
+        axis.iter().for_each(|axis| observer.note(&axis.describe()));
+        observer.note(&orbit.describe());
+        doubts(job.scan, &orbit, &upright, axis.as_ref()).iter().for_each(|line| observer.warn(line));
         let (geometry, measured) = orbit.symmetric(&job.scan.geometry);
         let upright = &orbit.symmetric(&upright).0;
         let (scan, backend) = (job.scan, job.backend);
@@ -127,8 +130,14 @@ impl Plan for Fdk {
         let upright = upright(&scan.geometry, axis.as_ref());
         let orbit = FdkOrbit::of(&upright);
         let mut lines = surround::found(scan, self.scene.surround)?;
-        let fits = check(&orbit, &upright);
-        lines.extend(fits.map_or_else(|e| vec![e.to_string()], |()| said(axis.as_ref(), &orbit)));
+        match check(&orbit, &upright, scan.geometry.volume, axis.as_ref()) {
+            Err(e) => lines.push(e.to_string()),
+            Ok(()) => {
+                lines.extend(axis.iter().map(OrbitAxis::describe));
+                lines.push(orbit.describe());
+                lines.extend(doubts(scan, &orbit, &upright, axis.as_ref()));
+            }
+        }
         Ok(Findings { lines, ..Findings::default() })
     }
 
@@ -225,14 +234,52 @@ impl Backprojection<'_> {
     }
 }
 
-/// Log lines about the orbit.
-fn said(axis: Option<&OrbitAxis>, orbit: &FdkOrbit) -> Vec<String> {
-    let mut lines: Vec<String> = axis.into_iter().map(OrbitAxis::describe).collect();
-    lines.push(orbit.describe());
-    if orbit.coverage == Coverage::Limited {
-        lines.push("expect streaks along the missing directions; an iterative method suits this scan better".into());
+/// Warnings about what FDK gets wrong in this scan.
+fn doubts(scan: &Scan, orbit: &FdkOrbit, upright: &Geometry, axis: Option<&OrbitAxis>) -> Vec<String> {
+    let mut lines = vec![];
+    let missing = if orbit.twice() { 0.0 } else { object(scan, orbit, upright).map_or(0.0, |d| orbit.missing(d)) };
+    if missing > MISSING {
+        lines.push(format!(
+            "no view measures {:.1} % of the rays through the object: expect streaks and wrong values; an iterative method \
+             suits this scan better",
+            100.0 * missing
+        ));
+    }
+    let [_, farthest] = cone(orbit, scan.geometry.volume, axis);
+    if farthest > CONE {
+        lines.push(format!(
+            "the volume extends to {:.0} degrees from the plane of the sources: beyond {:.0} degrees fdk loses attenuation; an \
+             iterative method does not",
+            farthest.to_degrees(),
+            CONE.to_degrees()
+        ));
     }
     lines
+}
+
+/// The disc in which the object lies, from its shadows in evenly spaced views. `None` if no view shows an object.
+fn object(scan: &Scan, orbit: &FdkOrbit, upright: &Geometry) -> Option<Disc> {
+    let every = scan.geometry.views.len().div_ceil(SHADOWS);
+    let columns = scan.geometry.detector[1] as f64;
+    let shadows = Blocks::of_every(scan, every).columns().into_iter().map(|(view, [first, last])| {
+        let places = [first as f64 - 0.5, (last as f64 - 0.5).min(columns - 0.5)];
+        (view, places.map(|c| place(upright, view, c, orbit.radius[view])))
+    });
+    orbit.disc(&shadows.collect::<Vec<_>>())
+}
+
+/// Angles between the plane of the sources and the nearest and the farthest part of the volume, seen from the far side
+/// of the circle through the axis, rad.
+fn cone(orbit: &FdkOrbit, volume: VoxelGrid, axis: Option<&OrbitAxis>) -> [f64; 2] {
+    let [low, high] = volume.bounds();
+    let heights = (0..8usize).map(|k| {
+        let corner: Vec3 = std::array::from_fn(|i| if k >> i & 1 == 0 { low[i] } else { high[i] });
+        orbit.height(axis.map_or(corner, |a| a.point(corner)))
+    });
+    let [low, high] = heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[l, h], z| [l.min(z), h.max(z)]);
+    let radius = orbit.radius.iter().sum::<f64>() / orbit.radius.len() as f64;
+    let nearest = if low < 0.0 && high > 0.0 { 0.0 } else { low.abs().min(high.abs()) };
+    [nearest, low.abs().max(high.abs())].map(|z| (z / radius).atan())
 }
 
 /// Bytes of views to hold at once: 1/32 of scan and volume, but at least one MiB and no more than fits into the
@@ -250,8 +297,19 @@ fn views_at_once(detector: [usize; 2], bytes: u64) -> usize {
 /// circles deviate less; a helix or a detector on its side deviates more.
 const TILT: f64 = 0.05;
 
-/// Refuses orbits other than a circle about z whose detector rows lie across z.
-fn check(orbit: &FdkOrbit, geometry: &Geometry) -> Result<()> {
+/// Largest angle, rad, between the plane of the sources and a part of the volume. A ball at this angle loses 2 % of its
+/// attenuation, at 30 degrees 22 %.
+const CONE: f64 = 0.175;
+/// Largest slope of the detector's normal against the plane of the sources.
+const INCLINED: f64 = 0.1;
+/// Largest share of the rays through the object that no view measures, about what sampling the disc resolves.
+const MISSING: f64 = 0.002;
+/// Views in which the object's shadow is sought.
+const SHADOWS: usize = 120;
+
+/// Refuses orbits other than a circle about z, detectors that do not stand along z, and volumes far from the plane of
+/// the sources. `geometry` is upright; `volume` and `axis` are as scanned.
+fn check(orbit: &FdkOrbit, geometry: &Geometry, volume: VoxelGrid, axis: Option<&OrbitAxis>) -> Result<()> {
     let span = |values: &mut dyn Iterator<Item = f64>| {
         values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)))
     };
@@ -264,5 +322,14 @@ fn check(orbit: &FdkOrbit, geometry: &Geometry) -> Result<()> {
     ensure(top - bottom <= TILT * low, "scan", "views", found, circle)?;
     let steep = geometry.views.iter().position(|v| v.u[2].abs() > TILT * norm(v.u));
     let found = steep.map_or(String::new(), |v| format!("a detector whose rows rise along z in view {v}"));
-    ensure(steep.is_none(), "scan", "views", found, "rows across z for fdk; iterative methods accept any orbit")
+    ensure(steep.is_none(), "scan", "views", found, "rows across z for fdk; iterative methods accept any orbit")?;
+    let slope = |v: &View| v.normal().0[2].abs();
+    let most = geometry.views.iter().map(slope).fold(0.0, f64::max);
+    let found = format!("a detector inclined by {:.0} degrees", most.asin().to_degrees());
+    let stands = "a detector along z for fdk, to within 6 degrees; iterative methods accept any";
+    ensure(most <= INCLINED, "scan", "views", found, stands)?;
+    let [nearest, _] = cone(orbit, volume, axis);
+    let found = format!("a volume at least {:.0} degrees from the plane of the sources", nearest.to_degrees());
+    let near = format!("at most {:.0} degrees for fdk; iterative methods accept any", CONE.to_degrees());
+    ensure(nearest <= CONE, "scan", "volume", found, &near)
 }

@@ -94,7 +94,9 @@ pub fn volume(solution: Solution) -> Volume {
 #[derive(Default)]
 pub struct Heard {
     pub records: Vec<Record>,
+    /// Messages and warnings.
     pub notes: Vec<String>,
+    pub warnings: Vec<String>,
     pub interrupt_after: Option<usize>,
     pub kept: Option<Resume>,
 }
@@ -122,6 +124,10 @@ impl Observer for Heard {
     }
     fn note(&mut self, text: &str) {
         self.notes.push(text.into());
+    }
+    fn warn(&mut self, text: &str) {
+        self.warnings.push(text.into());
+        self.note(text);
     }
     fn cancelled(&self) -> bool {
         self.interrupt_after.is_some_and(|n| self.records.len() >= n)

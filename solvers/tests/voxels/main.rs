@@ -8,4 +8,5 @@ mod iterative;
 mod kit;
 mod refusals;
 mod surround;
+mod sweep;
 mod warm_start;

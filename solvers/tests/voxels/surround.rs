@@ -4,7 +4,7 @@ use crate::kit::{Case, Heard, mean, psnr, view};
 use conefield_backend_cpu::Cpu;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::method::Job;
-use conefield_core::scan::Scan;
+use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::{CoarseSurround, SurroundRule};
 use conefield_projectors::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
 use conefield_solvers::surround::found;
@@ -91,11 +91,32 @@ fn what_is_left_is_the_inside() {
 
 #[test]
 fn a_scan_that_shows_all_of_the_object_is_left_alone() {
-    let scan = scan_ellipsoids(&bodies(), geometry(true));
+    let volume = VoxelGrid { shape: [40; 3], spacing: [3.0; 3], center: [0.0; 3] };
+    let scan = scan_ellipsoids(&bodies(), Geometry { volume, ..geometry(true) });
     let (without, _) = Case::of(&scan).volume(&method("os-sart", ""));
     let (with, heard) = Case::of(&scan).volume(&method("os-sart", SURROUND));
     assert!(heard.said("surround: nothing, as the object reaches the sides of no view"), "{:?}", heard.notes);
     assert_eq!(with.data, without.data);
+}
+
+/// Views that show the whole body, and a volume of some of its slices: rays above and below the volume tell how much of
+/// the attenuation is not its own.
+#[test]
+fn a_volume_of_some_slices_is_as_good_as_the_whole_one() {
+    let slices = |shape, center| Geometry { volume: VoxelGrid { shape, spacing: [3.0; 3], center }, ..geometry(true) };
+    let (few, all) = (slices([40, 40, 6], [0.0, 0.0, 12.0]), slices([40, 40, 32], [0.0; 3]));
+    let scan = scan_ellipsoids(&bodies(), few.clone());
+    let truth = ellipsoids(&bodies(), &few.volume);
+    let whole = Case::of(&Scan { geometry: all, ..scan.clone() }).volume(&method("os-sart", "")).0;
+    let part = whole.data.slice(ndarray::s![.., .., 17..23]).to_owned();
+    let whole = psnr(&Volume { data: part, grid: few.volume, affine: None }, &truth);
+    let (without, _) = Case::of(&scan).volume(&method("os-sart", ""));
+    let (with, heard) =
+        Case::of(&scan).volume(&method("os-sart", "scene.surround = { coarse = { margin = 1.0, cells = 40 } }\n"));
+    assert!(heard.said("as rays beside it are attenuated too"), "{:?}", heard.notes);
+    let [without, with] = [without, with].map(|v| psnr(&v, &truth));
+    println!("{without:.2} to {with:.2} dB, {whole:.2} dB in the whole volume");
+    assert!(with > whole - 1.0 && with > without + 6.0, "{without} to {with} dB, {whole} dB in the whole volume");
 }
 
 #[test]
