@@ -219,11 +219,13 @@ impl Header {
             return Err(self.invalid(name, format!("{turn:?}"), "three independent voxel axes"));
         }
         // ITK multiplies both: an axis that is not a unit vector scales the voxels.
-        let spacing = std::array::from_fn(|k| {
+        let scaled = std::array::from_fn(|k| {
             let length = norm(std::array::from_fn(|i| entry(k, i)));
             if (length - 1.0).abs() <= 1e-3 { spacing[k] } else { spacing[k] * length }
         });
-        Ok((spacing, affine::flip(lps)))
+        let differs = affine::contradiction("ElementSpacing", spacing, &format!("with the axes of {name}"), scaled);
+        affine::warn(&self.place, affine::skew(&lps).into_iter().chain(differs));
+        Ok((scaled, affine::flip(lps)))
     }
 }
 

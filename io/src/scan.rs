@@ -1,7 +1,7 @@
 //! Entry points for scans: they recognize the format of a folder or file.
 
 use crate::text::format_of;
-use crate::{ImportOptions, naf, pickle, r2, scan_folder, scanner};
+use crate::{ImportOptions, foreign, naf, pickle, r2, scan_folder, scanner};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -87,7 +87,10 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
                 // The description's reader reports what is missing.
                 _ => Ok(ScanFile::Scanner(path.to_path_buf())),
             },
-            _ => Err(Error::invalid(place, "scan", "a file of another kind", understood)),
+            _ => {
+                foreign::refuse_file(path)?;
+                Err(Error::invalid(place, "scan", "a file of another kind", understood))
+            }
         };
     }
     let has = |name: &str| path.join(name).is_file();
@@ -97,7 +100,10 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
         (_, true, _) => Ok(ScanFile::Own(path.join("scan.json"))),
         (.., true) => Ok(ScanFile::R2(path.to_path_buf())),
         _ if has(SCANNER) => Ok(ScanFile::Scanner(path.join(SCANNER))),
-        _ => Err(Error::invalid(place, "scan", "none of the files that describe one", understood)),
+        _ => {
+            foreign::refuse_folder(path)?;
+            Err(Error::invalid(place, "scan", "none of the files that describe one", understood))
+        }
     }
 }
 

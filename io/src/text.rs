@@ -1,8 +1,9 @@
-//! TOML and JSON with errors that name the line and, for an unknown key, the nearest valid one.
+//! TOML and JSON with errors that name the line and, for an unknown key, the nearest valid one; texts of other
+//! programs in their encodings.
 
 use crate::input::LONGEST_TEXT;
 use conefield_core::error::ensure;
-use conefield_core::files::{read_text, toml_line};
+use conefield_core::files::{read_text, read_text_bytes, toml_line};
 use conefield_core::{Error, Result};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -50,6 +51,25 @@ pub(crate) fn described<T: DeserializeOwned>(path: &Path, format: &str, version:
     parse(path, &text, notation)
 }
 
+/// Reads a text that another program wrote: in UTF-8, else in Windows-1252, the usual encoding of programs on Windows.
+/// At most `most` bytes.
+pub(crate) fn read_foreign(path: &Path, most: u64) -> Result<String> {
+    String::from_utf8(read_text_bytes(path, most)?).or_else(|e| {
+        tracing::info!("{}: the text is not UTF-8 and is read as Windows-1252", path.display());
+        Ok(windows_1252(e.as_bytes()))
+    })
+}
+
+/// Decodes Windows-1252: Latin-1 but for the bytes from 0x80 to 0x9f.
+fn windows_1252(bytes: &[u8]) -> String {
+    const HIGH: [char; 32] = [
+        '€', '\u{81}', '‚', 'ƒ', '„', '…', '†', '‡', 'ˆ', '‰', 'Š', '‹', 'Œ', '\u{8d}', 'Ž', '\u{8f}', '\u{90}', '‘',
+        '’', '“', '”', '•', '–', '—', '˜', '™', 'š', '›', 'œ', '\u{9d}', 'ž', 'Ÿ',
+    ];
+    let decoded = |b: &u8| HIGH.get(usize::from(b.wrapping_sub(0x80))).copied().unwrap_or(char::from(*b));
+    bytes.iter().map(decoded).collect()
+}
+
 /// Parses `text`, the content of `path`.
 pub(crate) fn parse<T: DeserializeOwned>(path: &Path, text: &str, notation: Notation) -> Result<T> {
     match notation {
@@ -94,6 +114,13 @@ fn explain(path: &Path, text: &str, line: Option<usize>, message: &str) -> Error
     }
 }
 
+/// Warns of `keys` of the file `place` that are not read.
+pub(crate) fn warn_of_keys(place: &str, keys: &[String]) {
+    if !keys.is_empty() {
+        tracing::warn!("{place}: not read, though they may change the geometry: {}", keys.join(", "));
+    }
+}
+
 /// A value in quotes, cut to 80 characters for errors.
 pub(crate) fn shortened(text: &str) -> String {
     match text.char_indices().nth(80) {
@@ -110,5 +137,24 @@ fn suggestion(unknown: &str, valid: &[&str]) -> String {
         Some(b) if valid.len() > 1 => format!("`{b}` (the nearest of: {})", valid.join(", ")),
         Some(b) => format!("`{b}`"),
         None => "no key at all".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn windows_1252_is_read_where_a_text_is_not_utf_8() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.txt");
+        for (bytes, want) in [
+            (&b"\xa9 2004 \x96 K\xfcndig \x80 \x9f\x7f"[..], "© 2004 – Kündig € Ÿ\u{7f}"),
+            ("© Kündig".as_bytes(), "© Kündig"),
+            (b"\xef\xbb\xbfangle", "angle"),
+        ] {
+            std::fs::write(&path, bytes).unwrap();
+            assert_eq!(read_foreign(&path, 100).unwrap(), want);
+        }
     }
 }

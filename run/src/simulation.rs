@@ -2,6 +2,7 @@
 
 use crate::memory::Memory;
 use crate::parse::{AnglesOption, Values};
+use conefield_core::error::ensure;
 use conefield_core::files::{read_text, toml_line};
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
@@ -30,9 +31,24 @@ pub struct Changes {
     pub seed: Option<u64>,
 }
 
-/// The volume centred on the rotation axis, in attenuation, with blocks of `size`³ voxels averaged.
+/// Attenuation per unit is not negative; noise of a reconstruction stays far above this, Hounsfield units of air are far
+/// below.
+const LEAST: f32 = -50.0;
+
+/// The volume centred on the rotation axis, in attenuation, with blocks of `size`³ voxels averaged. Refuses values as
+/// they are that can only be Hounsfield units, and warns of negative ones.
 pub fn prepared(volume: Volume, values: Values, size: usize) -> Result<Volume> {
     let mut volume = values.apply(volume)?;
+    if let Values::AsIs = values {
+        let [low, high] =
+            volume.data.iter().fold([f32::INFINITY, f32::NEG_INFINITY], |[a, b], x| [a.min(*x), b.max(*x)]);
+        let expected = "attenuation, which is not negative: of Hounsfield units, --values hu:0.02 makes attenuation \
+                        (water 0.02 per mm) and --values clip:-1000,2000 numbers from 0 to 1";
+        ensure(low >= LEAST, "volume", "values", format!("{low} to {high}"), expected)?;
+        if low < -0.1 * high.max(0.0) {
+            tracing::warn!("the volume has values from {low} to {high}: attenuation is not negative (--values)");
+        }
+    }
     // A scan's volume is centred on the rotation axis.
     volume.grid.center = [0.0; 3];
     if size > 1 {
