@@ -20,8 +20,6 @@ const LONGEST_HEADER: usize = 1 << 16;
 /// The header's entries.
 #[derive(Debug, PartialEq)]
 struct Header {
-    /// NumPy's name for the type.
-    descr: String,
     number: Number,
     order: ByteOrder,
     fortran: bool,
@@ -43,8 +41,8 @@ pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
     read_counts(input, start, sets).map(|(array, _)| array)
 }
 
-/// Like [`read_one_of`], with NumPy's name for the type of the numbers in the file.
-pub(crate) fn read_counts(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<(ArrayD<f32>, String)> {
+/// Like [`read_one_of`], with the type of the numbers in the file.
+pub(crate) fn read_counts(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<(ArrayD<f32>, Number)> {
     let header = read_header(input, start)?;
     let expected = || {
         let each: Vec<String> = sets.iter().map(|a| format!("{} axes ({})", a.len(), a.join(", "))).collect();
@@ -69,7 +67,7 @@ pub(crate) fn read_counts(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
     if let Some((at, x)) = stray(&array) {
         return Err(input.invalid(format!("data{:?}", at.slice()), x, "a finite number"));
     }
-    Ok((array, header.descr))
+    Ok((array, header.number))
 }
 
 /// Shape and numbers, in C order and full precision, of a small array of one or two axes; continues after `start` like
@@ -166,7 +164,6 @@ fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
         input.invalid("descr", format!("'{descr}'"), "real numbers: b1, i1 to i8, u1 to u8, f4 or f8")
     })?;
     Ok(Header {
-        descr,
         number,
         order,
         fortran: fortran.ok_or_else(|| lacks("fortran_order"))?,

@@ -90,18 +90,18 @@ pub(crate) fn read(
         if single {
             return Ok(stack);
         }
-        let first = numbers.get_or_insert_with(|| stored.clone());
-        if stored != *first {
-            let shown = |n: &Option<String>| n.clone().unwrap_or_else(|| "another format".into());
-            let expected = format!("{}, as in {}", shown(first), sources[0].path.display());
-            return Err(Error::invalid(source.path.display().to_string(), "numbers", shown(&stored), expected));
-        }
         let (views, rows, columns) = stack.dim();
         let (values, size, count) = all.get_or_insert_with(|| (Vec::new(), [rows, columns], 0));
         if *size != [rows, columns] {
             let found = format!("{rows} x {columns}");
             let expected = format!("{} x {} (rows x columns), as in {}", size[0], size[1], sources[0].path.display());
             return Err(Error::invalid(source.path.display().to_string(), "image", found, expected));
+        }
+        let first = numbers.get_or_insert_with(|| stored.clone());
+        if stored != *first {
+            let shown = |n: &Option<String>| n.clone().unwrap_or_else(|| "another format".into());
+            let expected = format!("{}, as in {}", shown(first), sources[0].path.display());
+            return Err(Error::invalid(source.path.display().to_string(), "numbers", shown(&stored), expected));
         }
         memory::grow(values, stack.len(), usize::MAX, place, field)?;
         values.extend(stack.iter());
@@ -187,7 +187,7 @@ fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<(Array3<f32>,
     }
     if head.starts_with(npy::MAGIC) {
         let (array, numbers) = npy::read_counts(&mut input, head, sets)?;
-        return Ok((three(array)?, Some(numbers)));
+        return Ok((three(array)?, Some(numbers.to_string())));
     }
     if tiff::is_tiff(&head) {
         let stack = tiff::read(path)?;
@@ -306,7 +306,7 @@ mod tests {
         std::fs::create_dir(at("empty")).unwrap();
         for (found, words) in [
             (many(&["views/p1.npy", "odd.npy"]), ["odd.npy", "2 x 2", "1 x 2"]),
-            (many(&["views/p1.npy", "wide.npy"]), ["wide.npy: numbers", "<u2", "|u1"]),
+            (many(&["views/p1.npy", "wide.npy"]), ["wide.npy: numbers", "found 16-bit", "expected 8-bit"]),
             (many(&[]), ["s.toml", "files.projections", "empty list"]),
             (one("../x.npy"), ["s.toml", "files.projections", "without \"..\""]),
             (many(&["odd.npy", "/etc/passwd"]), ["s.toml", "files.projections[1]", "inside the folder"]),

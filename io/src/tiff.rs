@@ -179,7 +179,7 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
     let mut decoder =
         Decoder::new(BufReader::new(AsStored { reader: file, white: directories.white, at: 0 })).map_err(broken)?;
     let mut first: Option<(Page, Option<Claim>)> = None;
-    let (mut pages, mut claimed, mut stored) = (0usize, [0u64; 2], 0u64);
+    let (mut pages, mut claimed, mut stored, mut end) = (0usize, [0u64; 2], 0u64, directories.end);
     loop {
         let (width, height) = decoder.dimensions().map_err(broken)?;
         let bits = match decoder.colortype().map_err(broken)? {
@@ -217,9 +217,15 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
             let expected = format!("{}, as on the first page", like.sample);
             return Err(Error::invalid(&place, format!("page {pages}"), sample, expected));
         }
-        let tag = if decoder.get_chunk_type() == ChunkType::Tile { Tag::TileByteCounts } else { Tag::StripByteCounts };
-        let counts = decoder.find_tag_unsigned_vec::<u64>(tag).map_err(broken)?.unwrap_or_default();
-        stored = counts.iter().fold(stored, |sum, n| sum.saturating_add(*n));
+        let mut list = |strips, tiles| {
+            let tag = if decoder.get_chunk_type() == ChunkType::Tile { tiles } else { strips };
+            decoder.find_tag_unsigned_vec::<u64>(tag).map(Option::unwrap_or_default).map_err(broken)
+        };
+        let offsets = list(Tag::StripOffsets, Tag::TileOffsets)?;
+        for (at, bytes) in offsets.into_iter().zip(list(Tag::StripByteCounts, Tag::TileByteCounts)?) {
+            stored = stored.saturating_add(bytes);
+            end = end.max(at.saturating_add(bytes));
+        }
         each(&mut decoder, page())?;
         pages += 1;
         if !decoder.more_images() {
@@ -239,9 +245,14 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
             images.rest = Some(rest);
         }
         _ => {
-            let more = packed.saturating_sub(directories.bytes.saturating_add(stored));
             if !directories.others {
-                images.remarks.extend(unexplained(&place, &mut decoder, &page, pages, stored, more)?);
+                let parts = Parts {
+                    pages: pages as u64,
+                    stored,
+                    after: packed.saturating_sub(end),
+                    undescribed: packed.saturating_sub(directories.bytes.saturating_add(stored)),
+                };
+                images.remarks.extend(parts.remark(&place, &mut decoder, &page)?);
             }
             let fewer = claim.filter(|c| c.whole && c.images < pages as u64);
             images.remarks.extend(fewer.map(|c| {
@@ -253,30 +264,37 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
 }
 
 /// Fewer bytes than this that nothing describes are gaps between the parts of a file.
-const GAPS: u64 = 64;
+const GAPS: u64 = 4096;
 
-/// Refuses a file of one page with room for more images after it; else a remark if `more` bytes of the file, which
-/// belong to no page, can hold an image.
-fn unexplained(
-    place: &str,
-    decoder: &mut Pages,
-    page: &Page,
-    pages: usize,
+/// The bytes of a file's parts.
+struct Parts {
+    pages: u64,
+    /// Of the pages' strips or tiles.
     stored: u64,
-    more: u64,
-) -> Result<Option<String>> {
-    let plain = compression(place, decoder)? == 1;
-    let image = if plain { page.bytes } else { stored / pages as u64 };
-    if more < image.max(GAPS) {
-        return Ok(None);
+    /// Of what follows the last part.
+    after: u64,
+    /// Of what is no part.
+    undescribed: u64,
+}
+
+impl Parts {
+    /// Refuses a file of one page with room for more images after it; else a remark if an image has room in the bytes
+    /// that are no part.
+    fn remark(&self, place: &str, decoder: &mut Pages, page: &Page) -> Result<Option<String>> {
+        let Self { pages, stored, after, undescribed } = *self;
+        let plain = compression(place, decoder)? == 1;
+        if plain && pages == 1 && after >= page.bytes {
+            let found = format!("{after} bytes after the one page, room for {} more images", after / page.bytes);
+            return Err(Error::invalid(place, "file size", found, "one page per image (save the stack so)"));
+        }
+        let image = if plain { page.bytes } else { stored / pages };
+        Ok((undescribed >= image.max(GAPS)).then(|| {
+            format!(
+                "{undescribed} bytes of the file belong to none of its {pages} pages, each of about {image} bytes: \
+                 images may be missing"
+            )
+        }))
     }
-    if plain && pages == 1 && more % page.bytes < GAPS {
-        let found = format!("{more} bytes after the one page, as many as {} more images", more / page.bytes);
-        return Err(Error::invalid(place, "file size", found, "one page per image (save the stack so)"));
-    }
-    Ok(Some(format!(
-        "{more} bytes of the file belong to none of its {pages} pages, each of about {image} bytes: images may be missing"
-    )))
 }
 
 fn compression(place: &str, decoder: &mut Pages) -> Result<u32> {

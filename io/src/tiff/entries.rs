@@ -11,10 +11,19 @@ use std::io::{Read, Seek, SeekFrom};
 pub(super) struct Directories {
     /// Bytes of the header, the directories and the values of their entries.
     pub bytes: u64,
+    /// The byte after the last of them.
+    pub end: u64,
     /// Bytes that say that white is zero (the entry PhotometricInterpretation), in ascending order.
     pub white: Vec<u64>,
     /// Whether an entry points to directories outside the chain of pages: reduced images, camera settings.
     pub others: bool,
+}
+
+impl Directories {
+    fn add(&mut self, at: u64, bytes: u64) {
+        self.bytes = self.bytes.saturating_add(bytes);
+        self.end = self.end.max(at.saturating_add(bytes));
+    }
 }
 
 /// The entry PhotometricInterpretation.
@@ -34,13 +43,14 @@ struct EntryWalk<'a, R> {
 /// damage.
 pub(super) fn check(place: &str, reader: &mut (impl Read + Seek), size: u64) -> Result<Directories> {
     let mut mark = [0; 4];
-    let found = Directories { bytes: 0, white: Vec::new(), others: false };
+    let found = Directories { bytes: 0, end: 0, white: Vec::new(), others: false };
     if reader.rewind().and_then(|()| reader.read_exact(&mut mark)).is_err() {
         return Ok(found);
     }
     let little = mark[0] == b'I';
     let mut walk = EntryWalk { reader, little, big_tiff: mark[if little { 2 } else { 3 }] == 43, found };
-    walk.found.bytes = if walk.big_tiff { 16 } else { 8 };
+    let header = if walk.big_tiff { 16 } else { 8 };
+    walk.found.add(0, header);
     let mut page = 0;
     let mut seen = HashSet::new();
     let mut next = walk.first();
@@ -76,7 +86,7 @@ impl<R: Read + Seek> EntryWalk<'_, R> {
             return Err(format!("a directory of {count} entries"));
         }
         let directory = count_bytes as u64 + count * entry_bytes + value_bytes;
-        self.found.bytes = self.found.bytes.saturating_add(directory);
+        self.found.add(at, directory);
         for i in 0..count {
             let Some([tag, kind, length, value]) = self.entry() else { return Ok(None) };
             let bytes = length.saturating_mul(bytes_of(kind));
@@ -84,7 +94,7 @@ impl<R: Read + Seek> EntryWalk<'_, R> {
                 return Err(format!("{bytes} bytes in the entry {tag}"));
             }
             if bytes > value_bytes {
-                self.found.bytes = self.found.bytes.saturating_add(bytes);
+                self.found.add(value, bytes);
             }
             self.found.others |= POINTERS.contains(&tag);
             // A short fills the first two bytes of the value, in the file's byte order.
