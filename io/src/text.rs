@@ -3,7 +3,7 @@
 
 use crate::input::LONGEST_TEXT;
 use conefield_core::error::ensure;
-use conefield_core::files::{read_text, read_text_bytes, toml_line};
+use conefield_core::files::{BYTE_ORDER_MARK, read_text, read_text_bytes, toml_line};
 use conefield_core::{Error, Result};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -49,6 +49,11 @@ pub(crate) fn described<T: DeserializeOwned>(path: &Path, format: &str, version:
     let found = mark.version.map_or("nothing".into(), |v| v.to_string());
     ensure(mark.version == Some(version), &place, "version", found, format!("{version}, which this build reads"))?;
     parse(path, &text, notation)
+}
+
+/// The start of a text file without its byte-order mark.
+pub(crate) fn without_mark(head: &[u8]) -> &[u8] {
+    head.strip_prefix(BYTE_ORDER_MARK).unwrap_or(head)
 }
 
 /// Reads a text that another program wrote: in UTF-8, else in Windows-1252, the usual encoding of programs on Windows.

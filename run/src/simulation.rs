@@ -2,7 +2,6 @@
 
 use crate::memory::Memory;
 use crate::parse::{AnglesOption, Values};
-use conefield_core::error::ensure;
 use conefield_core::files::{read_text, toml_line};
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
@@ -10,6 +9,9 @@ use conefield_core::{Error, Result};
 use conefield_projectors::simulate::{Angles, DetectorNoise, HuMapping, Protocol, downsample, project, simulate};
 use serde_json::json;
 use std::path::Path;
+
+/// Line integrals that no measurement reaches: exp(−50) of the light is left.
+const OPAQUE: f32 = 50.0;
 
 /// Longest protocol or list of angles, in bytes.
 const LONGEST: u64 = 16 << 20;
@@ -31,24 +33,9 @@ pub struct Changes {
     pub seed: Option<u64>,
 }
 
-/// Attenuation per unit is not negative; noise of a reconstruction stays far above this, Hounsfield units of air are far
-/// below.
-const LEAST: f32 = -50.0;
-
-/// The volume centred on the rotation axis, in attenuation, with blocks of `size`³ voxels averaged. Refuses values as
-/// they are that can only be Hounsfield units, and warns of negative ones.
+/// The volume centred on the rotation axis, in attenuation, with blocks of `size`³ voxels averaged.
 pub fn prepared(volume: Volume, values: Values, size: usize) -> Result<Volume> {
-    let mut volume = values.apply(volume)?;
-    if let Values::AsIs = values {
-        let [low, high] =
-            volume.data.iter().fold([f32::INFINITY, f32::NEG_INFINITY], |[a, b], x| [a.min(*x), b.max(*x)]);
-        let expected = "attenuation, which is not negative: of Hounsfield units, --values hu:0.02 makes attenuation \
-                        (water 0.02 per mm) and --values clip:-1000,2000 numbers from 0 to 1";
-        ensure(low >= LEAST, "volume", "values", format!("{low} to {high}"), expected)?;
-        if low < -0.1 * high.max(0.0) {
-            tracing::warn!("the volume has values from {low} to {high}: attenuation is not negative (--values)");
-        }
-    }
+    let mut volume = values.attenuation(volume)?;
     // A scan's volume is centred on the rotation axis.
     volume.grid.center = [0.0; 3];
     if size > 1 {
@@ -114,6 +101,13 @@ pub fn scan(mut volume: Volume, values: Values, protocol: &Protocol, source: &st
         volume = volume.mapped(|x| x * per_unit);
     }
     let mut scan = simulate(&volume, protocol)?;
+    let most = scan.projections.iter().copied().fold(0.0, f32::max);
+    if most > OPAQUE {
+        tracing::warn!(
+            "line integrals up to {most}: nothing passes such an object; voxel values are attenuation per {} (--values)",
+            protocol.unit.name
+        );
+    }
     if let Some(p) = scan.provenance.as_object_mut() {
         p.insert("source".into(), json!(source));
     }

@@ -6,7 +6,7 @@ use crate::folder;
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
 use crate::scan_folder::folder_of;
-use crate::text::shortened;
+use crate::text::{shortened, without_mark};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
@@ -20,7 +20,7 @@ const DATA_FILE: [&str; 2] = ["data file", "datafile"];
 
 /// Whether `head`, the start of a file, has NRRD's magic bytes, of any version.
 pub(crate) fn is_header(head: &[u8]) -> bool {
-    head.starts_with(b"NRRD000")
+    without_mark(head).starts_with(b"NRRD000")
 }
 
 /// The entries of a header.
@@ -360,6 +360,8 @@ mod tests {
         let want = [1.0, -2.0, 3.0, 256.0];
         let d = dir.path();
         assert_eq!(values(&write(d, "a.nrrd", &[HEAD.as_bytes(), b"\n", &DATA])), want);
+        let marked = write(d, "m.nrrd", &[b"\xef\xbb\xbf", HEAD.as_bytes(), b"\n", &DATA]);
+        assert_eq!(values(&marked), want);
         let dos = HEAD.replace('\n', "\r\n");
         assert_eq!(values(&write(d, "b.nrrd", &[dos.as_bytes(), b"\r\n", &DATA])), want);
         let packed = HEAD.replace("raw", "gz");

@@ -55,6 +55,7 @@ pub(crate) fn folder_voxels(folder: &Path) -> Result<u64> {
 pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
     let place = folder.display().to_string();
     let names = slices(folder)?;
+    folder::oddity(&names).iter().for_each(|o| tracing::warn!("{place}: {o}"));
     // Claims are checked against file sizes here, before memory for all files is allocated.
     let voxels = usize::try_from(folder_voxels(folder)?).unwrap_or(usize::MAX);
     allowance::numbers(&place, "slices", voxels)?;
