@@ -65,11 +65,6 @@ pub(crate) fn contradiction(name: &str, said: [f64; 3], source: &str, used: [f64
     (!same).then(|| format!("{name} says voxels of {said:?} mm, {source} {used:?} mm: the latter are used"))
 }
 
-/// Warns of the file `place`.
-pub(crate) fn warn(place: &str, remarks: impl IntoIterator<Item = String>) {
-    remarks.into_iter().for_each(|r| tracing::warn!("{place}: {r}"));
-}
-
 /// The affine to write for `voxels` into the file `place`, and whether it is the volume's own. An affine whose voxel
 /// sizes differ from the grid's would make the file contradict itself; it is replaced by one that puts the grid's
 /// centre at `grid.center`.

@@ -6,7 +6,7 @@ use crate::file_order::{self, FileOrder, PACKED_BYTES};
 use crate::folder;
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
-use crate::text::{shortened, without_mark};
+use crate::text::{self, shortened, without_mark};
 use crate::write_atomic;
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::parts::Voxels;
@@ -226,7 +226,7 @@ impl Header {
             if (length - 1.0).abs() <= 1e-3 { spacing[k] } else { spacing[k] * length }
         });
         let differs = affine::contradiction("ElementSpacing", spacing, &format!("with the axes of {name}"), scaled);
-        affine::warn(&self.place, affine::skew(&lps).into_iter().chain(differs));
+        text::warn(&self.place, affine::skew(&lps).into_iter().chain(differs));
         Ok((scaled, affine::flip(lps)))
     }
 }

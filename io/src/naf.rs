@@ -9,9 +9,8 @@ use crate::input::read_bytes;
 use crate::orbit::common_orbit;
 use crate::pickle::{self, Item, Out, Pickle};
 use crate::scan::DataSet;
-use crate::text::warn_of_keys;
 use crate::unit::{self, Reading, Units};
-use crate::{rays, write_atomic};
+use crate::{rays, text, write_atomic};
 use conefield_core::error::ensure;
 use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
@@ -106,7 +105,7 @@ fn read(path: &Path, with_test: bool) -> Result<DataSet> {
     let pickle = Pickle::parse(&place, &bytes)?;
     let top = pickle.top();
     let file = Description::read(&top)?;
-    warn_of_keys(&place, &others(&top)?);
+    text::warn(&place, text::unread(&others(&top)?));
     let name = path.file_name().map(|n| n.to_string_lossy());
     let provenance = json!({ "format": "naf", "file": name });
     let scan = |views: &Item| -> Result<Scan> {
@@ -675,5 +674,9 @@ mod tests {
             fs::write(&path, &bytes[..cut]).unwrap();
             assert!(read_scan(&path).is_err() && read_naf(&path).is_err());
         }
+        // A second pickle in the file.
+        fs::write(&path, [&bytes[..], &bytes].concat()).unwrap();
+        let e = read_naf(&path).unwrap_err().to_string();
+        assert!(e.contains(&format!("{} bytes after the end", bytes.len())), "{e}");
     }
 }

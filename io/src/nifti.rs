@@ -7,6 +7,7 @@ use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder};
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
+use crate::text;
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
@@ -178,7 +179,7 @@ fn orientation(input: &Input, header: &NiftiHeader) -> Result<Affine> {
     if !affine::is_regular(&affine) {
         return Err(input.invalid(field, format!("{rows:?}"), "finite numbers and three independent voxel axes"));
     }
-    affine::warn(&input.place(), remarks(header, &affine, mm));
+    text::warn(&input.place(), remarks(header, &affine, mm));
     Ok(affine)
 }
 

@@ -8,7 +8,7 @@
 use crate::input::LONGEST_TEXT;
 use crate::orbit::common_orbit;
 use crate::scan::DataSet;
-use crate::text::{Notation, parse, shortened, warn_of_keys};
+use crate::text::{self, Notation, parse, shortened, unread};
 use crate::unit::{self, Reading, Units};
 use crate::{ScanSize, folder, memory, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
 use conefield_core::error::ensure;
@@ -67,12 +67,26 @@ struct Scanner {
 /// if the projections are a thousand times larger, the lengths are metres and the volume is in 1/mm. Any other ratio
 /// counts as the first case, with a warning.
 pub fn read_r2(path: impl AsRef<Path>) -> Result<DataSet> {
+    warn_of_others(path.as_ref())?;
     read(path.as_ref(), true)
 }
 
 /// Like [`read_r2`], without the test views.
 pub(crate) fn read_train(folder: &Path) -> Result<DataSet> {
+    warn_of_others(folder)?;
     read(folder, false)
+}
+
+/// The volume of [`read_r2`], in the unit that the training views give.
+pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
+    read(folder, false).map(|r| r.volume)
+}
+
+fn warn_of_others(folder: &Path) -> Result<()> {
+    let file = folder.join(META);
+    let meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
+    text::warn(&file.display().to_string(), unread(&others(&meta)));
+    Ok(())
 }
 
 /// Keys of the scanner that do not move source, detector or volume, beside those of noise.
@@ -122,9 +136,7 @@ const SCANNER_KEYS: [&str; 11] = [
 fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
     let place = file.display().to_string();
-    let text = read_text(&file, LONGEST_TEXT)?;
-    let meta: Meta = parse(&file, &text, Notation::Json)?;
-    warn_of_keys(&place, &others(&parse(&file, &text, Notation::Json)?));
+    let meta: Meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
     let s = &meta.scanner;
     if s.mode != "cone" {
         let what = format!("{place}: scanner.mode: \"{}\"", s.mode);

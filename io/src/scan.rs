@@ -60,7 +60,7 @@ pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet> {
 pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
     match find(path.as_ref())? {
         ScanFile::Own(file) => scan_folder::read_truth(&file),
-        ScanFile::R2(folder) => r2::read_train(&folder).map(|r| r.volume),
+        ScanFile::R2(folder) => r2::read_truth(&folder),
         ScanFile::Naf(file) => naf::read_truth(&file),
         ScanFile::Scanner(_) => Ok(None),
     }

@@ -57,7 +57,7 @@ use crate::rtk::read_rtk_geometry;
 use crate::selection::{Mean, Selection};
 use crate::stack::{self, Names, StackAxis, StackLayout};
 use crate::table::{self, Numbers};
-use crate::text::described;
+use crate::text::{self, described};
 use crate::{ScanSize, folder, foreign, memory, scan_folder};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, Radians, View, VoxelGrid};
@@ -133,6 +133,9 @@ struct Description {
     /// Rows and columns of the detector, if the description states them.
     #[serde(skip)]
     detector: Option<[usize; 2]>,
+    /// Warnings for the user.
+    #[serde(skip)]
+    remarks: Vec<String>,
 }
 
 impl Description {
@@ -276,7 +279,8 @@ struct ValuesTable {
 pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<Imported> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let d = Description::read(path)?;
+    let mut d = Description::read(path)?;
+    text::warn(&place, std::mem::take(&mut d.remarks));
     let folder = scan_folder::folder_of(path);
     d.volume.validate(&place)?;
     let layout = layout(&place, &d.layout)?;

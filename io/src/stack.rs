@@ -3,7 +3,7 @@
 
 use crate::hdf5::{self, ScanPart};
 use crate::input::Input;
-use crate::{folder, foreign, memory, metaimage, npy, npz, tiff};
+use crate::{folder, foreign, memory, metaimage, npy, npz, text, tiff};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, ArrayD, Axis, Ix3};
 use serde::{Deserialize, Serialize};
@@ -78,7 +78,7 @@ pub(crate) fn read(
     layout: StackLayout,
 ) -> Result<Array3<f32>> {
     let (sources, oddities) = sources(folder, place, field, names)?;
-    oddities.iter().for_each(|o| tracing::warn!("{place}: {field}: {o}"));
+    text::warn(&format!("{place}: {field}"), oddities);
     let mut named = folder::NamedFiles::default();
     sources.iter().try_for_each(|s| named.once(place, field, &s.path, s.array.as_deref()))?;
     let mut all: Option<(Vec<f32>, [usize; 2], usize)> = None;

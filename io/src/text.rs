@@ -119,11 +119,14 @@ fn explain(path: &Path, text: &str, line: Option<usize>, message: &str) -> Error
     }
 }
 
-/// Warns of `keys` of the file `place` that are not read.
-pub(crate) fn warn_of_keys(place: &str, keys: &[String]) {
-    if !keys.is_empty() {
-        tracing::warn!("{place}: not read, though they may change the geometry: {}", keys.join(", "));
-    }
+/// What to say of `keys` that are not read; `None` if there are none.
+pub(crate) fn unread(keys: &[String]) -> Option<String> {
+    (!keys.is_empty()).then(|| format!("not read, though they may change the geometry: {}", keys.join(", ")))
+}
+
+/// Warns of the file `place`.
+pub(crate) fn warn(place: &str, remarks: impl IntoIterator<Item = String>) {
+    remarks.into_iter().for_each(|r| tracing::warn!("{place}: {r}"));
 }
 
 /// A value in quotes, cut to 80 characters for errors.

@@ -15,8 +15,8 @@ pub(crate) use volume::{folder_voxels, is_stack, read_folder, read_volume};
 pub(crate) use write::{check_shape, write};
 
 use crate::input::must_unpack;
-use crate::memory;
 use crate::number::{ByteOrder, Number};
+use crate::{memory, text};
 use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance, files};
 use entries::AsStored;
@@ -81,7 +81,7 @@ fn stack(path: &Path, first: impl FnOnce(&mut Pages) -> Result<()>) -> Result<(S
     if let Some(rest) = &images.rest {
         rest.read(path, &mut values)?;
     }
-    images.remarks.iter().for_each(|r| tracing::warn!("{place}: {r}"));
+    text::warn(&place, images.remarks.iter().cloned());
     if images.white > 0 {
         tracing::info!("{place}: {} pages say that white is zero; the numbers are taken as stored", images.white);
     }

@@ -6,7 +6,7 @@ use crate::folder;
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
 use crate::scan_folder::folder_of;
-use crate::text::{shortened, without_mark};
+use crate::text::{self, shortened, without_mark};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
@@ -264,7 +264,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
     let packed = header.packed()?;
     let (spacing, affine) = header.place_of_voxels()?;
     if let Some(affine) = &affine {
-        affine::warn(&header.place, header.remarks(spacing, affine)?);
+        text::warn(&header.place, header.remarks(spacing, affine)?);
     }
     let grid = VoxelGrid { shape, spacing, center: [0.0; 3] };
     grid.validate(&header.place)?;

@@ -17,7 +17,7 @@ use crate::input::LONGEST_TEXT;
 use crate::scan_folder::folder_of;
 use crate::stack::Names;
 use crate::table::Numbers;
-use crate::text::{read_foreign, shortened, warn_of_keys};
+use crate::text::{read_foreign, shortened, unread};
 use conefield_core::geometry::{View, VoxelGrid};
 use conefield_core::{Error, Result};
 use std::collections::HashMap;
@@ -72,13 +72,14 @@ pub(super) fn description(path: &Path) -> Result<Description> {
         axis_direction: [roll.sin(), -tilt.sin() * roll.cos(), tilt.cos() * roll.cos()],
     };
     let numbers = |v: View| [v.source, v.detector, v.u, v.v].concat();
-    let angles = angles(&keys, path, count)?;
+    let mut remarks = Vec::new();
+    let angles = angles(&keys, path, count, &mut remarks)?;
     let cone_vec = rest.views(angles.into_iter().map(|a| a - 180.0)).into_iter().map(numbers).collect();
-    warn_of_keys(&keys.1, &keys.others());
+    remarks.extend(unread(&keys.others()));
     Ok(Description {
         _format: String::new(),
         _version: 0,
-        files: Files { projections: projections(&keys, path, count), flat: None, dark: None },
+        files: Files { projections: projections(&keys, path, count, &mut remarks), flat: None, dark: None },
         circle: None,
         vectors: Some(Vectors { cone_vec: Numbers::List(cone_vec) }),
         rtk: None,
@@ -91,14 +92,17 @@ pub(super) fn description(path: &Path) -> Result<Description> {
         },
         volume: volume(&keys, [columns, rows], [column, row].map(|x| x * object / detector))?,
         detector: Some([rows, columns]),
+        remarks,
     })
 }
 
 /// The angles of `count` views, in degrees: measured ones, else even steps.
-fn angles(keys: &Keys, path: &Path, count: usize) -> Result<Vec<f64>> {
+fn angles(keys: &Keys, path: &Path, count: usize, remarks: &mut Vec<String>) -> Result<Vec<f64>> {
     let (first, step) = (keys.number("InitialAngle")?, keys.number("AngularStep")?);
     let even = |i: usize| first + step * i as f64;
-    let Some((file, measured)) = measured_angles(keys, path, count)? else { return Ok((0..count).map(even).collect()) };
+    let Some((file, measured)) = measured_angles(keys, path, count, remarks)? else {
+        return Ok((0..count).map(even).collect());
+    };
     let used = !keys.text("AngleFile_Use").is_some_and(|u| u.eq_ignore_ascii_case("false"));
     // Relative to the first view, within half a turn.
     let off = |(i, a): (usize, &f64)| {
@@ -107,17 +111,20 @@ fn angles(keys: &Keys, path: &Path, count: usize) -> Result<Vec<f64>> {
     };
     let most = measured.iter().enumerate().map(off).fold(0.0, f64::max);
     let differ = format!("the angles in {file} differ by up to {most:.3} degrees from steps of {step}");
-    match (used, most > UNEVEN * step.abs()) {
-        (true, true) => tracing::warn!("{}: {differ}; those of the file are used", keys.1),
-        (false, true) => tracing::warn!("{}: {differ}; the steps are used, as AngleFile_Use says", keys.1),
-        (true, false) => tracing::info!("{}: angles from {file}", keys.1),
-        (false, false) => {}
+    if most > UNEVEN * step.abs() {
+        let which = if used { "those of the file are used" } else { "the steps are used, as AngleFile_Use says" };
+        remarks.push(format!("{differ}; {which}"));
     }
     Ok(if used { measured } else { (0..count).map(even).collect() })
 }
 
 /// The first of `_ctdata.txt` and `Name.ang` beside the description, and the angles in it.
-fn measured_angles(keys: &Keys, path: &Path, count: usize) -> Result<Option<(String, Vec<f64>)>> {
+fn measured_angles(
+    keys: &Keys,
+    path: &Path,
+    count: usize,
+    remarks: &mut Vec<String>,
+) -> Result<Option<(String, Vec<f64>)>> {
     let folder = folder_of(path);
     let name = keys.text("Name").unwrap_or_default();
     let names = folder::names(folder, &["txt", "ang"])?;
@@ -153,13 +160,13 @@ fn measured_angles(keys: &Keys, path: &Path, count: usize) -> Result<Option<(Str
         return Err(Error::invalid(place, format!("angle of projection {}", i + 1), "none", expected));
     }
     if beyond > 0 {
-        tracing::warn!("{place}: {beyond} angles beyond the {count} Projections are not used");
+        remarks.push(format!("{file}: {beyond} angles beyond the {count} Projections are not used"));
     }
     Ok(Some((file.clone(), angles)))
 }
 
 /// The images: those that have the name in the description and a number, else all of the folder.
-fn projections(keys: &Keys, path: &Path, count: usize) -> Names {
+fn projections(keys: &Keys, path: &Path, count: usize, remarks: &mut Vec<String>) -> Names {
     let text = |key| keys.text(key).unwrap_or_default();
     let folder = match text("InputFolderName") {
         "" => ".",
@@ -187,7 +194,7 @@ fn projections(keys: &Keys, path: &Path, count: usize) -> Names {
     let names = (1..=count).map(name).collect();
     if numbered.keys().any(|n| *n > count) {
         let more = numbered.len();
-        tracing::warn!("{}: {more} images beyond the {count} Projections are not read", keys.1);
+        remarks.push(format!("{more} images beyond the {count} Projections are not read"));
     }
     Names::Many(names)
 }

@@ -97,11 +97,13 @@ impl<R: Read + Seek> EntryWalk<'_, R> {
                 self.found.add(value, bytes);
             }
             self.found.others |= POINTERS.contains(&tag);
-            // A short fills the first two bytes of the value, in the file's byte order.
-            let short = if self.little { value & 0xffff } else { value >> (8 * value_bytes - 16) };
-            if (tag, kind, length, short) == (PHOTOMETRIC, 3, 1, 0) {
-                let entry_end = at.saturating_add(count_bytes as u64 + (i + 1) * entry_bytes);
-                self.found.white.push(entry_end.saturating_sub(value_bytes) + u64::from(!self.little));
+            // The value fills the first bytes of its field, in the file's byte order.
+            let unused = 8 * (value_bytes - bytes.min(value_bytes));
+            let small =
+                if self.little { value & (u64::MAX >> (64 - 8 * value_bytes) >> unused) } else { value >> unused };
+            if tag == PHOTOMETRIC && length == 1 && bytes <= 4 && small == 0 {
+                let field = at.saturating_add(count_bytes as u64 + (i + 1) * entry_bytes - value_bytes);
+                self.found.white.push(field + if self.little { 0 } else { bytes - 1 });
             }
         }
         Ok(self.offset())

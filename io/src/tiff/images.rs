@@ -32,7 +32,7 @@ pub(super) fn claimed(text: &str, [rows, columns]: [u64; 2]) -> Option<Claim> {
     for (at, _) in text.match_indices("Pixels ").filter(|(at, _)| text[..*at].ends_with(['<', ':'])) {
         let element = &text[at..at + text[at..].find('>')?];
         let size = |name: &str| -> u64 {
-            let value = element.split_once(&format!("{name}=")).map(|(_, v)| &v[1..]);
+            let value = element.split_once(&format!("{name}=")).and_then(|(_, v)| v.strip_prefix(['"', '\'']));
             value.and_then(|v| v.split(['"', '\'']).next()?.parse().ok()).unwrap_or(1)
         };
         let series = size("SizeC").saturating_mul(size("SizeT"));
@@ -80,6 +80,8 @@ mod tests {
         assert_eq!(found(&ome.replace("<Pixels", "<OME:Pixels")), Some((16, 2)));
         assert_eq!(found(&ome.repeat(2)), Some((32, 4)));
         assert_eq!(found("<Pixels SizeZ="), None);
+        assert_eq!(found("<Pixels SizeZ=>"), Some((1, 1)));
+        assert_eq!(found("<Pixels SizeZ=é>"), Some((1, 1)));
         assert_eq!(found("a microscope with many Pixels "), None);
         assert_eq!(found(""), None);
     }

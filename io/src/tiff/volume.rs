@@ -5,7 +5,7 @@
 
 use super::{stack, values};
 use crate::affine::{self, Affine};
-use crate::{file_order, folder};
+use crate::{file_order, folder, text};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result, allowance};
@@ -55,7 +55,7 @@ pub(crate) fn folder_voxels(folder: &Path) -> Result<u64> {
 pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
     let place = folder.display().to_string();
     let names = slices(folder)?;
-    folder::oddity(&names).iter().for_each(|o| tracing::warn!("{place}: {o}"));
+    text::warn(&place, folder::oddity(&names));
     // Claims are checked against file sizes here, before memory for all files is allocated.
     let voxels = usize::try_from(folder_voxels(folder)?).unwrap_or(usize::MAX);
     allowance::numbers(&place, "slices", voxels)?;
