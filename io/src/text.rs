@@ -60,7 +60,7 @@ pub(crate) fn without_mark(head: &[u8]) -> &[u8] {
 /// At most `most` bytes.
 pub(crate) fn read_foreign(path: &Path, most: u64) -> Result<String> {
     String::from_utf8(read_text_bytes(path, most)?).or_else(|e| {
-        tracing::info!("{}: the text is not UTF-8 and is read as Windows-1252", path.display());
+        tracing::debug!("{}: the text is not UTF-8 and is read as Windows-1252", path.display());
         Ok(windows_1252(e.as_bytes()))
     })
 }
