@@ -106,7 +106,7 @@ fn others(meta: &serde_json::Value) -> Vec<String> {
     let mut all = Vec::new();
     for (key, value) in meta["scanner"].as_object().into_iter().flatten() {
         if !known(key) && set(value) {
-            all.push(format!("scanner.{key} = {}", shortened(&value.to_string())));
+            all.push(format!("scanner.{key} = {}", shortened(&value.to_string()).trim_matches('"')));
         }
     }
     for split in ["proj_train", "proj_test"] {
@@ -510,7 +510,7 @@ mod tests {
         meta["scanner"]["COR"] = json!(0);
         meta["scanner"]["possion_noise"] = json!(1e4);
         meta["proj_train"][3]["offDetector"] = json!([1, 0]);
-        assert_eq!(others(&meta), ["scanner.rotDetector = \"[0,0.01,0]\"", "proj_train[3].offDetector"]);
+        assert_eq!(others(&meta), ["scanner.rotDetector = [0,0.01,0]", "proj_train[3].offDetector"]);
         // A backslash separates folders: the file was made on Windows.
         for (i, frame) in meta["proj_train"].as_array_mut().unwrap().iter_mut().enumerate() {
             frame["file_path"] = json!(format!("proj_train\\proj_train_{i:04}.npy"));

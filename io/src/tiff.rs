@@ -547,10 +547,11 @@ mod tests {
     #[test]
     fn pages_of_other_numbers_are_refused() {
         let mut file = std::io::Cursor::new(Vec::new());
-        let mut w = TiffEncoder::new(&mut file).unwrap();
-        w.write_image::<kind::Gray16>(2, 1, &[1, 2]).unwrap();
-        w.write_image::<kind::Gray8>(2, 1, &[1, 2]).unwrap();
-        drop(w);
+        {
+            let mut w = TiffEncoder::new(&mut file).unwrap();
+            w.write_image::<kind::Gray16>(2, 1, &[1, 2]).unwrap();
+            w.write_image::<kind::Gray8>(2, 1, &[1, 2]).unwrap();
+        }
         refused(&file.into_inner(), &["page 1", "8-bit unsigned", "16-bit unsigned"]);
     }
 

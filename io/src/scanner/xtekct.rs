@@ -149,8 +149,10 @@ fn measured_angles(
     }
     let mut angles = vec![f64::NAN; count];
     let mut beyond = 0;
+    // Projections are numbered from 1; some files number them from 0.
+    let first = usize::from(rows.iter().all(|(number, _)| *number > 0));
     for (number, angle) in rows {
-        match number.checked_sub(1).and_then(|i| angles.get_mut(i)) {
+        match number.checked_sub(first).and_then(|i| angles.get_mut(i)) {
             Some(at) => *at = angle,
             None => beyond += 1,
         }
@@ -402,6 +404,7 @@ mod tests {
         // Windows-1252, a decimal comma, another order and a row too many.
         let ang = b"Proj\tAngle(\xb0)\n2:\t140,5\n1:\t31,5\n3:\t280\n4:\t391,5\n";
         near(angles("", "", &[("BONE.ANG", ang)]), [31.5, 140.5, 280.0]);
+        near(angles("", "", &[("bone.ang", b"Proj\tAngle\n0\t31\n1\t140\n2\t281\n")]), [31.0, 140.0, 281.0]);
         near(angles("[Xrays]", "[CTPro]\nAngleFile_Use=False\n", &[("bone.ang", ang)]), [30.0, 150.0, 270.0]);
         for (text, words) in [
             ("Proj\n1 31\n3 280\n", ["bone.ang: angle of projection 2", "none"]),
