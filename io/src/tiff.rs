@@ -508,6 +508,16 @@ mod tests {
             let whole = three(true, 1, text);
             refused(&whole[..whole.len() - 1], &["images: found 3", "1 pages and 35 bytes", "12 bytes"]);
         }
+        // No changed byte causes a panic or a large allocation.
+        let whole = three(true, 0, "ImageJ=1.54f\nimages=3\nslices=3\n");
+        for at in (0..160).chain(512..560) {
+            for x in [0x01, 0x80, 0xff] {
+                let mut bytes = whole.clone();
+                bytes[at] ^= x;
+                std::fs::write(&path, &bytes).unwrap();
+                let _ = read(&path);
+            }
+        }
         // Nothing counts them: as many bytes as two more images, or a part of one.
         refused(&three(false, 1, "a detector"), &["file size", "24 bytes", "2 more images"]);
         std::fs::write(&path, &three(false, 1, "a detector")[..1024 + 20]).unwrap();
