@@ -2,15 +2,14 @@
 
 use crate::arc::{ScanArc, scan_arc};
 use crate::shadow::Shadow;
-use conefield_core::geometry::{Geometry, Vec3, norm};
-use conefield_core::orbit::CircularOrbit;
+use conefield_core::geometry::{Geometry, Vec3, View, norm, sub};
 use serde::Serialize;
 
 /// A scan's lengths and angles; medians if views differ. The axis is z; the isocentre is its point at the source's
 /// height.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Setup {
-    /// Whether all views lie on one circle about the axis.
+    /// Whether all views lie on one circle about the axis: source and detector turn about it as one body.
     pub circle: bool,
     /// Distance from the source to the axis.
     pub source_to_axis_mm: f64,
@@ -85,7 +84,7 @@ pub fn setup(geometry: &Geometry) -> Setup {
     let finite = |x: f64| if x.is_finite() { x.max(0.0) } else { 0.0 };
     let [dso, dsd, magnification, pv, pu, ov, ou] = std::array::from_fn(middle);
     Setup {
-        circle: CircularOrbit::fit(&geometry.views).is_some(),
+        circle: turns_about_the_axis(&geometry.views),
         source_to_axis_mm: dso,
         source_to_detector_mm: dsd,
         magnification,
@@ -100,6 +99,25 @@ pub fn setup(geometry: &Geometry) -> Setup {
         },
         angles: scan_arc(&geometry.views),
     }
+}
+
+/// Tolerance of a view's deviation from the turned first view, relative to the distance from source to detector.
+const TOLERANCE: f64 = 1e-9;
+
+/// Whether every view is the first one, turned about z.
+fn turns_about_the_axis(views: &[View]) -> bool {
+    let Some(first) = views.first().filter(|v| v.source[0].hypot(v.source[1]) > 0.0) else { return false };
+    let position = |v: &View| v.source[1].atan2(v.source[0]);
+    let distance = norm(sub(first.detector, first.source));
+    views.iter().all(|view| {
+        let (s, c) = (position(view) - position(first)).sin_cos();
+        let turned = |p: Vec3| [c * p[0] - s * p[1], s * p[0] + c * p[1], p[2]];
+        let near = |p: Vec3, q: Vec3, scale: f64| norm(sub(turned(p), q)) <= TOLERANCE * scale;
+        near(first.source, view.source, distance)
+            && near(first.detector, view.detector, distance)
+            && near(first.u, view.u, norm(first.u))
+            && near(first.v, view.v, norm(first.v))
+    })
 }
 
 /// Rounds tiny offsets, which are rounding errors, to 0.

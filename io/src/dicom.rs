@@ -11,7 +11,7 @@ mod slice;
 #[cfg(test)]
 mod tests;
 
-use crate::affine;
+use crate::{affine, foreign};
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm, sub};
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result, allowance, files};
@@ -64,6 +64,7 @@ fn slices(folder: &Path) -> Result<Vec<Slice>> {
         return Err(Error::invalid(place, "SeriesInstanceUID", list.join("; "), expected));
     }
     let Some(slices) = series.into_values().next() else {
+        foreign::refuse_folder(folder)?;
         let found = format!("none among {others} files (subfolders are not searched)");
         return Err(Error::invalid(place, "DICOM slices", found, "the files of one series"));
     };

@@ -23,19 +23,15 @@ pub(crate) fn inside(folder: &Path, place: &str, field: &str, name: &str) -> Res
     Ok(path)
 }
 
-/// Like [`inside`], for a file or a folder.
+/// Like [`inside`], for a file or a folder. A backslash separates folders like a slash, as programs on Windows write it.
 pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
     let shown = || format!("\"{name}\"");
-    let down = Path::new(name).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
-    if name.is_empty() || !down || name.contains(['\\', ':', '\0']) {
-        return Err(Error::invalid(
-            place,
-            field,
-            shown(),
-            "a relative path inside the folder, without \"..\" and backslashes",
-        ));
+    let slashed = name.replace('\\', "/");
+    let down = Path::new(&slashed).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
+    if name.is_empty() || !down || name.contains([':', '\0']) {
+        return Err(Error::invalid(place, field, shown(), "a relative path inside the folder, without \"..\""));
     }
-    let path = folder.join(name);
+    let path = folder.join(slashed);
     let real = path.canonicalize().map_err(|e| Error::invalid(place, field, format!("{} ({e})", shown()), "a file"))?;
     let root = folder.canonicalize().map_err(|e| Error::io(folder, e))?;
     if !real.starts_with(&root) {
@@ -121,6 +117,37 @@ fn natural(name: &str) -> (Vec<(String, usize, String)>, String) {
     (parts, name.to_string())
 }
 
+/// What is odd about the numbers in the `names` of a series, in the order of [`names`]: two series in one folder, or
+/// numbers missing between the first and the last. `None` if nothing is.
+pub(crate) fn oddity(names: &[String]) -> Option<String> {
+    let keys: Vec<_> = names.iter().map(|n| natural(n).0).collect();
+    let texts = |i: usize| -> Vec<&str> { keys[i].iter().map(|(text, ..)| text.as_str()).collect() };
+    if let Some(i) = (1..keys.len()).find(|&i| texts(i) != texts(i - 1)) {
+        return Some(format!("{} and {} look like files of two series, and are read as one", names[i - 1], names[i]));
+    }
+    let number = |i: usize, k: usize| keys[i][k].2.as_str();
+    let parts = keys.first().map_or(0, Vec::len);
+    let mut changing = (0..parts).filter(|&k| (1..keys.len()).any(|i| number(i, k) != number(0, k)));
+    // Numbers that cannot be counted, and names with two of them, such as an angle beside an index, say nothing.
+    let (Some(k), None) = (changing.next(), changing.next()) else { return None };
+    let numbers: Vec<u64> = (0..keys.len())
+        .map(|i| Some(number(i, k)).filter(|n| !n.is_empty()).map_or(Ok(0), str::parse))
+        .collect::<Result<_, _>>()
+        .ok()?;
+    let steps: Vec<u64> = numbers.windows(2).map(|n| n[1] - n[0]).collect();
+    let mut sorted = steps.clone();
+    sorted.sort_unstable();
+    let usual = sorted[sorted.len() / 2];
+    let (even, gaps): (Vec<_>, Vec<_>) = (0..steps.len()).partition(|&i| steps[i] == usual);
+    // Times and positions are no numbers of a series.
+    if gaps.is_empty() || usual == 0 || even.len() <= gaps.len() {
+        return None;
+    }
+    let shown: Vec<String> = gaps.iter().take(3).map(|&i| format!("{} and {}", names[i], names[i + 1])).collect();
+    let more = if gaps.len() > 3 { format!(" and at {} more places", gaps.len() - 3) } else { String::new() };
+    Some(format!("no file between {}{more}: are images missing?", shown.join(", between ")))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -130,5 +157,41 @@ mod tests {
         let mut names = ["p10.tif", "p9.tif", "p010.tif", "P1.tif", "p100000000000000000000000.tif", "a.tif"];
         names.sort_by_cached_key(|n| natural(n));
         assert_eq!(names, ["a.tif", "P1.tif", "p9.tif", "p010.tif", "p10.tif", "p100000000000000000000000.tif"]);
+    }
+
+    #[test]
+    fn gaps_and_strangers_in_a_series_are_found() {
+        let series = |numbers: &mut dyn Iterator<Item = u64>| -> Vec<String> {
+            numbers.map(|n| format!("view_{n:04}_90kV.tif")).collect()
+        };
+        assert_eq!(oddity(&series(&mut (1..100))), None);
+        assert_eq!(oddity(&series(&mut (0..100).step_by(5))), None);
+        let found = oddity(&series(&mut (1..100).filter(|n| ![17, 18, 40].contains(n)))).unwrap();
+        assert!(found.contains("view_0016_90kV.tif and view_0019_90kV.tif") && found.contains("view_0039"), "{found}");
+        // Irregular numbers are times or positions; two numbers that change need not be a series.
+        assert_eq!(oddity(&series(&mut [3, 10, 18, 90, 91].into_iter())), None);
+        assert_eq!(oddity(&(0..9).map(|i| format!("{i}_{}.tif", i * i)).collect::<Vec<_>>()), None);
+        assert_eq!(oddity(&["a.tif".into()]), None);
+        assert_eq!(oddity(&[]), None);
+        let mut mixed = series(&mut (1..4));
+        mixed.insert(0, "flat.tif".into());
+        assert!(oddity(&mixed).unwrap().contains("flat.tif and view_0001_90kV.tif"));
+        assert_eq!(oddity(&["p00000000000000000000000001.tif".into(), "p99999999999999999999999999.tif".into()]), None);
+    }
+
+    #[test]
+    fn a_backslash_separates_folders_but_does_not_lead_out() {
+        let dir = tempfile::tempdir().unwrap();
+        let inner = dir.path().join("in");
+        std::fs::create_dir_all(inner.join("sub")).unwrap();
+        std::fs::write(inner.join("sub/a.npy"), "").unwrap();
+        std::fs::write(dir.path().join("out.npy"), "").unwrap();
+        for name in ["sub\\a.npy", ".\\sub\\a.npy", "sub/a.npy"] {
+            assert!(inside(&inner, "m.json", "file_path", name).unwrap().ends_with("sub/a.npy"), "{name}");
+        }
+        for name in ["..\\out.npy", "sub\\..\\..\\out.npy", "C:\\out.npy", "\\\\server\\share\\out.npy", "\\out.npy"] {
+            let e = inside(&inner, "m.json", "file_path", name).unwrap_err().to_string();
+            assert!(e.contains("m.json: file_path") && e.contains("inside the folder"), "{name}: {e}");
+        }
     }
 }

@@ -34,6 +34,28 @@ const LONGEST_CHUNK: u64 = u32::MAX as u64;
 /// Most bytes (or one frame) of a data set without chunks that are read at a time.
 const SLAB_BYTES: u64 = 16 << 20;
 
+/// Filters that are not read, by their registered numbers.
+const FILTERS: &[(u32, &str)] = &[
+    (4, "szip"),
+    (305, "LZO"),
+    (307, "bzip2"),
+    (32_000, "LZF"),
+    (32_001, "Blosc"),
+    (32_002, "MAFISC"),
+    (32_003, "Snappy"),
+    (32_004, "LZ4"),
+    (32_008, "bitshuffle"),
+    (32_013, "ZFP"),
+    (32_014, "fpzip"),
+    (32_015, "Zstandard"),
+    (32_016, "B3D"),
+    (32_017, "SZ"),
+    (32_018, "FCIDECOMP"),
+    (32_019, "JPEG"),
+    (32_024, "SZ3"),
+    (32_026, "Blosc2"),
+];
+
 /// The part of a scan to read from a file that holds all of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ScanPart {
@@ -140,7 +162,21 @@ impl Container {
     }
 
     fn broken(&self, data: &Dataset, e: &hdf5_reader::error::Error) -> Error {
+        if let hdf5_reader::error::Error::UnsupportedFilter(text) = e {
+            return self.packed_otherwise(data, text);
+        }
         self.invalid(data.name(), e, "data that is not damaged, unpacked or packed by deflate")
+    }
+
+    /// The error about a filter that is not read; `text` is the library's, which ends with the filter's number.
+    fn packed_otherwise(&self, data: &Dataset, text: &str) -> Error {
+        let number = text.strip_prefix("filter id ").and_then(|n| n.parse::<u32>().ok());
+        let name = FILTERS.iter().find(|(id, _)| Some(*id) == number).map_or("a filter", |(_, name)| name);
+        Error::unsupported(
+            format!("{}: {}: packed by {name} ({text}), which is not read", self.place, data.name()),
+            "unpack it with `h5repack -f NONE IN.h5 OUT.h5` (HDF5's tool needs the filter's plugin, as hdf5plugin for \
+             Python has it), or save it with gzip",
+        )
     }
 
     /// The data set at `path`, if there is one.

@@ -29,6 +29,7 @@ mod dicom;
 mod events;
 mod file_order;
 mod folder;
+mod foreign;
 mod hdf5;
 mod input;
 mod lease;

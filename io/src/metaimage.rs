@@ -6,7 +6,7 @@ use crate::file_order::{self, FileOrder, PACKED_BYTES};
 use crate::folder;
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
-use crate::text::shortened;
+use crate::text::{self, shortened, without_mark};
 use crate::write_atomic;
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::parts::Voxels;
@@ -25,7 +25,8 @@ const DATA_FILE: &str = "ElementDataFile";
 /// Whether `head`, the start of a file, contains the line with the object type or the number of axes, preceded only by
 /// other lines of this form.
 pub(crate) fn is_header(head: &[u8]) -> bool {
-    head.split(|b| *b == b'\n')
+    without_mark(head)
+        .split(|b| *b == b'\n')
         .filter(|line| !line.trim_ascii().is_empty())
         .map_while(entry)
         .any(|(name, _)| name == "NDims" || name == "ObjectType")
@@ -61,10 +62,11 @@ impl Header {
                 let found = format!("the end of the file after {} lines", number - 1);
                 return Err(header.invalid(DATA_FILE, found, "a line that says where the data is"));
             }
+            let line = if number == 1 { without_mark(&line) } else { &line };
             if line.trim_ascii().is_empty() {
                 continue;
             }
-            let Some((name, value)) = entry(&line) else {
+            let Some((name, value)) = entry(line) else {
                 let start = String::from_utf8_lossy(&line[..line.len().min(40)]).into_owned();
                 return Err(header.invalid(&format!("line {number}"), format!("{start:?}"), "Name = value"));
             };
@@ -219,11 +221,13 @@ impl Header {
             return Err(self.invalid(name, format!("{turn:?}"), "three independent voxel axes"));
         }
         // ITK multiplies both: an axis that is not a unit vector scales the voxels.
-        let spacing = std::array::from_fn(|k| {
+        let scaled = std::array::from_fn(|k| {
             let length = norm(std::array::from_fn(|i| entry(k, i)));
             if (length - 1.0).abs() <= 1e-3 { spacing[k] } else { spacing[k] * length }
         });
-        Ok((spacing, affine::flip(lps)))
+        let differs = affine::contradiction("ElementSpacing", spacing, &format!("with the axes of {name}"), scaled);
+        text::warn(&self.place, affine::skew(&lps).into_iter().chain(differs));
+        Ok((scaled, affine::flip(lps)))
     }
 }
 
@@ -423,6 +427,8 @@ mod tests {
         let v = read_bytes(&small(""));
         assert_eq!(v.affine.unwrap()[0], [-1.0, 0.0, 0.0, 0.0]);
         assert_eq!(read_bytes(&small("DistanceUnits = cm\nElementSpacing = 1 2 3\n")).grid.spacing, [10.0, 20.0, 30.0]);
+        let marked = [b"\xef\xbb\xbf".as_slice(), &small("")].concat();
+        assert_eq!(read_bytes(&marked).grid.shape, [2, 3, 1]);
         // A comment may be in any encoding.
         let latin = [b"Comment = caf\xe9\n".as_slice(), &small("")].concat();
         assert_eq!(read_bytes(&latin).grid.shape, [2, 3, 1]);

@@ -10,7 +10,7 @@ use crate::orbit::common_orbit;
 use crate::pickle::{self, Item, Out, Pickle};
 use crate::scan::DataSet;
 use crate::unit::{self, Reading, Units};
-use crate::{rays, write_atomic};
+use crate::{rays, text, write_atomic};
 use conefield_core::error::ensure;
 use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
@@ -26,6 +26,22 @@ const REQUIRED: [&str; 8] = ["mode", "DSO", "DSD", "nDetector", "dDetector", "nV
 
 /// Optional keys that change the scan.
 const OPTIONAL: [&str; 7] = ["offOrigin", "offDetector", "image", "val", "numTrain", "numVal", "unit"];
+
+/// Keys of the published files that only their generator needs: none of them moves source, detector or volume.
+const STILL: [&str; 12] = [
+    "accuracy",
+    "filter",
+    "totalAngle",
+    "startAngle",
+    "randomAngle",
+    "convert",
+    "rescale_slope",
+    "rescale_intercept",
+    "normalize",
+    "noise",
+    "sDetector",
+    "sVoxel",
+];
 
 /// How similar an unknown key must be to a missing one to count as a misspelling.
 const NEAR: f64 = 0.9;
@@ -89,6 +105,7 @@ fn read(path: &Path, with_test: bool) -> Result<DataSet> {
     let pickle = Pickle::parse(&place, &bytes)?;
     let top = pickle.top();
     let file = Description::read(&top)?;
+    text::warn(&place, text::unread(&others(&top)?));
     let name = path.file_name().map(|n| n.to_string_lossy());
     let provenance = json!({ "format": "naf", "file": name });
     let scan = |views: &Item| -> Result<Scan> {
@@ -248,6 +265,23 @@ fn check_keys(top: &Item) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Numbers other than 0 that are not read, such as TIGRE's `rotDetector` and `COR`.
+fn others(top: &Item) -> Result<Vec<String>> {
+    let known = |key: &str| REQUIRED.contains(&key) || OPTIONAL.contains(&key) || STILL.contains(&key);
+    let mut all = Vec::new();
+    for key in top.keys()?.into_iter().filter(|k| !known(k)) {
+        let Some(item) = top.get(key)? else { continue };
+        let numbers = |item: &Item| {
+            let one = || item.number().map(|x| vec![x]);
+            one().or_else(|_| item.list::<2>("").map(Vec::from)).or_else(|_| item.list::<3>("").map(Vec::from))
+        };
+        if numbers(&item).is_ok_and(|n| n.iter().any(|x| *x != 0.0)) {
+            all.push(key.to_owned());
+        }
+    }
+    Ok(all)
 }
 
 fn nearest<'k>(key: &str, names: impl Iterator<Item = &'k &'k str>) -> Option<(&'k str, f64)> {
@@ -575,6 +609,21 @@ mod tests {
     }
 
     #[test]
+    fn keys_that_move_something_and_are_not_read_are_named() {
+        let (_dir, path) = written(&|e| {
+            e.push(("rotDetector", Out::Doubles(&[0.0, 0.1, 0.0])));
+            e.push(("COR", Out::Int(0)));
+            e.push(("noise", Out::Int(1)));
+            e.push(("startAngle", Out::Float(30.0)));
+            e.push(("comment", Out::Text("tilted")));
+        });
+        let bytes = fs::read(&path).unwrap();
+        let pickle = Pickle::parse("a.pickle", &bytes).unwrap();
+        assert_eq!(others(&pickle.top()).unwrap(), ["rotDetector"]);
+        assert!(read_naf(&path).is_ok());
+    }
+
+    #[test]
     fn lying_descriptions_are_refused_in_words() {
         let refused = |change: &dyn Fn(&mut Entries), words: &[&str]| {
             let (_dir, path) = written(change);
@@ -625,5 +674,9 @@ mod tests {
             fs::write(&path, &bytes[..cut]).unwrap();
             assert!(read_scan(&path).is_err() && read_naf(&path).is_err());
         }
+        // A second pickle in the file.
+        fs::write(&path, [&bytes[..], &bytes].concat()).unwrap();
+        let e = read_naf(&path).unwrap_err().to_string();
+        assert!(e.contains(&format!("{} bytes after the end", bytes.len())), "{e}");
     }
 }

@@ -7,6 +7,7 @@ use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder};
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
+use crate::text;
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
@@ -178,7 +179,16 @@ fn orientation(input: &Input, header: &NiftiHeader) -> Result<Affine> {
     if !affine::is_regular(&affine) {
         return Err(input.invalid(field, format!("{rows:?}"), "finite numbers and three independent voxel axes"));
     }
+    text::warn(&input.place(), remarks(header, &affine, mm));
     Ok(affine)
+}
+
+/// What is odd about the axes: shear, and sizes in pixdim other than those of the sform. A pixdim of zeros says nothing.
+fn remarks(header: &NiftiHeader, affine: &Affine, mm: f64) -> Vec<String> {
+    let said: [f64; 3] = std::array::from_fn(|k| f64::from(header.pixdim[k + 1]).abs() * mm);
+    let differs = affine::contradiction("pixdim", said, "the sform", affine::spacing(affine));
+    let says = header.sform_code > 0 && said.iter().all(|s| *s > 0.0);
+    affine::skew(affine).into_iter().chain(differs.filter(|_| says)).collect()
 }
 
 /// The standard's method 2: a rotation as a unit quaternion, voxel sizes, and the sign of the third axis in
@@ -456,6 +466,21 @@ mod tests {
         refused(&with(344, b"ni1\0"), &["another file"]);
         // Third stored voxel: x 2, y 0, z 0.
         refused(&with(352 + 8, &f32::NAN.to_le_bytes()), &["voxel [2, 0, 0]", "NaN"]);
+    }
+
+    #[test]
+    fn shear_and_sizes_that_contradict_are_said() {
+        let said = |bytes: &[u8]| {
+            let header = nifti::NiftiHeader::from_reader(&bytes[..super::HEADER]).unwrap();
+            let affine = read_volume(&file("a.nii", bytes).1).unwrap().affine.unwrap();
+            super::remarks(&header, &affine, 1.0).join("; ")
+        };
+        assert_eq!(said(&bytes()), "");
+        let other = said(&with(88, &3f32.to_le_bytes()));
+        assert!(other.contains("pixdim says voxels of [0.5, 0.75, 3.0] mm, the sform [0.5, 0.75, 2.0]"), "{other}");
+        // The sform's second column gets a part along x.
+        let sheared = said(&with(284, &0.75f32.to_le_bytes()));
+        assert!(sheared.contains("x and y of the voxels are at 45.00 degrees"), "{sheared}");
     }
 
     #[test]

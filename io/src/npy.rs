@@ -38,6 +38,11 @@ pub(crate) fn read_from(input: &mut Input, start: Vec<u8>, axes: &[&str]) -> Res
 
 /// Like [`read_from`], for an array with any of several sets of axes.
 pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
+    read_counts(input, start, sets).map(|(array, _)| array)
+}
+
+/// Like [`read_one_of`], with the type of the numbers in the file.
+pub(crate) fn read_counts(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<(ArrayD<f32>, Number)> {
     let header = read_header(input, start)?;
     let expected = || {
         let each: Vec<String> = sets.iter().map(|a| format!("{} axes ({})", a.len(), a.join(", "))).collect();
@@ -62,7 +67,7 @@ pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
     if let Some((at, x)) = stray(&array) {
         return Err(input.invalid(format!("data{:?}", at.slice()), x, "a finite number"));
     }
-    Ok(array)
+    Ok((array, header.number))
 }
 
 /// Shape and numbers, in C order and full precision, of a small array of one or two axes; continues after `start` like

@@ -18,6 +18,18 @@ pub(crate) enum Number {
     F64,
 }
 
+impl std::fmt::Display for Number {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let kind = match self {
+            Self::Bool => return f.write_str("booleans"),
+            Self::U8 | Self::U16 | Self::U32 | Self::U64 => "unsigned integers",
+            Self::I8 | Self::I16 | Self::I32 | Self::I64 => "signed integers",
+            Self::F32 | Self::F64 => "floats",
+        };
+        write!(f, "{}-bit {kind}", 8 * self.bytes())
+    }
+}
+
 /// Byte order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ByteOrder {

@@ -67,6 +67,10 @@ impl<'a> Pickle<'a> {
             encoded: 0,
         };
         let top = machine.run()?;
+        if machine.at < bytes.len() {
+            let found = format!("{} bytes after the end of the pickle", bytes.len() - machine.at);
+            return Err(Error::invalid(place, "content", found, "one pickle in the file"));
+        }
         machine.heap.check_nesting(top).map_err(|r| Error::invalid(place, "content", r.found, r.expected))?;
         Ok(Self { place: place.to_owned(), heap: machine.heap, top })
     }

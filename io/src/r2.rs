@@ -8,7 +8,7 @@
 use crate::input::LONGEST_TEXT;
 use crate::orbit::common_orbit;
 use crate::scan::DataSet;
-use crate::text::{Notation, parse};
+use crate::text::{self, Notation, parse, shortened, unread};
 use crate::unit::{self, Reading, Units};
 use crate::{ScanSize, folder, memory, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
 use conefield_core::error::ensure;
@@ -67,13 +67,71 @@ struct Scanner {
 /// if the projections are a thousand times larger, the lengths are metres and the volume is in 1/mm. Any other ratio
 /// counts as the first case, with a warning.
 pub fn read_r2(path: impl AsRef<Path>) -> Result<DataSet> {
+    warn_of_others(path.as_ref())?;
     read(path.as_ref(), true)
 }
 
 /// Like [`read_r2`], without the test views.
 pub(crate) fn read_train(folder: &Path) -> Result<DataSet> {
+    warn_of_others(folder)?;
     read(folder, false)
 }
+
+/// The volume of [`read_r2`], in the unit that the training views give.
+pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
+    read(folder, false).map(|r| r.volume)
+}
+
+fn warn_of_others(folder: &Path) -> Result<()> {
+    let file = folder.join(META);
+    let meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
+    text::warn(&file.display().to_string(), unread(&others(&meta)));
+    Ok(())
+}
+
+/// Keys of the scanner that do not move source, detector or volume, beside those of noise.
+const STILL: [&str; 4] = ["filter", "accuracy", "totalAngle", "startAngle"];
+
+/// Numbers other than 0 in a description that are not read: of the scanner (TIGRE's `rotDetector` and `COR`, say) and of
+/// single views.
+fn others(meta: &serde_json::Value) -> Vec<String> {
+    fn set(value: &serde_json::Value) -> bool {
+        match value {
+            serde_json::Value::Number(n) => n.as_f64() != Some(0.0),
+            serde_json::Value::Array(all) => all.iter().any(set),
+            _ => false,
+        }
+    }
+    let known = |key: &str| SCANNER_KEYS.contains(&key) || STILL.contains(&key) || key.to_lowercase().contains("noise");
+    let mut all = Vec::new();
+    for (key, value) in meta["scanner"].as_object().into_iter().flatten() {
+        if !known(key) && set(value) {
+            all.push(format!("scanner.{key} = {}", shortened(&value.to_string()).trim_matches('"')));
+        }
+    }
+    for split in ["proj_train", "proj_test"] {
+        let frames = meta[split].as_array().into_iter().flatten().enumerate();
+        let mut keys = frames.flat_map(|(i, f)| f.as_object().into_iter().flatten().map(move |(key, v)| (i, key, v)));
+        let stranger = keys.find(|(_, key, value)| !["file_path", "angle"].contains(&key.as_str()) && set(value));
+        all.extend(stranger.map(|(i, key, _)| format!("{split}[{i}].{key}")));
+    }
+    all
+}
+
+/// The keys of [`Scanner`].
+const SCANNER_KEYS: [&str; 11] = [
+    "mode",
+    "DSD",
+    "DSO",
+    "nDetector",
+    "sDetector",
+    "dDetector",
+    "nVoxel",
+    "sVoxel",
+    "dVoxel",
+    "offOrigin",
+    "offDetector",
+];
 
 fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
@@ -441,6 +499,27 @@ mod tests {
     }
 
     #[test]
+    fn keys_that_move_something_and_are_not_read_are_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("r2");
+        write_r2(&path, &scan(), None, None).unwrap();
+        let file = path.join(META);
+        let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
+        assert_eq!(others(&meta), Vec::<String>::new());
+        meta["scanner"]["rotDetector"] = json!([0, 0.01, 0]);
+        meta["scanner"]["COR"] = json!(0);
+        meta["scanner"]["possion_noise"] = json!(1e4);
+        meta["proj_train"][3]["offDetector"] = json!([1, 0]);
+        assert_eq!(others(&meta), ["scanner.rotDetector = [0,0.01,0]", "proj_train[3].offDetector"]);
+        // A backslash separates folders: the file was made on Windows.
+        for (i, frame) in meta["proj_train"].as_array_mut().unwrap().iter_mut().enumerate() {
+            frame["file_path"] = json!(format!("proj_train\\proj_train_{i:04}.npy"));
+        }
+        fs::write(&file, meta.to_string()).unwrap();
+        assert_eq!(read_r2(&path).unwrap().train.projections, scan().projections);
+    }
+
+    #[test]
     fn lying_descriptions_are_refused_in_words() {
         let refused = |change: &dyn Fn(&mut serde_json::Value), words: &[&str]| {
             let dir = tempfile::tempdir().unwrap();
@@ -463,6 +542,7 @@ mod tests {
         refused(&|m| m["scanner"]["dVoxel"] = json!([9, 9, 9]), &["scanner.dVoxel", "sVoxel"]);
         refused(&|m| m["proj_train"] = json!([]), &["proj_train", "views"]);
         refused(&|m| m["proj_train"][2]["file_path"] = json!("../x.npy"), &["proj_train[2].file_path", "inside"]);
+        refused(&|m| m["proj_train"][2]["file_path"] = json!("..\\x.npy"), &["proj_train[2].file_path", "inside"]);
         refused(&|m| m["proj_train"][2]["file_path"] = json!("/etc/passwd"), &["proj_train[2].file_path", "inside"]);
         refused(&|m| m["proj_train"][2]["file_path"] = json!("none.npy"), &["proj_train[2].file_path", "none.npy"]);
         refused(&|m| m["vol"] = json!("vol_gt.npy"), &["vol", "vol_gt.npy"]);

@@ -10,9 +10,9 @@
 //!
 //! RTK names no unit of length; conefield uses mm. Angles are degrees.
 
+use crate::text::read_foreign;
 use crate::write_text_atomic;
 use conefield_core::error::ensure;
-use conefield_core::files::read_text;
 use conefield_core::geometry::{Vec3, View, cross, dot, norm, sub};
 use conefield_core::{Error, Result, allowance};
 use roxmltree::{Document, Node, ParsingOptions};
@@ -146,7 +146,7 @@ impl Projection {
 pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 2]) -> Result<Vec<View>> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let text = read_text(path, LONGEST)?;
+    let text = read_foreign(path, LONGEST)?;
     allowance::memory(&place, "XML", (text.len() as u64).saturating_mul(NODE_BYTES))?;
     // RTK writes a document type without content; the parser limits entities.
     let options = ParsingOptions { allow_dtd: true, nodes_limit: MOST_NODES, ..ParsingOptions::default() };
@@ -412,6 +412,7 @@ mod tests {
             let e = read(&text).unwrap_err().to_string();
             assert!(e.contains("geometry.xml") && e.contains(words), "{words:?} is not in: {e}");
         }
+        assert_eq!(read(&format!("\u{feff}{EXAMPLE}")).unwrap().len(), 2);
         assert!(read("").unwrap_err().to_string().contains("XML"));
         let e = read("<RTKThreeDCircularGeometry version=\"3\"/>").unwrap_err().to_string();
         assert!(e.contains("one for each view"), "{e}");

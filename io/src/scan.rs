@@ -1,7 +1,7 @@
 //! Entry points for scans: they recognize the format of a folder or file.
 
 use crate::text::format_of;
-use crate::{ImportOptions, naf, pickle, r2, scan_folder, scanner};
+use crate::{ImportOptions, foreign, naf, pickle, r2, scan_folder, scanner};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -60,7 +60,7 @@ pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet> {
 pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
     match find(path.as_ref())? {
         ScanFile::Own(file) => scan_folder::read_truth(&file),
-        ScanFile::R2(folder) => r2::read_train(&folder).map(|r| r.volume),
+        ScanFile::R2(folder) => r2::read_truth(&folder),
         ScanFile::Naf(file) => naf::read_truth(&file),
         ScanFile::Scanner(_) => Ok(None),
     }
@@ -87,7 +87,10 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
                 // The description's reader reports what is missing.
                 _ => Ok(ScanFile::Scanner(path.to_path_buf())),
             },
-            _ => Err(Error::invalid(place, "scan", "a file of another kind", understood)),
+            _ => {
+                foreign::refuse_file(path)?;
+                Err(Error::invalid(place, "scan", "a file of another kind", understood))
+            }
         };
     }
     let has = |name: &str| path.join(name).is_file();
@@ -97,7 +100,10 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
         (_, true, _) => Ok(ScanFile::Own(path.join("scan.json"))),
         (.., true) => Ok(ScanFile::R2(path.to_path_buf())),
         _ if has(SCANNER) => Ok(ScanFile::Scanner(path.join(SCANNER))),
-        _ => Err(Error::invalid(place, "scan", "none of the files that describe one", understood)),
+        _ => {
+            foreign::refuse_folder(path)?;
+            Err(Error::invalid(place, "scan", "none of the files that describe one", understood))
+        }
     }
 }
 

@@ -57,8 +57,8 @@ use crate::rtk::read_rtk_geometry;
 use crate::selection::{Mean, Selection};
 use crate::stack::{self, Names, StackAxis, StackLayout};
 use crate::table::{self, Numbers};
-use crate::text::described;
-use crate::{ScanSize, folder, memory, scan_folder};
+use crate::text::{self, described};
+use crate::{ScanSize, folder, foreign, memory, scan_folder};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, Radians, View, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;
@@ -133,6 +133,9 @@ struct Description {
     /// Rows and columns of the detector, if the description states them.
     #[serde(skip)]
     detector: Option<[usize; 2]>,
+    /// Warnings for the user.
+    #[serde(skip)]
+    remarks: Vec<String>,
 }
 
 impl Description {
@@ -149,8 +152,11 @@ fn refuse_images(path: &Path) -> Result<()> {
     let found = match &extension[..] {
         _ if path.is_dir() => "a folder".to_owned(),
         "tif" | "tiff" | "npy" | "npz" | "mha" | "h5" | "hdf5" | "nxs" => format!("a .{extension} file of projections"),
-        _ => return Ok(()),
+        _ => return foreign::refuse_file(path),
     };
+    if path.is_dir() {
+        foreign::refuse_folder(path)?;
+    }
     let expected = "a text file that describes the scanner and names its projections (docs/guide/scan-in.md)";
     Err(Error::invalid(path.display().to_string(), "SCANNER.toml", found, expected))
 }
@@ -273,7 +279,8 @@ struct ValuesTable {
 pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<Imported> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let d = Description::read(path)?;
+    let mut d = Description::read(path)?;
+    text::warn(&place, std::mem::take(&mut d.remarks));
     let folder = scan_folder::folder_of(path);
     d.volume.validate(&place)?;
     let layout = layout(&place, &d.layout)?;
@@ -310,7 +317,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
         let (a, report) = line_integrals(values, &correction, &place)?;
         (a, Some(report))
     };
-    let (geometry, projections) = rows_down(&place, geometry, projections)?;
+    let (geometry, projections) = straightened(&place, geometry, projections)?;
     let provenance = json!({
         "format": "scanner",
         "file": path.file_name().map(|n| n.to_string_lossy()),
@@ -341,14 +348,27 @@ pub(crate) fn size(path: &Path) -> Result<ScanSize> {
     })
 }
 
-/// Reverses the rows if that turns the views into conefield's own circles, on which rows run down: code that supports
-/// only circles then accepts the scan. RTK's rows run up.
-fn rows_down(place: &str, mut geometry: Geometry, mut projections: Array3<f32>) -> Result<(Geometry, Array3<f32>)> {
-    let turned: Vec<View> = geometry.views.iter().map(|w| View { v: w.v.map(|x| 0.0 - x), ..*w }).collect();
-    if CircularOrbit::fit(&turned).is_some() {
-        geometry.views = turned;
-        projections.invert_axis(Axis(1));
+/// Reverses rows or columns if that turns the views into conefield's own circles, on which rows run down and columns to
+/// the right, as the source sees them: code that supports only circles then accepts the scan. RTK's rows run up, Nikon's
+/// columns to the left.
+fn straightened(place: &str, mut geometry: Geometry, mut projections: Array3<f32>) -> Result<(Geometry, Array3<f32>)> {
+    let turned = |rows: bool, columns: bool| -> Vec<View> {
+        let along = |axis: [f64; 3], reverse: bool| if reverse { axis.map(|x| 0.0 - x) } else { axis };
+        geometry.views.iter().map(|w| View { u: along(w.u, columns), v: along(w.v, rows), ..*w }).collect()
+    };
+    for (rows, columns) in [(false, false), (true, false), (false, true), (true, true)] {
+        let views = turned(rows, columns);
+        if CircularOrbit::fit(&views).is_none() {
+            continue;
+        }
+        geometry.views = views;
+        for (axis, reverse) in [(1, rows), (2, columns)] {
+            if reverse {
+                projections.invert_axis(Axis(axis));
+            }
+        }
         projections = memory::in_order(place, "files.projections", projections)?;
+        break;
     }
     Ok((geometry, projections))
 }

@@ -3,7 +3,7 @@
 
 use crate::hdf5::{self, ScanPart};
 use crate::input::Input;
-use crate::{folder, memory, metaimage, npy, npz, tiff};
+use crate::{folder, foreign, memory, metaimage, npy, npz, text, tiff};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, ArrayD, Axis, Ix3};
 use serde::{Deserialize, Serialize};
@@ -77,13 +77,16 @@ pub(crate) fn read(
     names: &Names,
     layout: StackLayout,
 ) -> Result<Array3<f32>> {
-    let sources = sources(folder, place, field, names)?;
+    let (sources, oddities) = sources(folder, place, field, names)?;
+    text::warn(&format!("{place}: {field}"), oddities);
     let mut named = folder::NamedFiles::default();
     sources.iter().try_for_each(|s| named.once(place, field, &s.path, s.array.as_deref()))?;
     let mut all: Option<(Vec<f32>, [usize; 2], usize)> = None;
     let single = sources.len() == 1;
+    let mut numbers = None;
     for source in &sources {
-        let stack = layout.arrange(&source.path.display().to_string(), raw(source, part, layout.views())?)?;
+        let (stack, stored) = raw(source, part, layout.views())?;
+        let stack = layout.arrange(&source.path.display().to_string(), stack)?;
         if single {
             return Ok(stack);
         }
@@ -93,6 +96,12 @@ pub(crate) fn read(
             let found = format!("{rows} x {columns}");
             let expected = format!("{} x {} (rows x columns), as in {}", size[0], size[1], sources[0].path.display());
             return Err(Error::invalid(source.path.display().to_string(), "image", found, expected));
+        }
+        let first = numbers.get_or_insert_with(|| stored.clone());
+        if stored != *first {
+            let shown = |n: &Option<String>| n.clone().unwrap_or_else(|| "another format".into());
+            let expected = format!("{}, as in {}", shown(first), sources[0].path.display());
+            return Err(Error::invalid(source.path.display().to_string(), "numbers", shown(&stored), expected));
         }
         memory::grow(values, stack.len(), usize::MAX, place, field)?;
         values.extend(stack.iter());
@@ -107,7 +116,7 @@ pub(crate) fn read(
 pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> Result<u64> {
     let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
     let mut sum = 0u64;
-    for StackFile { path, array } in sources(folder, place, field, names)? {
+    for StackFile { path, array } in sources(folder, place, field, names)?.0 {
         let mut input = Input::open(&path)?;
         let head = input.take(8)?;
         sum = sum.saturating_add(if head.starts_with(npz::MAGIC) {
@@ -147,8 +156,9 @@ pub(crate) fn read_field(
     stack.mean_axis(Axis(0)).ok_or_else(|| Error::invalid(place, field, "no image", "at least one"))
 }
 
-/// The file's three-dimensional array in its own order; an image gets a view axis of length one at `views`.
-fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<Array3<f32>> {
+/// The file's three-dimensional array in its own order, and how a TIFF or `.npy` stores a number; an image gets a view
+/// axis of length one at `views`.
+fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<(Array3<f32>, Option<String>)> {
     let path = &source.path;
     let place = path.display().to_string();
     let three = |a: ArrayD<f32>| {
@@ -159,7 +169,7 @@ fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<Array3<f32>> 
     let mut input = Input::open(path)?;
     let head = input.take(8)?;
     if head.starts_with(npz::MAGIC) {
-        return three(npz::read(path, source.array.as_deref(), sets)?);
+        return Ok((three(npz::read(path, source.array.as_deref(), sets)?)?, None));
     }
     // Pages, slices of MetaImage and frames of a scan in HDF5 are always views: they move to the layout's view axis.
     let pages = |a: Array3<f32>| match views {
@@ -169,42 +179,50 @@ fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<Array3<f32>> 
     };
     if head == hdf5::MAGIC {
         let stored = hdf5::read(path, source.array.as_deref(), part)?;
-        return three(stored.values).map(|a| if stored.frames_first { pages(a) } else { a });
+        return three(stored.values).map(|a| (if stored.frames_first { pages(a) } else { a }, None));
     }
     if let Some(array) = &source.array {
         let expected = "an .npz archive or an HDF5 file, whose arrays have names";
         return Err(Error::invalid(place, "array", format!("the name \"{array}\""), expected));
     }
     if head.starts_with(npy::MAGIC) {
-        return three(npy::read_one_of(&mut input, head, sets)?);
+        let (array, numbers) = npy::read_counts(&mut input, head, sets)?;
+        return Ok((three(array)?, Some(numbers.to_string())));
     }
     if tiff::is_tiff(&head) {
-        return Ok(pages(tiff::read(path)?));
+        let stack = tiff::read(path)?;
+        return Ok((pages(stack.values), Some(stack.numbers)));
     }
     if is_metaimage(&mut input, &head)? {
         // Columns are its x, rows its y.
-        return Ok(pages(metaimage::read(path)?.data.reversed_axes()));
+        return Ok((pages(metaimage::read(path)?.data.reversed_axes()), None));
     }
+    foreign::refuse(path, &head)?;
     let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), HDF5 \
                     (89 48 44 46) or MetaImage (NDims = 3)";
     Err(Error::invalid(place, "format", format!("{head:02x?} at the start"), expected))
 }
 
-fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<Vec<StackFile>> {
-    match names {
-        Names::One(name) => source(folder, place, field, name),
-        Names::Many(names) if names.is_empty() => Err(Error::invalid(place, field, "an empty list", "file names")),
+/// The files that `names` stand for, and what is odd about the numbers in the names of folders' files.
+fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<(Vec<StackFile>, Vec<String>)> {
+    let mut oddities = Vec::new();
+    let all = match names {
+        Names::One(name) => source(folder, place, field, name, &mut oddities)?,
+        Names::Many(names) if names.is_empty() => {
+            return Err(Error::invalid(place, field, "an empty list", "file names"));
+        }
         Names::Many(names) => {
             let mut all = Vec::new();
             for (i, name) in names.iter().enumerate() {
-                all.extend(source(folder, place, &format!("{field}[{i}]"), name)?);
+                all.extend(source(folder, place, &format!("{field}[{i}]"), name, &mut oddities)?);
             }
-            Ok(all)
+            all
         }
-    }
+    };
+    Ok((all, oddities))
 }
 
-fn source(folder: &Path, place: &str, field: &str, name: &str) -> Result<Vec<StackFile>> {
+fn source(folder: &Path, place: &str, field: &str, name: &str, oddities: &mut Vec<String>) -> Result<Vec<StackFile>> {
     let (file, array) = match name.split_once(".npz:") {
         Some((stem, array)) => (format!("{stem}.npz"), Some(array.to_string())),
         None => {
@@ -221,9 +239,11 @@ fn source(folder: &Path, place: &str, field: &str, name: &str) -> Result<Vec<Sta
         chosen = folder::names(&path, &["npy"])?;
     }
     if chosen.is_empty() {
+        foreign::refuse_folder(&path)?;
         let what = format!("a folder \"{file}\" without them");
         return Err(Error::invalid(place, field, what, "a folder with .tif, .tiff or .npy files"));
     }
+    oddities.extend(folder::oddity(&chosen));
     let inside = chosen.iter().map(|n| {
         let path = folder::inside(folder, place, field, &format!("{}/{n}", file.trim_end_matches('/')))?;
         Ok(StackFile { path, array: None })
@@ -281,10 +301,12 @@ mod tests {
             [10.0, 1.0]
         );
         std::fs::write(at("odd.npy"), npy_bytes("|u1", false, "(2, 2)", &[0; 4])).unwrap();
+        std::fs::write(at("wide.npy"), npy_bytes("<u2", false, "(1, 2)", &[0; 4])).unwrap();
         std::fs::write(at("text.tif"), "no image").unwrap();
         std::fs::create_dir(at("empty")).unwrap();
         for (found, words) in [
             (many(&["views/p1.npy", "odd.npy"]), ["odd.npy", "2 x 2", "1 x 2"]),
+            (many(&["views/p1.npy", "wide.npy"]), ["wide.npy: numbers", "found 16-bit", "expected 8-bit"]),
             (many(&[]), ["s.toml", "files.projections", "empty list"]),
             (one("../x.npy"), ["s.toml", "files.projections", "without \"..\""]),
             (many(&["odd.npy", "/etc/passwd"]), ["s.toml", "files.projections[1]", "inside the folder"]),

@@ -1,8 +1,8 @@
 //! Per-view numbers in a separate file: text (such as CSV), NumPy's arrays or HDF5.
 
 use crate::input::Input;
+use crate::text::read_foreign;
 use crate::{folder, hdf5, npy, npz};
-use conefield_core::files::read_text;
 use conefield_core::{Error, Result};
 use serde::Deserialize;
 use std::path::Path;
@@ -83,7 +83,7 @@ fn arrayed(path: &Path, shape: &[usize], values: Vec<f64>, width: usize) -> Resu
 }
 
 fn texts(path: &Path, column: Option<&str>, width: usize) -> Result<Vec<Vec<f64>>> {
-    let text = read_text(path, LONGEST)?;
+    let text = read_foreign(path, LONGEST)?;
     let place = path.display();
     let lines = text.lines().map(|l| l.split('#').next().unwrap_or_default().trim()).enumerate();
     let mut lines = lines.filter(|(_, l)| !l.is_empty()).map(|(i, l)| (i + 1, cells(l))).peekable();
@@ -157,6 +157,8 @@ mod tests {
         ] {
             assert_eq!(found("a.csv", text.as_bytes(), 1).unwrap(), want, "{text}");
         }
+        assert_eq!(found("a.csv:angle", b"\xef\xbb\xbfangle\r\n0\r\n0.1\r\n-0.001\r\n", 1).unwrap(), want);
+        assert_eq!(found("a.csv:angle", b"angle,\xb5m\n0,1\n0.1,1\n-0.001,1\n", 1).unwrap(), want);
         let named = "\"view\";angle\n0;0\n1;0.1\n2;-0.001";
         assert_eq!(found("a.csv:angle", named.as_bytes(), 1).unwrap(), want);
         let numbers = [0.0f64, 0.1, -1e-3].map(f64::to_le_bytes).concat();
@@ -180,6 +182,7 @@ mod tests {
         refused("a.csv", b"1,2\n3\n", 2, &["line 2", "1 cells", "2 numbers"]);
         refused("a.csv:b", b"a,c\n1,2\n", 1, &["column", "\"b\"", "a, c"]);
         refused("a.csv:b", b"1,2\n", 1, &["no names"]);
+        refused("a.csv", b"\xff\xfe0\0\n\0", 1, &["a.csv: text", "UTF-16"]);
         refused("a.csv", b"0\nnan\n", 1, &["row 1", "NaN", "finite"]);
         let numbers = [0.0f64; 3].map(f64::to_le_bytes).concat();
         refused("a.npy", &npy_bytes("<f8", false, "(3,)", &numbers), 12, &["shape", "[3]", "[views, 12]"]);

@@ -1,8 +1,9 @@
-//! TOML and JSON with errors that name the line and, for an unknown key, the nearest valid one.
+//! TOML and JSON with errors that name the line and, for an unknown key, the nearest valid one; texts of other
+//! programs in their encodings.
 
 use crate::input::LONGEST_TEXT;
 use conefield_core::error::ensure;
-use conefield_core::files::{read_text, toml_line};
+use conefield_core::files::{BYTE_ORDER_MARK, read_text, read_text_bytes, toml_line};
 use conefield_core::{Error, Result};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -50,6 +51,30 @@ pub(crate) fn described<T: DeserializeOwned>(path: &Path, format: &str, version:
     parse(path, &text, notation)
 }
 
+/// The start of a text file without its byte-order mark.
+pub(crate) fn without_mark(head: &[u8]) -> &[u8] {
+    head.strip_prefix(BYTE_ORDER_MARK).unwrap_or(head)
+}
+
+/// Reads a text that another program wrote: in UTF-8, else in Windows-1252, the usual encoding of programs on Windows.
+/// At most `most` bytes.
+pub(crate) fn read_foreign(path: &Path, most: u64) -> Result<String> {
+    String::from_utf8(read_text_bytes(path, most)?).or_else(|e| {
+        tracing::debug!("{}: the text is not UTF-8 and is read as Windows-1252", path.display());
+        Ok(windows_1252(e.as_bytes()))
+    })
+}
+
+/// Decodes Windows-1252: Latin-1 but for the bytes from 0x80 to 0x9f.
+fn windows_1252(bytes: &[u8]) -> String {
+    const HIGH: [char; 32] = [
+        '€', '\u{81}', '‚', 'ƒ', '„', '…', '†', '‡', 'ˆ', '‰', 'Š', '‹', 'Œ', '\u{8d}', 'Ž', '\u{8f}', '\u{90}', '‘',
+        '’', '“', '”', '•', '–', '—', '˜', '™', 'š', '›', 'œ', '\u{9d}', 'ž', 'Ÿ',
+    ];
+    let decoded = |b: &u8| HIGH.get(usize::from(b.wrapping_sub(0x80))).copied().unwrap_or(char::from(*b));
+    bytes.iter().map(decoded).collect()
+}
+
 /// Parses `text`, the content of `path`.
 pub(crate) fn parse<T: DeserializeOwned>(path: &Path, text: &str, notation: Notation) -> Result<T> {
     match notation {
@@ -94,6 +119,16 @@ fn explain(path: &Path, text: &str, line: Option<usize>, message: &str) -> Error
     }
 }
 
+/// What to say of `keys` that are not read; `None` if there are none.
+pub(crate) fn unread(keys: &[String]) -> Option<String> {
+    (!keys.is_empty()).then(|| format!("not read, though they may change the geometry: {}", keys.join(", ")))
+}
+
+/// Warns of the file `place`.
+pub(crate) fn warn(place: &str, remarks: impl IntoIterator<Item = String>) {
+    remarks.into_iter().for_each(|r| tracing::warn!("{place}: {r}"));
+}
+
 /// A value in quotes, cut to 80 characters for errors.
 pub(crate) fn shortened(text: &str) -> String {
     match text.char_indices().nth(80) {
@@ -110,5 +145,24 @@ fn suggestion(unknown: &str, valid: &[&str]) -> String {
         Some(b) if valid.len() > 1 => format!("`{b}` (the nearest of: {})", valid.join(", ")),
         Some(b) => format!("`{b}`"),
         None => "no key at all".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn windows_1252_is_read_where_a_text_is_not_utf_8() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.txt");
+        for (bytes, want) in [
+            (&b"\xa9 2004 \x96 K\xfcndig \x80 \x9f\x7f"[..], "© 2004 – Kündig € Ÿ\u{7f}"),
+            ("© Kündig".as_bytes(), "© Kündig"),
+            (b"\xef\xbb\xbfangle", "angle"),
+        ] {
+            std::fs::write(&path, bytes).unwrap();
+            assert_eq!(read_foreign(&path, 100).unwrap(), want);
+        }
     }
 }

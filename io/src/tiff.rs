@@ -1,8 +1,12 @@
 //! TIFF from detectors: one grey channel, integers or floats, one image per page; uncompressed, or compressed by LZW,
 //! deflate, PackBits or Zstandard. [`write`] writes a volume with one slice per page; [`read_volume`] and
 //! [`read_folder`] read slices.
+//!
+//! The numbers are those that the file stores. The entry PhotometricInterpretation, which can say that white is zero,
+//! is a hint for screens.
 
 mod entries;
+mod images;
 mod volume;
 mod write;
 mod zstd;
@@ -11,45 +15,56 @@ pub(crate) use volume::{folder_voxels, is_stack, read_folder, read_volume};
 pub(crate) use write::{check_shape, write};
 
 use crate::input::must_unpack;
-use crate::memory;
+use crate::number::{ByteOrder, Number};
+use crate::{memory, text};
 use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance, files};
+use entries::AsStored;
+use images::Claim;
 use ndarray::Array3;
 use std::fs::File;
-use std::io::{BufReader, ErrorKind, Seek};
+use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::Path;
-use tiff::decoder::{Decoder, DecodingResult, Limits};
+use tiff::decoder::{ChunkType, Decoder, DecodingResult, Limits};
+use tiff::tags::Tag;
 use tiff::{ColorType, TiffError};
+
+/// The decoder of an open file.
+type Pages = Decoder<BufReader<AsStored<File>>>;
 
 /// Whether `head`, the first bytes of a file, starts a TIFF or BigTIFF.
 pub(crate) fn is_tiff(head: &[u8]) -> bool {
     [b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"].iter().any(|m| head.starts_with(*m))
 }
 
-/// Number of values of all pages, from their directories.
+/// Number of values of all images, from the directories.
 pub(crate) fn values(path: &Path) -> Result<u64> {
-    let mut sum = 0u64;
-    pages(path, |_, page| {
-        sum = sum.saturating_add(page.pixels);
-        Ok(())
-    })?;
-    Ok(sum)
+    let found = images(path, |_, _| Ok(()))?;
+    Ok(found.size.iter().fold(found.count as u64, |n, side| n.saturating_mul(*side as u64)))
 }
 
-/// Reads all pages as `[page, row, column]`; they must have the same size.
+/// The images of a file.
+pub(crate) struct Stack {
+    /// `[page, row, column]`.
+    pub values: Array3<f32>,
+    /// How the file stores a number, such as "16-bit unsigned integers".
+    pub numbers: String,
+}
+
+/// Reads all images as `[page, row, column]`; they must have the same size and the same numbers.
 ///
 /// Converts 8 to 64 bits per pixel, integers or floats, to `f32`. Refuses other colour types, sizes that the file
-/// cannot hold, values that are not finite and damaged files.
-pub(crate) fn read(path: &Path) -> Result<Array3<f32>> {
-    stack(path, |_| Ok(()))
+/// cannot hold, values that are not finite and damaged files, and a file that holds more images than are found.
+pub(crate) fn read(path: &Path) -> Result<Stack> {
+    stack(path, |_| Ok(())).map(|(stack, _)| stack)
 }
 
 /// Like [`read`]; `first` gets the decoder at the first page.
-fn stack(path: &Path, first: impl FnOnce(&mut Decoder<BufReader<File>>) -> Result<()>) -> Result<Array3<f32>> {
+fn stack(path: &Path, first: impl FnOnce(&mut Pages) -> Result<()>) -> Result<(Stack, Images)> {
     let place = path.display().to_string();
     let mut values = Vec::<f32>::new();
     let mut first = Some(first);
-    let (pages, [rows, columns]) = pages(path, |decoder, page| {
+    let images = images(path, |decoder, page| {
         if let Some(first) = first.take() {
             first(decoder)?;
         }
@@ -58,18 +73,70 @@ fn stack(path: &Path, first: impl FnOnce(&mut Decoder<BufReader<File>>) -> Resul
         // The stored page and its decompressed strips or tiles.
         allowance::memory(&place, "page", page.bytes.saturating_mul(2))?;
         if zstd::is_packed(decoder) {
-            return zstd::read(&place, decoder, page.size, page.bits, &mut values);
+            return zstd::read(&place, decoder, page.size, page.sample, &mut values);
         }
         append(&mut values, decoder.read_image().map_err(|e| broken(&place, &e))?);
         Ok(())
     })?;
-    let all = Array3::from_shape_vec((pages, rows, columns), values)
+    if let Some(rest) = &images.rest {
+        rest.read(path, &mut values)?;
+    }
+    text::warn(&place, images.remarks.iter().cloned());
+    if images.white > 0 {
+        tracing::info!("{place}: {} pages say that white is zero; the numbers are taken as stored", images.white);
+    }
+    let [rows, columns] = images.size;
+    let all = Array3::from_shape_vec((images.count, rows, columns), values)
         .map_err(|e| Error::invalid(&place, "TIFF", e, format!("{rows} x {columns} values per page")))?;
     match stray(&all) {
         Some(((p, r, c), x)) => {
             Err(Error::invalid(place, format!("page {p}, row {r}, column {c}"), x, "a finite number"))
         }
-        None => Ok(all),
+        None => Ok((Stack { values: all, numbers: images.sample.to_string() }, images)),
+    }
+}
+
+/// How a page stores a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Sample {
+    /// The entry SampleFormat: 1 unsigned, 2 signed, 3 floats.
+    format: u16,
+    bits: u8,
+}
+
+impl Sample {
+    fn of(place: &str, decoder: &mut Pages, bits: u8) -> Result<Self> {
+        let format = decoder.find_tag_unsigned_vec::<u16>(Tag::SampleFormat).map_err(|e| broken(place, &e))?;
+        Ok(Self { format: format.and_then(|f| f.first().copied()).unwrap_or(1), bits })
+    }
+
+    /// The number; `None` for floats of 16 bits, which only the `tiff` crate decodes, and unknown formats.
+    fn number(self) -> Option<Number> {
+        Some(match (self.format, self.bits) {
+            (1, 8) => Number::U8,
+            (1, 16) => Number::U16,
+            (1, 32) => Number::U32,
+            (1, 64) => Number::U64,
+            (2, 8) => Number::I8,
+            (2, 16) => Number::I16,
+            (2, 32) => Number::I32,
+            (2, 64) => Number::I64,
+            (3, 32) => Number::F32,
+            (3, 64) => Number::F64,
+            _ => return None,
+        })
+    }
+}
+
+impl std::fmt::Display for Sample {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let kind = match self.format {
+            1 => "unsigned integers",
+            2 => "signed integers",
+            3 => "floats",
+            _ => "numbers of an unknown format",
+        };
+        write!(f, "{}-bit {kind}", self.bits)
     }
 }
 
@@ -78,24 +145,41 @@ struct Page {
     pixels: u64,
     /// Bytes of the decompressed values.
     bytes: u64,
-    bits: u8,
+    sample: Sample,
     /// Rows and columns.
     size: [usize; 2],
 }
 
-/// Walks over the pages without decompressing them; returns their number, rows and columns.
-fn pages(
-    path: &Path,
-    mut each: impl FnMut(&mut Decoder<BufReader<File>>, Page) -> Result<()>,
-) -> Result<(usize, [usize; 2])> {
+/// The images of a file, with and without a directory.
+struct Images {
+    count: usize,
+    /// Rows and columns.
+    size: [usize; 2],
+    sample: Sample,
+    /// The images after the one page.
+    rest: Option<Rest>,
+    /// The text's claim.
+    claim: Option<Claim>,
+    /// Number of pages in which white is zero.
+    white: usize,
+    /// Warnings for the user.
+    remarks: Vec<String>,
+}
+
+/// Walks over the pages without decompressing them, and counts the images that have no directory.
+fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> Result<Images> {
     let place = path.display().to_string();
     let (file, packed) = files::open(path)?;
     let broken = |e: TiffError| broken(&place, &e);
     let mut reader = BufReader::new(file);
-    entries::check(&place, &mut reader, packed)?;
-    reader.rewind().map_err(|e| Error::io(path, e))?;
-    let mut decoder = Decoder::new(reader).map_err(broken)?;
-    let (mut size, mut pages, mut claimed) = (None, 0usize, [0u64; 2]);
+    let directories = entries::check(&place, &mut reader, packed)?;
+    let mut file = reader.into_inner();
+    file.rewind().map_err(|e| Error::io(path, e))?;
+    let white = directories.white.len();
+    let mut decoder =
+        Decoder::new(BufReader::new(AsStored { reader: file, white: directories.white, at: 0 })).map_err(broken)?;
+    let mut first: Option<(Page, Option<Claim>)> = None;
+    let (mut pages, mut claimed, mut stored, mut end) = (0usize, [0u64; 2], 0u64, directories.end);
     loop {
         let (width, height) = decoder.dimensions().map_err(broken)?;
         let bits = match decoder.colortype().map_err(broken)? {
@@ -113,25 +197,170 @@ fn pages(
             let found = format!("{height} x {width} pixels of {bits} bits in a file of {packed} bytes");
             Error::invalid(&place, format!("page {pages}"), found, expected)
         })?;
-        if *size.get_or_insert((height, width)) != (height, width) {
-            let found = format!("{height} x {width} pixels");
-            return Err(Error::invalid(&place, format!("page {pages}"), found, "the size of the first page"));
-        }
         // Includes the next page's entries; a value takes 32 bytes at most.
         let most = bytes.max(packed.saturating_mul(32));
         let mut limits = Limits::default();
         limits.decoding_buffer_size = usize::try_from(most).unwrap_or(usize::MAX);
         (limits.ifd_value_size, limits.intermediate_buffer_size) = [limits.decoding_buffer_size; 2].into();
         decoder = decoder.with_limits(limits);
-        each(&mut decoder, Page { pixels, bytes, bits, size: [height as usize, width as usize] })?;
+        let sample = Sample::of(&place, &mut decoder, bits)?;
+        let page = || Page { pixels, bytes, sample, size: [height as usize, width as usize] };
+        let (like, _) = first.get_or_insert_with(|| {
+            let text = decoder.find_tag(Tag::ImageDescription).ok().flatten().and_then(|v| v.into_string().ok());
+            (page(), text.and_then(|t| images::claimed(&t, [u64::from(height), u64::from(width)])))
+        });
+        if like.size != page().size {
+            let found = format!("{height} x {width} pixels");
+            return Err(Error::invalid(&place, format!("page {pages}"), found, "the size of the first page"));
+        }
+        if like.sample != sample {
+            let expected = format!("{}, as on the first page", like.sample);
+            return Err(Error::invalid(&place, format!("page {pages}"), sample, expected));
+        }
+        let mut list = |strips, tiles| {
+            let tag = if decoder.get_chunk_type() == ChunkType::Tile { tiles } else { strips };
+            decoder.find_tag_unsigned_vec::<u64>(tag).map(Option::unwrap_or_default).map_err(broken)
+        };
+        let offsets = list(Tag::StripOffsets, Tag::TileOffsets)?;
+        for (at, bytes) in offsets.into_iter().zip(list(Tag::StripByteCounts, Tag::TileByteCounts)?) {
+            stored = stored.saturating_add(bytes);
+            end = end.max(at.saturating_add(bytes));
+        }
+        each(&mut decoder, page())?;
         pages += 1;
         if !decoder.more_images() {
             break;
         }
         decoder.next_image().map_err(broken)?;
     }
-    let (height, width) = size.unwrap_or_default();
-    Ok((pages, [height as usize, width as usize]))
+    let Some((page, claim)) = first else {
+        return Err(Error::invalid(&place, "TIFF", "no page", "at least one"));
+    };
+    let mut images =
+        Images { count: pages, size: page.size, sample: page.sample, rest: None, claim, white, remarks: vec![] };
+    match claim {
+        Some(claim) if claim.images > pages as u64 => {
+            let rest = Rest::of(&place, &mut decoder, &page, pages, claim.images, packed)?;
+            images.count += rest.images;
+            images.rest = Some(rest);
+        }
+        _ => {
+            if !directories.others {
+                let parts = Parts {
+                    pages: pages as u64,
+                    stored,
+                    after: packed.saturating_sub(end),
+                    undescribed: packed.saturating_sub(directories.bytes.saturating_add(stored)),
+                };
+                images.remarks.extend(parts.remark(&place, &mut decoder, &page)?);
+            }
+            let fewer = claim.filter(|c| c.whole && c.images < pages as u64);
+            images.remarks.extend(fewer.map(|c| {
+                format!("the ImageDescription counts {} images, the file has {pages} pages: all are read", c.images)
+            }));
+        }
+    }
+    Ok(images)
+}
+
+/// Fewer bytes than this that nothing describes are gaps between the parts of a file.
+const GAPS: u64 = 4096;
+
+/// The bytes of a file's parts.
+struct Parts {
+    pages: u64,
+    /// Of the pages' strips or tiles.
+    stored: u64,
+    /// Of what follows the last part.
+    after: u64,
+    /// Of what is no part.
+    undescribed: u64,
+}
+
+impl Parts {
+    /// Refuses a file of one page with room for more images after it; else a remark if an image has room in the bytes
+    /// that are no part.
+    fn remark(&self, place: &str, decoder: &mut Pages, page: &Page) -> Result<Option<String>> {
+        let Self { pages, stored, after, undescribed } = *self;
+        let plain = compression(place, decoder)? == 1;
+        if plain && pages == 1 && after >= page.bytes {
+            let found = format!("{after} bytes after the one page, room for {} more images", after / page.bytes);
+            return Err(Error::invalid(place, "file size", found, "one page per image (save the stack so)"));
+        }
+        let image = if plain { page.bytes } else { stored / pages };
+        Ok((undescribed >= image.max(GAPS)).then(|| {
+            format!(
+                "{undescribed} bytes of the file belong to none of its {pages} pages, each of about {image} bytes: \
+                 images may be missing"
+            )
+        }))
+    }
+}
+
+fn compression(place: &str, decoder: &mut Pages) -> Result<u32> {
+    decoder.find_tag_unsigned::<u32>(Tag::Compression).map(|c| c.unwrap_or(1)).map_err(|e| broken(place, &e))
+}
+
+/// Images without a directory, in one piece after the one page.
+struct Rest {
+    /// The byte at which they start.
+    at: u64,
+    images: usize,
+    pixels: usize,
+    number: Number,
+    order: ByteOrder,
+}
+
+impl Rest {
+    /// The images after the first of `claimed`. Refuses a file that does not hold them in one piece.
+    fn of(place: &str, decoder: &mut Pages, page: &Page, pages: usize, claimed: u64, packed: u64) -> Result<Self> {
+        let broken = |e: TiffError| broken(place, &e);
+        let offsets = decoder.find_tag_unsigned_vec::<u64>(Tag::StripOffsets).map_err(broken)?.unwrap_or_default();
+        let start = offsets.first().copied().unwrap_or(packed);
+        let room = packed.saturating_sub(start);
+        let strip = u64::from(decoder.chunk_dimensions().1).saturating_mul(page.bytes / page.size[0].max(1) as u64);
+        let one_piece = compression(place, decoder)? == 1
+            && decoder.get_chunk_type() == ChunkType::Strip
+            && offsets.iter().enumerate().all(|(i, at)| *at == start.saturating_add(strip.saturating_mul(i as u64)));
+        let images = usize::try_from(claimed - 1).ok().filter(|_| claimed.saturating_mul(page.bytes) <= room);
+        match (page.sample.number(), images) {
+            (Some(number), Some(images)) if pages == 1 && one_piece => Ok(Self {
+                at: start + page.bytes,
+                images,
+                pixels: page.size[0] * page.size[1],
+                number,
+                order: match decoder.byte_order() {
+                    tiff::tags::ByteOrder::LittleEndian => ByteOrder::Little,
+                    tiff::tags::ByteOrder::BigEndian => ByteOrder::Big,
+                },
+            }),
+            _ => {
+                let found = format!("{claimed} in the ImageDescription, but {pages} pages and {room} bytes of pixels");
+                let expected = format!(
+                    "{pages}, the pages of the file (save the stack with one page per image), or all images of {} \
+                     bytes in one piece after one page",
+                    page.bytes
+                );
+                Err(Error::invalid(place, "images", found, expected))
+            }
+        }
+    }
+
+    fn read(&self, path: &Path, values: &mut Vec<f32>) -> Result<()> {
+        let place = path.display().to_string();
+        let io = |e| Error::io(path, e);
+        memory::grow(values, self.images.saturating_mul(self.pixels), usize::MAX, &place, "pages")?;
+        let bytes = self.pixels * self.number.bytes();
+        allowance::memory(&place, "page", bytes as u64)?;
+        let mut raw = vec![0; bytes];
+        let mut file = files::open(path)?.0;
+        file.seek(SeekFrom::Start(self.at)).map_err(io)?;
+        for _ in 0..self.images {
+            file.read_exact(&mut raw).map_err(io)?;
+            self.number.decode(self.order, &raw, values, |x| x as f32);
+        }
+        Ok(())
+    }
 }
 
 fn broken(place: &str, e: &TiffError) -> Error {
@@ -177,7 +406,7 @@ mod tests {
                     w.write_image::<$kind>(3, 2, &data).unwrap();
                 }
                 drop(w);
-                let a = read(&path).unwrap();
+                let a = read(&path).unwrap().values;
                 assert_eq!(a.dim(), (2, 2, 3));
                 assert_eq!((a[[0, 0, 2]], a[[0, 1, 0]], a[[1, 1, 2]]), (2.0, 3.0, 15.0));
             }};
@@ -203,7 +432,7 @@ mod tests {
         let count = |i: usize| 9000.0 + 97.0 * i as f32;
         for (name, bytes) in ZSTD {
             std::fs::write(&path, bytes).unwrap();
-            let a = read(&path).unwrap();
+            let a = read(&path).unwrap().values;
             let want = |p: usize, r: usize, c: usize| match *name {
                 "strips" => count(20 * p + 5 * r + c),
                 "floats" => ((f64::from(count(20 * p + 5 * r + c))) / 7.0) as f32,
@@ -225,11 +454,122 @@ mod tests {
         }
     }
 
+    /// A file of one directory with `entries` and, from byte 1024 on, `data`.
+    fn one_page(big_endian: bool, entries: &[(u16, u16, u32, u32)], text: &str, data: &[u8]) -> Vec<u8> {
+        let half = |x: u16| if big_endian { x.to_be_bytes() } else { x.to_le_bytes() };
+        let whole = |x: u32| if big_endian { x.to_be_bytes() } else { x.to_le_bytes() };
+        let mut out = if big_endian { b"MM".to_vec() } else { b"II".to_vec() };
+        out.extend([half(42).to_vec(), whole(8).to_vec(), half(entries.len() as u16).to_vec()].concat());
+        for &(tag, kind, count, value) in entries {
+            out.extend([half(tag).to_vec(), half(kind).to_vec(), whole(count).to_vec()].concat());
+            // A short fills the first half of its field.
+            out.extend(if kind == 3 { [half(value as u16), [0; 2]].concat() } else { whole(value).to_vec() });
+        }
+        out.extend([0; 4]);
+        out.resize(512, 0);
+        out.extend(text.as_bytes());
+        out.resize(1024, 0);
+        out.extend(data);
+        out
+    }
+
+    /// Three images of 2 x 3 pixels of 16 bits: 0 to 17.
+    fn three(big_endian: bool, photometric: u32, text: &str) -> Vec<u8> {
+        let data: Vec<u8> =
+            (0..18u16).flat_map(|x| if big_endian { x.to_be_bytes() } else { x.to_le_bytes() }).collect();
+        let entries = [
+            (256, 4, 1, 3),
+            (257, 4, 1, 2),
+            (258, 3, 1, 16),
+            (259, 3, 1, 1),
+            (262, 3, 1, photometric),
+            (270, 2, text.len() as u32, 512),
+            (273, 4, 1, 1024),
+            (277, 3, 1, 1),
+            (278, 4, 1, 2),
+            (279, 4, 1, 12),
+        ];
+        one_page(big_endian, &entries, text, &data)
+    }
+
+    #[test]
+    fn images_without_a_directory_are_read_where_the_text_counts_them() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.tif");
+        let ome = "<OME><Image><Pixels SizeX=\"3\" SizeY=\"2\" SizeZ=\"3\" SizeC=\"1\"/></Image></OME>";
+        for text in ["ImageJ=1.54f\nimages=3\nslices=3\n", "{\"shape\": [3, 2, 3], \"truncated\": true}", ome] {
+            for (big_endian, photometric) in [(false, 1), (true, 1), (false, 0), (true, 0)] {
+                std::fs::write(&path, three(big_endian, photometric, text)).unwrap();
+                let a = read(&path).unwrap().values;
+                assert_eq!(a.dim(), (3, 2, 3), "{text}");
+                assert_eq!(a.iter().copied().collect::<Vec<_>>(), (0..18u8).map(f32::from).collect::<Vec<_>>());
+                assert_eq!(values(&path).unwrap(), 18);
+            }
+            let whole = three(true, 1, text);
+            refused(&whole[..whole.len() - 1], &["images: found 3", "1 pages and 35 bytes", "12 bytes"]);
+        }
+        // No changed byte causes a panic or a large allocation.
+        let whole = three(true, 0, "ImageJ=1.54f\nimages=3\nslices=3\n");
+        for at in (0..160).chain(512..560) {
+            for x in [0x01, 0x80, 0xff] {
+                let mut bytes = whole.clone();
+                bytes[at] ^= x;
+                std::fs::write(&path, &bytes).unwrap();
+                let _ = read(&path);
+            }
+        }
+        // Nothing counts them: as many bytes as two more images, or a part of one.
+        refused(&three(false, 1, "a detector"), &["file size", "24 bytes", "2 more images"]);
+        std::fs::write(&path, &three(false, 1, "a detector")[..1024 + 20]).unwrap();
+        assert_eq!(read(&path).unwrap().values.dim(), (1, 2, 3));
+        refused(&three(false, 1, "{\"shape\": [1000000000000, 2, 3]}"), &["images", "1000000000000"]);
+    }
+
+    #[test]
+    fn numbers_are_as_stored_whether_white_or_black_is_zero() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.tif");
+        let floats: Vec<u8> = [0.25f32, -3.0].iter().flat_map(|x| x.to_le_bytes()).collect();
+        for (bits, format, data, want) in [
+            (8, 1, vec![3, 250], [3.0, 250.0]),
+            (16, 1, [3118u16, 1].iter().flat_map(|x| x.to_le_bytes()).collect(), [3118.0, 1.0]),
+            (16, 2, [-5i16, 1].iter().flat_map(|x| x.to_le_bytes()).collect(), [-5.0, 1.0]),
+            (32, 3, floats, [0.25, -3.0]),
+        ] {
+            let entries = [
+                (256, 4, 1, 2),
+                (257, 4, 1, 1),
+                (258, 3, 1, bits),
+                (259, 3, 1, 1),
+                (262, 3, 1, 0),
+                (273, 4, 1, 1024),
+                (277, 3, 1, 1),
+                (278, 4, 1, 1),
+                (279, 4, 1, bits / 4),
+                (339, 3, 1, format),
+            ];
+            std::fs::write(&path, one_page(false, &entries, "", &data)).unwrap();
+            let found = read(&path).unwrap();
+            assert_eq!(found.values.as_slice().unwrap(), want, "{}", found.numbers);
+        }
+    }
+
+    #[test]
+    fn pages_of_other_numbers_are_refused() {
+        let mut file = std::io::Cursor::new(Vec::new());
+        {
+            let mut w = TiffEncoder::new(&mut file).unwrap();
+            w.write_image::<kind::Gray16>(2, 1, &[1, 2]).unwrap();
+            w.write_image::<kind::Gray8>(2, 1, &[1, 2]).unwrap();
+        }
+        refused(&file.into_inner(), &["page 1", "8-bit unsigned", "16-bit unsigned"]);
+    }
+
     fn refused(bytes: &[u8], words: &[&str]) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.tif");
         std::fs::write(&path, bytes).unwrap();
-        let e = read(&path).unwrap_err().to_string();
+        let e = read(&path).map(|s| s.numbers).unwrap_err().to_string();
         assert!(e.contains("a.tif") && words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
     }
 

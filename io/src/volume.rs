@@ -1,7 +1,7 @@
 //! Entry points for volumes: they recognize a file's format, and choose a format for a file name.
 
 use crate::input::Input;
-use crate::{dicom, metaimage, nifti, npy, nrrd, pickle, scan, tiff, write_atomic, zarr};
+use crate::{dicom, foreign, metaimage, nifti, npy, nrrd, pickle, scan, tiff, write_atomic, zarr};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -87,6 +87,7 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
         return Ok(file);
     }
     if !nifti::is_header(&head) {
+        foreign::refuse(path, &head)?;
         let mark = head.get(344..348).map_or_else(
             || format!("a file of {} bytes", head.len()),
             |m| format!("{:02x?} at byte 344 and {:02x?} at the start", m, &head[..6]),

@@ -173,7 +173,7 @@ pub fn simulate(
         if let Some(geometry) = geometry {
             let expected = "1 with a geometry: the volume is taken as it stands";
             ensure(wanted.downsample == 1, "arguments", "downsample", wanted.downsample, expected)?;
-            let volume = values.apply(volume)?;
+            let volume = values.attenuation(volume)?;
             let noise = noise.unwrap_or(DetectorNoise::None);
             let scan = simulation::scan_in(&volume, geometry, noise, wanted.seed.unwrap_or(0))?;
             // The volume is the truth only on the reconstructed voxels.

@@ -1,5 +1,6 @@
 //! Parsers of values from the command line and elsewhere. Errors are reported before any work.
 
+use conefield_core::error::ensure;
 use conefield_core::scan::Volume;
 use conefield_io::I0;
 use conefield_projectors::simulate::{DetectorNoise, HuMapping};
@@ -170,7 +171,36 @@ pub enum Values {
     Hu(HuMapping),
 }
 
+/// Attenuation is not negative. The noise of a reconstruction stays above this; Hounsfield units of air are far below.
+const LEAST: f32 = -50.0;
+
+/// Refuses a volume whose values are no attenuation, but probably Hounsfield units.
+pub fn must_be_attenuation(volume: &Volume) -> conefield_core::Result<()> {
+    let [low, high] = range(volume);
+    let expected = "attenuation, which is not negative (Hounsfield units? --values hu:0.02 of simulate and convert makes \
+                    attenuation, with water 0.02 per mm; clip:-1000,2000 numbers from 0 to 1)";
+    ensure(low >= LEAST, "volume", "values", format!("{low} to {high}"), expected)
+}
+
+fn range(volume: &Volume) -> [f32; 2] {
+    volume.data.iter().fold([f32::INFINITY, f32::NEG_INFINITY], |[low, high], x| [low.min(*x), high.max(*x)])
+}
+
 impl Values {
+    /// Maps a volume that is to be projected to attenuation: refuses values as they are that are none, and warns of
+    /// negative ones.
+    pub fn attenuation(self, volume: Volume) -> conefield_core::Result<Volume> {
+        let volume = self.apply(volume)?;
+        if self == Self::AsIs {
+            must_be_attenuation(&volume)?;
+            let [low, high] = range(&volume);
+            if low < -0.1 * high.max(0.0) {
+                tracing::warn!("the volume has values from {low} to {high}: attenuation is not negative (--values)");
+            }
+        }
+        Ok(volume)
+    }
+
     /// Maps the volume to attenuation.
     pub fn apply(self, volume: Volume) -> conefield_core::Result<Volume> {
         match self {

@@ -10,6 +10,9 @@ use conefield_projectors::simulate::{Angles, DetectorNoise, HuMapping, Protocol,
 use serde_json::json;
 use std::path::Path;
 
+/// Line integrals that no measurement reaches: exp(−50) of the light is left.
+const OPAQUE: f32 = 50.0;
+
 /// Longest protocol or list of angles, in bytes.
 const LONGEST: u64 = 16 << 20;
 
@@ -32,7 +35,7 @@ pub struct Changes {
 
 /// The volume centred on the rotation axis, in attenuation, with blocks of `size`³ voxels averaged.
 pub fn prepared(volume: Volume, values: Values, size: usize) -> Result<Volume> {
-    let mut volume = values.apply(volume)?;
+    let mut volume = values.attenuation(volume)?;
     // A scan's volume is centred on the rotation axis.
     volume.grid.center = [0.0; 3];
     if size > 1 {
@@ -98,6 +101,13 @@ pub fn scan(mut volume: Volume, values: Values, protocol: &Protocol, source: &st
         volume = volume.mapped(|x| x * per_unit);
     }
     let mut scan = simulate(&volume, protocol)?;
+    let most = scan.projections.iter().copied().fold(0.0, f32::max);
+    if most > OPAQUE {
+        tracing::warn!(
+            "line integrals up to {most}: nothing passes such an object; voxel values are attenuation per {} (--values)",
+            protocol.unit.name
+        );
+    }
     if let Some(p) = scan.provenance.as_object_mut() {
         p.insert("source".into(), json!(source));
     }

@@ -59,7 +59,7 @@ impl PretrainArgs {
         let mut plan = method::plan(&loaded, backend.as_ref())?;
         let voxels: Vec<u64> = self.volumes.iter().map(|v| files::voxels(v)).collect::<Result<_>>()?;
         pretraining::check_memory(&voxels, &plan.outline())?;
-        let read = |name: &String| self.values.apply(files::volume(name)?);
+        let read = |name: &String| self.values.attenuation(files::volume(name)?);
         let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
         let job =
             PretrainJob { volumes: &volumes, backend: backend.as_ref(), seed: self.seed, limits: self.ends.limits() };

@@ -68,6 +68,7 @@ impl ProjectArgs {
         memory.check(|_| vec![])?;
 
         let volume = conefield_io::read_volume(&self.volume)?;
+        parse::must_be_attenuation(&volume)?;
         let scan = self.chosen(files::scan(&self.like)?)?;
         let mut geometry = scan.geometry.clone();
         // Of the readable formats only NumPy arrays have no affine.

@@ -1,6 +1,6 @@
 //! HDF5 in its layouts, and Nikon's description.
 
-use crate::case::{Case, changed, cut, put, refused, replaced};
+use crate::case::{Case, End, changed, cut, put, refused, replaced};
 use conefield_tests::hostile::seeds::{scanner_cil, scanner_hdf5, scanner_nxtomo, xtekct};
 use std::path::Path;
 
@@ -91,6 +91,41 @@ pub fn cases() -> Vec<Case> {
             IMPORT,
             &["cil.file", "none.nxs"],
         ),
+        refused(
+            "packed by a filter that is not read",
+            changed(scanner_nxtomo, FILE, |b| {
+                let at = b.windows(8).position(|w| w == b"deflate\0").expect("a filter of the seed") - 8;
+                b[at..at + 2].copy_from_slice(&32_008u16.to_le_bytes());
+            }),
+            IMPORT,
+            &[FILE, "bitshuffle", "h5repack -f NONE"],
+        ),
+        refused(
+            "Nikon: measured angles that differ from even steps",
+            |d| {
+                xtekct(d);
+                put(d.join("_ctdata.txt"), "Projection\tAngle(deg)\n1\t3\n2\t110\n3\t250\n");
+            },
+            NIKON,
+            &["_ctdata.txt", "degrees from steps of 120"],
+        )
+        .ends(End::Warned),
+        refused(
+            "Nikon: too few measured angles",
+            |d| {
+                xtekct(d);
+                put(d.join("_ctdata.txt"), "Projection\tAngle(deg)\n1\t3\n2\t110\n");
+            },
+            NIKON,
+            &["_ctdata.txt", "angle of projection 3"],
+        ),
+        refused(
+            "Nikon: a key that may move the volume",
+            nikon("SrcToObject=500\n", "SrcToObject=500\nOffsetX=-4\n"),
+            NIKON,
+            &["not read", "OffsetX = -4"],
+        )
+        .ends(End::Warned),
         refused("Nikon: no distance", nikon("SrcToObject=500\n", ""), NIKON, &["SrcToObject", "nothing"]),
         refused(
             "Nikon: a distance of 0",

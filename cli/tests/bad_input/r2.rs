@@ -1,6 +1,6 @@
 //! R2-Gaussian's folder.
 
-use crate::case::{Case, changed, cut, put, refused, replaced};
+use crate::case::{Case, End, changed, cut, put, refused, replaced};
 use conefield_tests::hostile::seeds::{npy_bytes, r2};
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -32,6 +32,13 @@ pub fn cases() -> Vec<Case> {
             INFO,
             &["UTF-8"],
         ),
+        refused(
+            "a rotated detector, which is not read",
+            meta("\"mode\"", "\"rotDetector\": [0, 0.1, 0], \"mode\""),
+            INFO,
+            &["not read", "scanner.rotDetector"],
+        )
+        .ends(End::Warned),
         refused("a missing key", meta("\"DSO\"", "\"DS0\""), INFO, &["DSO", "nothing"]),
         refused("a parallel beam", meta("\"cone\"", "\"parallel\""), INFO, &["scanner.mode", "cone"]),
         refused("a negative distance", meta("\"DSO\": 500.0", "\"DSO\": -500.0"), INFO, &["scanner.DSO", "-500"]),

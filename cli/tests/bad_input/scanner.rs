@@ -36,6 +36,12 @@ pub fn cases() -> Vec<Case> {
     vec![
         refused("an empty file", |d| put(d.join("scanner.toml"), ""), IMPORT, &["scanner.toml", "format"]),
         refused("no UTF-8", |d| put(d.join("scanner.toml"), b"format = \"\xff\""), IMPORT, &["scanner.toml", "UTF-8"]),
+        refused(
+            "UTF-16",
+            |d| put(d.join("scanner.toml"), b"\xff\xfef\0o\0"),
+            IMPORT,
+            &["scanner.toml", "UTF-16", "UTF-8"],
+        ),
         refused("a folder", scanner_npy, "import . -o scan", &["SCANNER.toml", "a folder", "a text file"]),
         refused(
             "an image",

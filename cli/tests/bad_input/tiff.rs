@@ -1,6 +1,6 @@
 //! TIFF stacks, through a scanner's description.
 
-use crate::case::{Case, changed, cut, cut_end, put, refused};
+use crate::case::{Case, End, changed, cut, cut_end, put, refused};
 use conefield_tests::hostile::seeds::{
     CIRCLE, scanner_tiff, scanner_tiff_deflate, scanner_tiff_lzw, scanner_tiff_zstd, scanner_toml,
 };
@@ -31,6 +31,35 @@ where
         let mut w = TiffEncoder::new(&mut file).unwrap().with_compression(packing);
         w.write_image::<C>(width, height, &values).unwrap();
         put(d.join(FILE), file.into_inner());
+        put(d.join("scanner.toml"), scanner_toml(FILE, CIRCLE));
+    }
+}
+
+/// One directory with ImageJ's text, `counted` images in it and `stored` after each other: 2 x 3 pixels of 16 bits.
+fn one_directory(counted: Option<usize>, stored: usize) -> impl Fn(&Path) + Sync + Send {
+    move |d| {
+        let text = counted.map_or("a detector".to_owned(), |n| format!("ImageJ=1.54f\nimages={n}\nslices={n}\n"));
+        let entries: [(u16, u16, u32, u32); 9] = [
+            (256, 4, 1, 3),
+            (257, 4, 1, 2),
+            (258, 3, 1, 16),
+            (259, 3, 1, 1),
+            (262, 3, 1, 1),
+            (270, 2, text.len() as u32, 200),
+            (273, 4, 1, 300),
+            (278, 4, 1, 2),
+            (279, 4, 1, 12),
+        ];
+        let mut bytes = [b"II*\0\x08\0\0\0".as_slice(), &(entries.len() as u16).to_le_bytes()].concat();
+        for (tag, kind, count, value) in entries {
+            bytes.extend([tag.to_le_bytes(), kind.to_le_bytes()].concat());
+            bytes.extend([count.to_le_bytes(), value.to_le_bytes()].concat());
+        }
+        bytes.resize(200, 0);
+        bytes.extend(text.as_bytes());
+        bytes.resize(300, 0);
+        bytes.extend((0..6 * stored as u16).flat_map(|i| (9000 + i).to_le_bytes()));
+        put(d.join(FILE), bytes);
         put(d.join("scanner.toml"), scanner_toml(FILE, CIRCLE));
     }
 }
@@ -117,6 +146,96 @@ pub fn cases() -> Vec<Case> {
             },
             IMPORT,
             &["files.projections", ".tif"],
+        ),
+        refused(
+            "one directory for eight images, of which three are there",
+            one_directory(Some(8), 3),
+            IMPORT,
+            &["images", "found 8 in the ImageDescription", "36 bytes"],
+        ),
+        refused(
+            "one directory, and images that nothing counts",
+            one_directory(None, 3),
+            IMPORT,
+            &["file size", "24 bytes after the one page"],
+        ),
+        refused(
+            "pages of other numbers",
+            |d| {
+                scanner_tiff(d);
+                let mut file = Cursor::new(Vec::new());
+                let mut w = TiffEncoder::new(&mut file).unwrap();
+                w.write_image::<colortype::Gray16>(3, 2, &[1; 6]).unwrap();
+                w.write_image::<colortype::Gray8>(3, 2, &[1; 6]).unwrap();
+                put(d.join(FILE), file.into_inner());
+            },
+            IMPORT,
+            &["page 1", "8-bit unsigned", "16-bit unsigned"],
+        ),
+        refused(
+            "a folder whose numbers have a gap",
+            |d| {
+                scanner_tiff(d);
+                std::fs::create_dir(d.join("views")).unwrap();
+                let image = std::fs::read(d.join(FILE)).unwrap();
+                for i in [1, 2, 3, 4, 7, 8, 9] {
+                    put(d.join(format!("views/view_{i:04}.tif")), &image);
+                }
+                put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
+            },
+            IMPORT,
+            &["files.projections", "view_0004.tif and view_0007.tif"],
+        )
+        .ends(End::Warned),
+        refused(
+            "a folder with two series",
+            |d| {
+                scanner_tiff(d);
+                std::fs::create_dir(d.join("views")).unwrap();
+                let image = std::fs::read(d.join(FILE)).unwrap();
+                for name in ["flat", "view_1", "view_2"] {
+                    put(d.join(format!("views/{name}.tif")), &image);
+                }
+                put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
+            },
+            IMPORT,
+            &["files.projections", "flat.tif and view_1.tif", "two series"],
+        )
+        .ends(End::Warned),
+        refused(
+            "HND of Varian in place of images",
+            |d| {
+                scanner_tiff(d);
+                std::fs::create_dir(d.join("views")).unwrap();
+                put(d.join("views/Proj_00001.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0");
+                put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
+            },
+            IMPORT,
+            &["Proj_00001.hnd", "Varian's HND", "rtkprojections"],
+        ),
+        refused(
+            "HND of Varian, asked about",
+            |d| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0"),
+            "info a.hnd",
+            &["a.hnd", "Varian's HND", "rtkprojections"],
+        ),
+        refused(
+            "HND of Varian in place of a description",
+            |d| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0"),
+            "import a.hnd -o scan",
+            &["a.hnd", "Varian's HND", "rtkprojections"],
+        ),
+        refused(
+            "HND of Varian in place of a volume",
+            |d| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0"),
+            "simulate a.hnd -o scan",
+            &["a.hnd", "Varian's HND", "rtkprojections"],
+        ),
+        refused(
+            "HND of Varian in place of a scan",
+            |d| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0"),
+            "reconstruct a.hnd --spec fdk -o run",
+            &["a.hnd", "Varian's HND", "rtkprojections"],
         ),
     ]
 }

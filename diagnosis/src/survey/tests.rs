@@ -109,6 +109,26 @@ fn a_clean_scan_gives_no_warning_and_the_right_figures() {
 }
 
 #[test]
+fn source_and_detector_that_turn_as_one_body_are_on_a_circle() {
+    let geometry = clean().scan().geometry;
+    let changed = |change: &dyn Fn(usize, &mut View)| {
+        let mut geometry = geometry.clone();
+        geometry.views.iter_mut().enumerate().for_each(|(i, view)| change(i, view));
+        setup(&geometry).circle
+    };
+    assert!(changed(&|_, _| {}));
+    // Columns the other way, as on Nikon's scanners; a tilted detector; an axis beside the central ray.
+    assert!(changed(&|_, v| v.u = v.u.map(|x| -x)));
+    assert!(changed(&|_, v| *v = v.tilted([0.02, -0.01, 0.03].map(Radians))));
+    assert!(changed(&|_, v| {
+        let aside = v.u;
+        (0..3).for_each(|k| (v.source[k], v.detector[k]) = (v.source[k] + aside[k], v.detector[k] + aside[k]));
+    }));
+    assert!(!changed(&|i, v| v.source[2] += 1e-3 * i as f64));
+    assert!(!changed(&|i, v| v.detector[0] += if i == 7 { 1e-3 } else { 0.0 }));
+}
+
+#[test]
 fn unusual_but_complete_scans_give_no_warning() {
     // A half-offset detector with a full circle; a short scan of 180° and more; irregular angles; noise.
     let offset = Setting { offset: [0.0, 30.0], detector: [40, 80], ..clean() };

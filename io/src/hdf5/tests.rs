@@ -134,3 +134,27 @@ fn any_changed_byte_is_refused_or_changes_only_values() {
         let _ = import("projections = \"dxchange.h5\"", &turn, |b| b[at] ^= 0x81);
     }
 }
+
+#[test]
+fn a_filter_that_is_not_read_is_named_with_the_way_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let whole = fs::read(fixture("nxtomo.nxs")).unwrap();
+    // The filter's number stands 8 bytes before its name; headers of this file have no checksums.
+    let at = whole.windows(8).position(|w| w == b"deflate\0").unwrap() - 8;
+    assert_eq!(whole[at..at + 2], [1, 0]);
+    for (id, name) in
+        [(32_000u16, "LZF"), (32_008, "bitshuffle"), (32_001, "Blosc"), (32_015, "Zstandard"), (999, "a filter")]
+    {
+        let mut bytes = whole.clone();
+        bytes[at..at + 2].copy_from_slice(&id.to_le_bytes());
+        fs::write(dir.path().join("a.h5"), bytes).unwrap();
+        let text = format!(
+            "format = \"conefield-scanner\"\nversion = 1\n[files]\nprojections = \"a.h5\"\n{CIRCLE}range_deg = 360\n\
+             [values]\ni0 = 20000\n[volume]\nshape = [4, 3, 2]\nspacing = [0.5, 0.75, 2.0]\n"
+        );
+        fs::write(dir.path().join("s.toml"), text).unwrap();
+        let e = read_scanner(dir.path().join("s.toml"), &ImportOptions::default()).unwrap_err().to_string();
+        let words = ["a.h5", &format!("packed by {name} (filter id {id})"), "h5repack -f NONE"];
+        assert!(words.iter().all(|w| e.contains(w)), "{e}");
+    }
+}

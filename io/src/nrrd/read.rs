@@ -6,7 +6,7 @@ use crate::folder;
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
 use crate::scan_folder::folder_of;
-use crate::text::shortened;
+use crate::text::{self, shortened, without_mark};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
@@ -20,7 +20,7 @@ const DATA_FILE: [&str; 2] = ["data file", "datafile"];
 
 /// Whether `head`, the start of a file, has NRRD's magic bytes, of any version.
 pub(crate) fn is_header(head: &[u8]) -> bool {
-    head.starts_with(b"NRRD000")
+    without_mark(head).starts_with(b"NRRD000")
 }
 
 /// The entries of a header.
@@ -231,6 +231,14 @@ impl Header {
         };
         Ok((affine::spacing(&affine), Some(affine)))
     }
+
+    /// What is odd about the axes: shear, and sizes in spacings other than those of the space directions.
+    fn remarks(&self, spacing: [f64; 3], affine: &Affine) -> Result<Vec<String>> {
+        let said = self.three("spacings")?.map(|s| s.map(|x| x.abs()));
+        let differs = said.and_then(|s| affine::contradiction("spacings", s, "space directions", spacing));
+        let both = self.entry("space directions")?.is_some();
+        Ok(affine::skew(affine).into_iter().chain(differs.filter(|_| both)).collect())
+    }
 }
 
 /// Three numbers, if these are three and finite.
@@ -255,6 +263,9 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
     let order = header.order(number)?;
     let packed = header.packed()?;
     let (spacing, affine) = header.place_of_voxels()?;
+    if let Some(affine) = &affine {
+        text::warn(&header.place, header.remarks(spacing, affine)?);
+    }
     let grid = VoxelGrid { shape, spacing, center: [0.0; 3] };
     grid.validate(&header.place)?;
     let count = grid.len().unwrap_or(0);
@@ -349,6 +360,8 @@ mod tests {
         let want = [1.0, -2.0, 3.0, 256.0];
         let d = dir.path();
         assert_eq!(values(&write(d, "a.nrrd", &[HEAD.as_bytes(), b"\n", &DATA])), want);
+        let marked = write(d, "m.nrrd", &[b"\xef\xbb\xbf", HEAD.as_bytes(), b"\n", &DATA]);
+        assert_eq!(values(&marked), want);
         let dos = HEAD.replace('\n', "\r\n");
         assert_eq!(values(&write(d, "b.nrrd", &[dos.as_bytes(), b"\r\n", &DATA])), want);
         let packed = HEAD.replace("raw", "gz");
@@ -393,6 +406,22 @@ mod tests {
         let (spacing, _) = read(&format!("space: LPS\nspace units: \"um\" \"um\" \"um\"\n{axes}"));
         assert_eq!(spacing, [0.002, 0.003, 0.004]);
         assert_eq!(read("spacings: 0.5 0.25 2\nunits: \"cm\" \"cm\" \"cm\"\n").0, [5.0, 2.5, 20.0]);
+    }
+
+    #[test]
+    fn shear_and_sizes_that_contradict_are_said() {
+        let dir = tempfile::tempdir().unwrap();
+        let said = |lines: &str| {
+            let path = write(dir.path(), "a.nrrd", &[HEAD.as_bytes(), lines.as_bytes(), b"\n", &DATA]);
+            let header = super::Header::read(&mut crate::input::Input::open_plain(&path).unwrap()).unwrap();
+            let (spacing, affine) = header.place_of_voxels().unwrap();
+            header.remarks(spacing, &affine.unwrap()).unwrap().join("; ")
+        };
+        assert_eq!(said("space: LPS\nspace directions: (0,2,0) (3,0,0) (0,0,4)\n"), "");
+        assert_eq!(said("spacings: 1 2 3\n"), "");
+        assert!(said("space: LPS\nspace directions: (1,0,0) (1,1,0) (0,0,1)\n").contains("x and y of the voxels"));
+        let both = said("space: LPS\nspace directions: (1,0,0) (0,1,0) (0,0,2)\nspacings: 1 1 3\n");
+        assert!(both.contains("spacings says voxels of [1.0, 1.0, 3.0] mm"), "{both}");
     }
 
     #[test]

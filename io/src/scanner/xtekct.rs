@@ -1,17 +1,23 @@
 //! Nikon's scan description `.xtekct`: an INI file next to the folder of its 16-bit TIFFs.
 //!
 //! Lengths are mm, angles degrees. Source of the meaning of the keys: CIL (`cil.io.NikonDataReader`). The source looks
-//! along +y at a detector whose first pixel is at the top right, at the distance `SrcToDetector`. The object rotates at
-//! the distance `SrcToObject`, with its axis `ObjectOffsetX` to the left (without that key, computed from the centres
-//! of rotation at the top and bottom of the detector and the magnification), rolled about the ray and tilted towards
-//! it. `WhiteLevel` is the open-beam count.
+//! along +y at a detector whose first pixel is at the top right, at the distance `SrcToDetector`; `DetectorOffsetX`
+//! shifts it along its columns, to the left, `DetectorOffsetY` up. The object rotates at the distance `SrcToObject`,
+//! with its axis `ObjectOffsetX` to the left (without that key, computed from the centres of rotation at the top and
+//! bottom of the detector and the magnification), rolled about the ray and tilted towards it. `WhiteLevel` is the
+//! open-beam count.
+//!
+//! The angles are those of the stage in `_ctdata.txt` or `Name.ang` (rows of a projection's number and its angle, as
+//! TIGRE reads them), unless `AngleFile_Use` is `False`; without such a file, even steps.
 
 use super::turning::TurningObject;
 use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, Vectors};
+use crate::folder;
 use crate::input::LONGEST_TEXT;
+use crate::scan_folder::folder_of;
 use crate::stack::Names;
 use crate::table::Numbers;
-use conefield_core::files::read_text;
+use crate::text::{read_foreign, shortened, unread};
 use conefield_core::geometry::{View, VoxelGrid};
 use conefield_core::{Error, Result};
 use std::collections::HashMap;
@@ -20,6 +26,9 @@ use std::path::Path;
 /// Most views of a description: a circle in steps of about one second of arc.
 const MOST_VIEWS: f64 = 1e6;
 
+/// Share of a step by which measured angles may differ from even steps before a warning.
+const UNEVEN: f64 = 0.1;
+
 /// Whether `path` has the extension of such a file.
 pub(crate) fn is_xtekct(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("xtekct"))
@@ -27,7 +36,7 @@ pub(crate) fn is_xtekct(path: &Path) -> bool {
 
 /// The scan as a description in the terms of `scanner.toml`.
 pub(super) fn description(path: &Path) -> Result<Description> {
-    let text = read_text(path, LONGEST_TEXT)?;
+    let text = read_foreign(path, LONGEST_TEXT)?;
     let keys = Keys::of(path.display().to_string(), &text)?;
     let whole = |key: &str, most: f64| -> Result<usize> {
         let found = keys.number(key)?;
@@ -38,10 +47,14 @@ pub(super) fn description(path: &Path) -> Result<Description> {
             Err(keys.invalid(key, found, format!("a whole number from 1 to {most}")))
         }
     };
+    if let Some(unit) = keys.text("Units").filter(|u| !u.eq_ignore_ascii_case("mm")) {
+        return Err(keys.invalid("Units", shortened(unit), "mm"));
+    }
     let count = whole("Projections", MOST_VIEWS)?;
     let [columns, rows] = [whole("DetectorPixelsX", 1e6)?, whole("DetectorPixelsY", 1e6)?];
     let [column, row] = [keys.length("DetectorPixelSizeX")?, keys.length("DetectorPixelSizeY")?];
     let [object, detector] = [keys.length("SrcToObject")?, keys.length("SrcToDetector")?];
+    let [aside_detector, above] = [keys.or("DetectorOffsetX", 0.0)?, keys.or("DetectorOffsetY", 0.0)?];
     let [top, bottom] = [keys.or("CentreOfRotationTop", 0.0)?, keys.or("CentreOfRotationBottom", 0.0)?];
     let aside = keys.or("ObjectOffsetX", 0.5 * (top + bottom) * object / detector)?;
     let roll = match keys.or("ObjectRoll", f64::NAN)? {
@@ -49,10 +62,9 @@ pub(super) fn description(path: &Path) -> Result<Description> {
         degrees => degrees.to_radians(),
     };
     let tilt = -keys.or("ObjectTilt", 0.0)?.to_radians();
-    let (first, step) = (keys.number("InitialAngle")?, keys.number("AngularStep")?);
     let rest = TurningObject {
         source: [0.0; 3],
-        detector: [0.0, detector, 0.0],
+        detector: [-aside_detector, detector, above],
         u: [-column, 0.0, 0.0],
         v: [0.0, 0.0, -row],
         axis: [-aside, object, 0.0],
@@ -60,11 +72,14 @@ pub(super) fn description(path: &Path) -> Result<Description> {
         axis_direction: [roll.sin(), -tilt.sin() * roll.cos(), tilt.cos() * roll.cos()],
     };
     let numbers = |v: View| [v.source, v.detector, v.u, v.v].concat();
-    let cone_vec = rest.views((0..count).map(|i| first + step * i as f64 - 180.0)).into_iter().map(numbers).collect();
+    let mut remarks = Vec::new();
+    let angles = angles(&keys, path, count, &mut remarks)?;
+    let cone_vec = rest.views(angles.into_iter().map(|a| a - 180.0)).into_iter().map(numbers).collect();
+    remarks.extend(unread(&keys.others()));
     Ok(Description {
         _format: String::new(),
         _version: 0,
-        files: Files { projections: projections(&keys, path, count), flat: None, dark: None },
+        files: Files { projections: projections(&keys, path, count, &mut remarks), flat: None, dark: None },
         circle: None,
         vectors: Some(Vectors { cone_vec: Numbers::List(cone_vec) }),
         rtk: None,
@@ -77,22 +92,113 @@ pub(super) fn description(path: &Path) -> Result<Description> {
         },
         volume: volume(&keys, [columns, rows], [column, row].map(|x| x * object / detector))?,
         detector: Some([rows, columns]),
+        remarks,
     })
 }
 
-/// The images: by the names that the description implies, else all of the folder.
-fn projections(keys: &Keys, path: &Path, count: usize) -> Names {
-    let text = |key| keys.0.get(key).map_or("", |v| v.as_str());
+/// The angles of `count` views, in degrees: measured ones, else even steps.
+fn angles(keys: &Keys, path: &Path, count: usize, remarks: &mut Vec<String>) -> Result<Vec<f64>> {
+    let (first, step) = (keys.number("InitialAngle")?, keys.number("AngularStep")?);
+    let even = |i: usize| first + step * i as f64;
+    let Some((file, measured)) = measured_angles(keys, path, count, remarks)? else {
+        return Ok((0..count).map(even).collect());
+    };
+    let used = !keys.text("AngleFile_Use").is_some_and(|u| u.eq_ignore_ascii_case("false"));
+    // Relative to the first view, within half a turn.
+    let off = |(i, a): (usize, &f64)| {
+        let off = a - measured[0] - step * i as f64;
+        (off - 360.0 * (off / 360.0).round()).abs()
+    };
+    let most = measured.iter().enumerate().map(off).fold(0.0, f64::max);
+    let differ = format!("the angles in {file} differ by up to {most:.3} degrees from steps of {step}");
+    if most > UNEVEN * step.abs() {
+        let which = if used { "those of the file are used" } else { "the steps are used, as AngleFile_Use says" };
+        remarks.push(format!("{differ}; {which}"));
+    }
+    Ok(if used { measured } else { (0..count).map(even).collect() })
+}
+
+/// The first of `_ctdata.txt` and `Name.ang` beside the description, and the angles in it.
+fn measured_angles(
+    keys: &Keys,
+    path: &Path,
+    count: usize,
+    remarks: &mut Vec<String>,
+) -> Result<Option<(String, Vec<f64>)>> {
+    let folder = folder_of(path);
+    let name = keys.text("Name").unwrap_or_default();
+    let names = folder::names(folder, &["txt", "ang"])?;
+    let wanted = ["_ctdata.txt".to_owned(), format!("{name}_ctdata.txt"), format!("{name}.ang")];
+    let Some(file) = wanted.iter().find_map(|w| names.iter().find(|n| n.eq_ignore_ascii_case(w))) else {
+        return Ok(None);
+    };
+    let path = folder::inside(folder, &keys.1, "angles", file)?;
+    let place = path.display().to_string();
+    let mut rows: Vec<(usize, f64)> = Vec::new();
+    for line in read_foreign(&path, LONGEST_TEXT)?.lines().filter(|l| !l.trim().is_empty()) {
+        let mut cells = line.split(|c: char| c.is_whitespace() || c == ':' || c == ';').filter(|c| !c.is_empty());
+        let Some(number) = cells.next().and_then(|c| c.parse().ok()) else {
+            // The names of columns: rows of numbers before them belong to another table.
+            rows.clear();
+            continue;
+        };
+        // Some systems write a decimal comma.
+        let angle = cells.next().and_then(|a| a.replace(',', ".").parse().ok()).filter(|a: &f64| a.is_finite());
+        let shown = || Error::invalid(&place, format!("projection {number}"), shortened(line), "an angle");
+        rows.push((number, angle.ok_or_else(shown)?));
+    }
+    let mut angles = vec![f64::NAN; count];
+    let mut beyond = 0;
+    // Projections are numbered from 1; some files number them from 0.
+    let first = usize::from(rows.iter().all(|(number, _)| *number > 0));
+    for (number, angle) in rows {
+        match number.checked_sub(first).and_then(|i| angles.get_mut(i)) {
+            Some(at) => *at = angle,
+            None => beyond += 1,
+        }
+    }
+    if let Some(i) = angles.iter().position(|a| a.is_nan()) {
+        let expected = format!("one for each of the {count} Projections (move the file away to take even steps)");
+        return Err(Error::invalid(place, format!("angle of projection {}", i + 1), "none", expected));
+    }
+    if beyond > 0 {
+        remarks.push(format!("{file}: {beyond} angles beyond the {count} Projections are not used"));
+    }
+    Ok(Some((file.clone(), angles)))
+}
+
+/// The images: those that have the name in the description and a number, else all of the folder.
+fn projections(keys: &Keys, path: &Path, count: usize, remarks: &mut Vec<String>) -> Names {
+    let text = |key| keys.text(key).unwrap_or_default();
     let folder = match text("InputFolderName") {
         "" => ".",
         name => name,
     };
+    let start = format!("{}{}", text("Name"), text("InputSeparator"));
     let digits = text("InputDigits").parse().unwrap_or(4usize).min(9);
-    let name = |i: usize| format!("{folder}/{}{}{i:0digits$}.tif", text("Name"), text("InputSeparator"));
-    match path.parent().is_some_and(|p| p.join(name(1)).is_file()) {
-        true => Names::Many((1..=count).map(name).collect()),
-        false => Names::One(folder.to_owned()),
+    let within = folder::within(folder_of(path), &keys.1, "InputFolderName", folder);
+    // The reader of the images reports a folder that is not there.
+    let all = within.and_then(|f| folder::names(&f, &["tif", "tiff"])).unwrap_or_default();
+    let number = |name: &str| -> Option<usize> {
+        let (name, _) = name.rsplit_once('.')?;
+        name.get(..start.len()).filter(|s| s.eq_ignore_ascii_case(&start))?;
+        name[start.len()..].bytes().all(|b| b.is_ascii_digit()).then(|| name[start.len()..].parse().ok())?
+    };
+    let mut numbered: HashMap<usize, &String> = all.iter().filter_map(|n| Some((number(n)?, n))).collect();
+    if !numbered.contains_key(&1) {
+        return Names::One(folder.to_owned());
     }
+    let name = |i: usize| {
+        // A missing image is reported with the name that it should have.
+        let name = numbered.remove(&i).cloned().unwrap_or_else(|| format!("{start}{i:0digits$}.tif"));
+        format!("{folder}/{name}")
+    };
+    let names = (1..=count).map(name).collect();
+    if numbered.keys().any(|n| *n > count) {
+        let more = numbered.len();
+        remarks.push(format!("{more} images beyond the {count} Projections are not read"));
+    }
+    Names::Many(names)
 }
 
 /// The volume in the file, else as many voxels as pixels, with the pixel size at the axis.
@@ -135,10 +241,15 @@ impl Keys {
         Error::invalid(&self.1, key, found, expected)
     }
 
+    /// The text of a key; an empty one counts as absent.
+    fn text(&self, key: &str) -> Option<&str> {
+        self.0.get(key).map(String::as_str).filter(|v| !v.is_empty())
+    }
+
     fn number(&self, key: &str) -> Result<f64> {
         let Some(text) = self.0.get(key) else { return Err(self.invalid(key, "nothing", "a number")) };
         let found = text.parse::<f64>().ok().filter(|x| x.is_finite());
-        found.ok_or_else(|| self.invalid(key, format!("\"{}\"", text.chars().take(60).collect::<String>()), "a number"))
+        found.ok_or_else(|| self.invalid(key, shortened(text), "a number"))
     }
 
     fn length(&self, key: &str) -> Result<f64> {
@@ -147,9 +258,35 @@ impl Keys {
     }
 
     fn or(&self, key: &str, otherwise: f64) -> Result<f64> {
-        if self.0.contains_key(key) { self.number(key) } else { Ok(otherwise) }
+        if self.text(key).is_some() { self.number(key) } else { Ok(otherwise) }
+    }
+
+    /// Keys that may move source, detector, object or volume and are not read, with their values.
+    fn others(&self) -> Vec<String> {
+        let moves = |key: &str| MOVING.iter().any(|m| key.contains(m)) && !KNOWN.contains(&key);
+        let set = |value: &str| value.parse::<f64>().is_ok_and(|x| x != 0.0);
+        let mut others: Vec<String> =
+            self.0.iter().filter(|(k, v)| moves(k) && set(v)).map(|(k, v)| format!("{k} = {v}")).collect();
+        others.sort();
+        others
     }
 }
+
+/// Parts of the names of keys that move something.
+const MOVING: &[&str] = &[
+    "Offset",
+    "Shift",
+    "Tilt",
+    "Roll",
+    "Pitch",
+    "Yaw",
+    "Skew",
+    "Helic",
+    "Helix",
+    "Translation",
+    "RotationOf",
+    "RegionStart",
+];
 
 /// Keys of the geometry: two different values of one are an error.
 const KNOWN: &[&str] = &[
@@ -159,8 +296,15 @@ const KNOWN: &[&str] = &[
     "DetectorPixelsY",
     "DetectorPixelSizeX",
     "DetectorPixelSizeY",
+    "DetectorOffsetX",
+    "DetectorOffsetY",
     "SrcToObject",
     "SrcToDetector",
+    "ObjectOffsetX",
+    "ObjectRoll",
+    "ObjectTilt",
+    "CentreOfRotationTop",
+    "CentreOfRotationBottom",
     "InitialAngle",
     "AngularStep",
 ];
@@ -170,6 +314,7 @@ mod tests {
     use super::super::{ImportOptions, read_scanner};
     use super::*;
     use conefield_core::geometry::{Millimetres, Radians};
+    use conefield_core::orbit::CircularOrbit;
     use std::fs;
     use tiff::encoder::{TiffEncoder, colortype::Gray16};
 
@@ -221,10 +366,76 @@ mod tests {
         assert_eq!((grid.shape, grid.spacing), ([5, 5, 4], [1.25, 1.25, 0.9375]));
     }
 
+    /// The views of `TEXT` with the axis in the middle, after a change.
+    fn views(from: &str, to: &str, files: &[(&str, &[u8])]) -> Result<Vec<View>> {
+        let text = TEXT.replace("=1.6", "=0").replace(from, to);
+        let (dir, path) = written(&text);
+        files.iter().for_each(|(name, bytes)| fs::write(dir.path().join(name), bytes).unwrap());
+        crate::read_scan(&path).map(|s| s.geometry.views)
+    }
+
+    #[test]
+    fn the_detectors_offset_moves_it_along_its_columns_and_up_and_the_circle_is_one() {
+        let orbit = |from: &str, to: &str| CircularOrbit::fit(&views(from, to, &[]).unwrap()).unwrap();
+        let plain = orbit("", "");
+        assert_eq!((plain.dso, plain.pixel, plain.offset), (500.0, [1.5, 2.0], [0.0; 2]));
+        let moved = orbit("[Xrays]", "DetectorOffsetX=8\nDetectorOffsetY=4.5\n[Xrays]");
+        // Columns are reversed to run as on conefield's circles, so that along them is against Nikon's; rows run down.
+        assert_eq!((moved.offset[0], moved.angles), (-4.5, plain.angles));
+        assert!((moved.offset[1] + 8.0).abs() < 1e-9, "{:?}", moved.offset);
+        let path = "bone.xtekct".into();
+        let keys = Keys::of(path, "DetectorOffsetX=8\nOffsetX=-4\nShuttling=True\nObjectOffsetY=0\n").unwrap();
+        assert_eq!(keys.others(), ["OffsetX = -4"]);
+    }
+
+    #[test]
+    fn measured_angles_replace_even_steps() {
+        let angles = |from: &str, to: &str, files: &[(&str, &[u8])]| -> Vec<f64> {
+            let orbit = CircularOrbit::fit(&views(from, to, files).unwrap()).unwrap();
+            orbit.angles.iter().map(|a| (a.to_degrees() + 270.0).rem_euclid(360.0)).collect()
+        };
+        let near = |found: Vec<f64>, want: [f64; 3]| {
+            assert!(found.iter().zip(want).all(|(f, w)| (f - w).abs() < 1e-9), "{found:?} {want:?}");
+        };
+        near(angles("", "", &[]), [30.0, 150.0, 270.0]);
+        let ctdata = b"Projs\tFrames\tExposure\r\n3142\t1\t500\r\nProjection\tAngle(deg)\tTime(s)\r\n\
+                       1\t31.5\t0\r\n2\t140\t1\r\n3\t280.25\t2\r\n\r\n";
+        near(angles("", "", &[("_ctdata.txt", ctdata)]), [31.5, 140.0, 280.25]);
+        // Windows-1252, a decimal comma, another order and a row too many.
+        let ang = b"Proj\tAngle(\xb0)\n2:\t140,5\n1:\t31,5\n3:\t280\n4:\t391,5\n";
+        near(angles("", "", &[("BONE.ANG", ang)]), [31.5, 140.5, 280.0]);
+        near(angles("", "", &[("bone.ang", b"Proj\tAngle\n0\t31\n1\t140\n2\t281\n")]), [31.0, 140.0, 281.0]);
+        near(angles("[Xrays]", "[CTPro]\nAngleFile_Use=False\n", &[("bone.ang", ang)]), [30.0, 150.0, 270.0]);
+        for (text, words) in [
+            ("Proj\n1 31\n3 280\n", ["bone.ang: angle of projection 2", "none"]),
+            ("Proj\n1 31\n2 east\n3 280\n", ["projection 2", "2 east"]),
+            ("", ["angle of projection 1", "none"]),
+        ] {
+            let e = views("", "", &[("bone.ang", text.as_bytes())]).unwrap_err().to_string();
+            assert!(words.iter().all(|w| e.contains(w)), "{e}");
+        }
+    }
+
+    #[test]
+    fn texts_of_windows_and_names_in_capitals_are_read() {
+        let (dir, path) = written(TEXT);
+        fs::write(&path, [b"[XTekCT]\r\nOperatorID=K\xfcndig \xa9\r\n".as_slice(), TEXT.as_bytes()].concat()).unwrap();
+        fs::create_dir(dir.path().join("Raw")).unwrap();
+        for i in 1..=4 {
+            let [from, to] = [format!("bone_{i:04}.tif"), format!("Raw/BONE_{i:05}.TIF")];
+            fs::rename(dir.path().join(from), dir.path().join(to)).unwrap();
+        }
+        fs::write(&path, TEXT.replace("InputFolderName=", "InputFolderName=.\\Raw")).unwrap();
+        let scan = crate::read_scan(&path).unwrap();
+        assert_eq!(scan.projections.dim(), (3, 4, 5));
+        assert!((scan.projections[[1, 0, 0]] - 2.5f32.ln()).abs() < 1e-6);
+    }
+
     #[test]
     fn what_is_missing_or_wrong_is_named() {
         for (from, to, words) in [
             ("SrcToObject=500.000", "", ["SrcToObject", "nothing"]),
+            ("[Xrays]", "Units=inch\n[Xrays]", ["Units", "expected mm"]),
             ("SrcToObject=500.000", "SrcToObject=-5", ["SrcToObject", "above 0"]),
             ("SrcToObject=500.000", "SrcToObject=five", ["SrcToObject", "\"five\""]),
             ("SrcToObject=500.000", "SrcToObject=500\nSrcToObject=400", ["line 19: SrcToObject", "one value"]),

@@ -5,7 +5,7 @@
 
 use super::{stack, values};
 use crate::affine::{self, Affine};
-use crate::{file_order, folder};
+use crate::{file_order, folder, text};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result, allowance};
@@ -23,15 +23,15 @@ pub(super) const AFFINE: &str = "affine";
 pub(crate) fn read_volume(path: &Path) -> Result<Volume> {
     let place = path.display().to_string();
     let mut text = StackText::default();
-    let pages = stack(path, |decoder| {
+    let (stack, images) = stack(path, |decoder| {
         text = StackText::of(decoder);
         Ok(())
     })?;
+    let pages = stack.values;
     let (slices, rows, columns) = pages.dim();
-    // Above 4 GiB ImageJ writes one page and the other slices after it.
-    if let Some(n) = text.number("images").filter(|n| *n != slices as f64) {
-        let expected = format!("{slices}, the pages of the file (save the stack with one page per slice)");
-        return Err(Error::invalid(place, "images", n, expected));
+    if let Some(n) = images.claim.map(|c| c.volumes).filter(|n| *n > 1) {
+        let found = format!("{n} channels or points in time");
+        return Err(Error::invalid(place, "ImageDescription", found, "1: one volume, one number per voxel"));
     }
     let (grid, affine) = text.place_of_voxels(&place, [columns, rows, slices])?;
     file_order::read(&place, grid, affine, pages.into_raw_vec_and_offset().0)
@@ -55,19 +55,26 @@ pub(crate) fn folder_voxels(folder: &Path) -> Result<u64> {
 pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
     let place = folder.display().to_string();
     let names = slices(folder)?;
+    text::warn(&place, folder::oddity(&names));
     // Claims are checked against file sizes here, before memory for all files is allocated.
     let voxels = usize::try_from(folder_voxels(folder)?).unwrap_or(usize::MAX);
     allowance::numbers(&place, "slices", voxels)?;
     let mut text = StackText::default();
-    let mut data: Option<Array3<f32>> = None;
+    let (mut data, mut sample) = (None::<Array3<f32>>, None);
     for (z, name) in names.iter().enumerate() {
         let path = folder::inside(folder, &place, "slices", name)?;
-        let slice = stack(&path, |decoder| {
+        let (slice, images) = stack(&path, |decoder| {
             if z == 0 {
                 text = StackText::of(decoder);
             }
             Ok(())
         })?;
+        let slice = slice.values;
+        let numbers = *sample.get_or_insert(images.sample);
+        if images.sample != numbers {
+            let expected = format!("{numbers}, as in {}", names[0]);
+            return Err(Error::invalid(path.display().to_string(), "numbers", images.sample, expected));
+        }
         let (pages, rows, columns) = slice.dim();
         let invalid = |field: &str, found: String, expected: String| {
             Err(Error::invalid(path.display().to_string(), field, found, expected))
@@ -163,13 +170,8 @@ impl StackText {
         (affine::is_regular(&affine) && affine::fits(&affine, spacing)).then_some(affine)
     }
 
-    /// The grid of `shape` voxels, and the affine. Refuses a stack of several channels or points in time.
+    /// The grid of `shape` voxels, and the affine.
     fn place_of_voxels(&self, place: &str, shape: [usize; 3]) -> Result<(VoxelGrid, Option<Affine>)> {
-        for name in ["channels", "frames"] {
-            if let Some(n) = self.number(name).filter(|n| *n > 1.0) {
-                return Err(Error::invalid(place, name, n, "1: one volume, one number per voxel"));
-            }
-        }
         let mut grid = VoxelGrid { shape, spacing: self.spacing().unwrap_or([1.0; 3]), center: [0.0; 3] };
         grid.validate(place)?;
         let affine = self.spacing().map(|spacing| self.affine(spacing).unwrap_or_else(|| affine::centred(&grid)));
@@ -243,7 +245,7 @@ mod tests {
         }
         write(&path, 2, Some("ImageJ=1.54f\nimages=2\nchannels=2\n"));
         let e = read_volume(&path).unwrap_err().to_string();
-        assert!(e.contains("a.tif: channels: found 2"), "{e}");
+        assert!(e.contains("a.tif: ImageDescription: found 2 channels"), "{e}");
         write(&path, 2, Some("ImageJ=1.54f\nimages=3\n"));
         let e = read_volume(&path).unwrap_err().to_string();
         assert!(e.contains("a.tif: images: found 3") && e.contains("expected 2"), "{e}");

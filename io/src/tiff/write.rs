@@ -189,7 +189,7 @@ mod tests {
             let mut bytes = head.bytes();
             file_order::write(&mut bytes, &path, &mut &volume, FileOrder::XFastest).unwrap();
             std::fs::write(&path, bytes).unwrap();
-            let pages = crate::tiff::read(&path).unwrap();
+            let pages = crate::tiff::read(&path).unwrap().values;
             assert_eq!(pages, volume.data.t().to_owned(), "{big}");
             let back = crate::tiff::read_volume(&path).unwrap();
             assert_eq!((&back.data, back.grid, back.affine), (&volume.data, volume.grid, Some(affine)), "{big}");

@@ -3,6 +3,7 @@
 //! `ruzstd` decompresses the strips or tiles; this module undoes the predictor (TIFF 6.0, section 14; Adobe's Technical
 //! Note 3 for floats).
 
+use super::Sample;
 use crate::number::{ByteOrder, Number};
 use conefield_core::{Error, Result, allowance};
 use ruzstd::decoding::FrameDecoder;
@@ -21,15 +22,15 @@ pub(super) fn is_packed(decoder: &mut Decoder<impl Read + Seek>) -> bool {
     decoder.find_tag_unsigned::<u32>(Tag::Compression).is_ok_and(|c| c == Some(ZSTD))
 }
 
-/// Appends the `rows` × `columns` values of `bits` bits of the current page of `decoder` to `out`, row by row.
+/// Appends the `rows` × `columns` values of the current page of `decoder` to `out`, row by row.
 pub(super) fn read(
     place: &str,
     decoder: &mut Decoder<impl Read + Seek>,
     [rows, columns]: [usize; 2],
-    bits: u8,
+    sample: Sample,
     out: &mut Vec<f32>,
 ) -> Result<()> {
-    let page = Page::of(place, decoder, [rows, columns], bits)?;
+    let page = Page::of(place, decoder, [rows, columns], sample)?;
     let start = out.len();
     out.resize(start + rows * columns, 0.0);
     let across = columns.div_ceil(page.chunk[1]);
@@ -74,7 +75,7 @@ impl<'a> Page<'a> {
         place: &'a str,
         decoder: &mut Decoder<impl Read + Seek>,
         [rows, columns]: [usize; 2],
-        bits: u8,
+        sample: Sample,
     ) -> Result<Self> {
         let tiled = decoder.get_chunk_type() == ChunkType::Tile;
         let (width, height) = decoder.chunk_dimensions();
@@ -84,8 +85,6 @@ impl<'a> Page<'a> {
             tiff::tags::ByteOrder::BigEndian => ByteOrder::Big,
         };
         let broken = |e| super::broken(place, &e);
-        let format = decoder.find_tag_unsigned_vec::<u16>(Tag::SampleFormat).map_err(broken)?;
-        let format = format.and_then(|f| f.first().copied()).unwrap_or(1);
         let predictor = decoder.find_tag_unsigned::<u32>(Tag::Predictor).map_err(broken)?.unwrap_or(1);
         let mut list = |strips, tiles| {
             decoder
@@ -95,23 +94,10 @@ impl<'a> Page<'a> {
         };
         let offsets = list(Tag::StripOffsets, Tag::TileOffsets)?;
         let sizes = list(Tag::StripByteCounts, Tag::TileByteCounts)?;
-        let number = match (format, bits) {
-            (1, 8) => Number::U8,
-            (1, 16) => Number::U16,
-            (1, 32) => Number::U32,
-            (1, 64) => Number::U64,
-            (2, 8) => Number::I8,
-            (2, 16) => Number::I16,
-            (2, 32) => Number::I32,
-            (2, 64) => Number::I64,
-            (3, 32) => Number::F32,
-            (3, 64) => Number::F64,
-            _ => {
-                let found = format!("values of {bits} bits in the format {format}");
-                let expected = "integers of 8 to 64 bits or floats of 32 or 64, where Zstandard packs them";
-                return Err(Error::invalid(place, "SampleFormat", found, expected));
-            }
-        };
+        let number = sample.number().ok_or_else(|| {
+            let expected = "integers of 8 to 64 bits or floats of 32 or 64, where Zstandard packs them";
+            Error::invalid(place, "SampleFormat", sample, expected)
+        })?;
         let float = matches!(number, Number::F32 | Number::F64);
         if !(predictor == 1 || (predictor == 2 && !float) || (predictor == 3 && float)) {
             let expected = "1 (none), 2 (differences of integers) or 3 (differences of floats)";

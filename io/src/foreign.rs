@@ -1,0 +1,119 @@
+//! Files of scanners and programs that conefield does not read: one message for each, which names the format and the way
+//! to a format that is read, whatever command meets the file.
+
+use conefield_core::{Error, Result, files};
+use std::io::Read;
+use std::path::Path;
+
+/// Bytes that suffice to recognize a file.
+const HEAD: u64 = 64;
+
+/// Most files of a folder that are looked at.
+const MOST_FILES: usize = 64;
+
+const RTK: &str = "convert the projections with rtkprojections and the geometry with RTK's program for this machine \
+                   (rtkvarianobigeometry, rtkvarianprobeamgeometry, rtkelektasynergygeometry), and describe both in a \
+                   scanner.toml with [rtk] and kind = \"line-integrals\" (docs/guide/formats.md)";
+const ZEISS: &str = "export the projections as TIFF and describe them in a scanner.toml (docs/guide/formats.md), or \
+                     convert the file to Data Exchange (HDF5)";
+const EXPORT: &str = "export TIFF, NumPy, MetaImage or NIfTI files, and describe projections in a scanner.toml \
+                      (docs/guide/formats.md)";
+
+/// First bytes of a file, the format's name and what to do.
+const FORMATS: &[(&[u8], &str, &str)] = &[
+    (b"VARIAN_VA_INTERNAL_HND", "Varian's HND, projections of an On-Board Imager", RTK),
+    (b"VARIAN_VA_INTERNAL", "Varian's HNC or HNA, projections of an On-Board Imager", RTK),
+    (b"VMS.XI", "Varian's XIM, projections of a TrueBeam or ProBeam", RTK),
+    // Type 0x7000, a header of 68 bytes, whose image part has another 32.
+    (b"\x00\x70\x44\x00", "HIS, projections of an Elekta or PerkinElmer detector", RTK),
+    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "an OLE file such as Zeiss' TXRM and TXM", ZEISS),
+    (b"MATLAB 5.0 MAT-file", "MATLAB's MAT file of version 5", "save it with -v7.3, which is HDF5, or as .npy"),
+    (b"SIMPLE  =", "FITS", EXPORT),
+    (b"\x89PNG\r\n", "PNG", EXPORT),
+    (b"\xff\xd8\xff", "JPEG", EXPORT),
+    (b"ncaa", "VFF", EXPORT),
+];
+
+/// Extensions of these formats, for files that no mark identifies.
+const EXTENSIONS: &[(&str, &str, &str)] = &[
+    ("hnd", "Varian's HND, projections of an On-Board Imager", RTK),
+    ("hnc", "Varian's HNC, projections of an On-Board Imager", RTK),
+    ("xim", "Varian's XIM, projections of a TrueBeam or ProBeam", RTK),
+    ("his", "HIS, projections of an Elekta or PerkinElmer detector", RTK),
+    ("txrm", "Zeiss' TXRM", ZEISS),
+    ("txm", "Zeiss' TXM", ZEISS),
+];
+
+/// The name of the format of `path`, which starts with `head`, and what to do.
+fn format(path: &Path, head: &[u8]) -> Option<(&'static str, &'static str)> {
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let marked = FORMATS.iter().find(|(mark, ..)| head.starts_with(mark)).map(|(_, name, way)| (*name, *way));
+    let named = || EXTENSIONS.iter().find(|(end, ..)| *end == extension).map(|(_, name, way)| (*name, *way));
+    marked.or_else(named)
+}
+
+/// Refuses the file `path`, which starts with `head`, if its format is one of these. To be called where no reader has
+/// recognized it.
+pub(crate) fn refuse(path: &Path, head: &[u8]) -> Result<()> {
+    match format(path, head) {
+        Some((name, way)) => Err(Error::unsupported(format!("{}: {name}: not read", path.display()), way)),
+        None => Ok(()),
+    }
+}
+
+/// Like [`refuse`], for a file of which nothing has been read.
+pub(crate) fn refuse_file(path: &Path) -> Result<()> {
+    let mut head = Vec::new();
+    files::open(path)?.0.take(HEAD).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
+    refuse(path, &head)
+}
+
+/// Refuses a folder in which no reader has found its files, and one of these formats is among the first files.
+pub(crate) fn refuse_folder(folder: &Path) -> Result<()> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
+    let mut paths: Vec<_> = entries.flatten().map(|e| e.path()).filter(|p| p.is_file()).collect();
+    paths.sort();
+    // Pictures beside the files of another format are not the scan.
+    let picture =
+        |p: &Path| p.extension().is_some_and(|e| ["png", "jpg", "jpeg"].iter().any(|k| e.eq_ignore_ascii_case(k)));
+    paths.iter().filter(|p| !picture(p)).take(MOST_FILES).try_for_each(|p| refuse_file(p))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_format_is_named_by_its_mark_or_extension() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        for (name, bytes, words) in [
+            ("a.hnd", &b"VARIAN_VA_INTERNAL_HND_1.0"[..], "HND"),
+            ("b.bin", b"VARIAN_VA_INTERNAL_HND_1.0", "HND"),
+            ("c.hnc", b"VARIAN_VA_INTERNAL_HNCU_1.0", "HNC"),
+            ("d.xim", b"VMS.XI\0\0", "XIM"),
+            ("e.HIS", b"", "HIS"),
+            ("f.txrm", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "TXRM"),
+        ] {
+            std::fs::write(at(name), bytes).unwrap();
+            for said in [
+                refuse_file(&at(name)).unwrap_err(),
+                crate::read_volume(at(name)).unwrap_err(),
+                crate::read_scan(at(name)).unwrap_err(),
+                crate::read_scanner(at(name), &crate::ImportOptions::default()).unwrap_err(),
+                crate::scan_size(at(name)).unwrap_err(),
+                crate::read_scan(dir.path()).unwrap_err(),
+                crate::read_volume(dir.path()).unwrap_err(),
+            ] {
+                let said = said.to_string();
+                assert!(said.contains(name) && said.contains(words) && said.contains("scanner.toml"), "{said}");
+            }
+            std::fs::remove_file(at(name)).unwrap();
+        }
+        std::fs::write(at("a.txt"), "VARIAN").unwrap();
+        std::fs::write(at("a.png"), b"\x89PNG\r\n\x1a\n").unwrap();
+        refuse_file(&at("a.txt")).unwrap();
+        refuse_folder(dir.path()).unwrap();
+        assert!(refuse_file(&at("a.png")).unwrap_err().to_string().contains("PNG"));
+    }
+}
