@@ -1,6 +1,6 @@
 """Pages that are generated when the site is built, so that they are never out of date.
 
-The command's help and the JSON Schemas come from the program: the one that CONEFIELD names, else target/debug/conefield, else
+The command's help and the JSON Schemas come from the program: the one that CONEFIELD names, else target/release/conefield, else
 target/release/conefield. The Python page comes from the docstrings, the C page from the header.
 """
 
@@ -37,7 +37,7 @@ def find_program():
     for path in named or built:
         if path.is_file():
             return path
-    raise PluginError("the reference needs the program: cargo build -p conefield, or set CONEFIELD to its path")
+    raise PluginError("the reference needs the program: cargo build --release -p conefield, or set CONEFIELD to its path")
 
 
 def run(program, *arguments):

@@ -2,7 +2,7 @@
 //! [`conefield_tests::hostile::PARSERS`], in place of one file of a valid input.
 //!
 //! ```sh
-//! CONEFIELD_CORPUS=$PWD/fuzz/corpus cargo test -p conefield-tests --test corpus   # the seeds
+//! CONEFIELD_CORPUS=$PWD/fuzz/corpus cargo test --release -p conefield-tests --test corpus   # the seeds
 //! cargo +nightly fuzz run nifti
 //! ```
 

@@ -41,10 +41,10 @@ def geometry():
 def command():
     """The command, built beside the package; its tests are skipped if it is missing."""
     named = os.environ.get("CONEFIELD_COMMAND")
-    known = [named] if named else [str(ROOT / "target" / kind / "conefield") for kind in ("debug", "release")]
+    known = [named] if named else [str(ROOT / "target" / "release" / "conefield")]
     program = next((p for p in known if shutil.which(p)), None)
     if program is None:
-        pytest.skip("the command conefield is not built: cargo build -p conefield")
+        pytest.skip("the command conefield is not built: cargo build --release -p conefield")
 
     def run(*arguments, code=0):
         done = subprocess.run([program, "--quiet", *map(str, arguments)], capture_output=True, text=True)

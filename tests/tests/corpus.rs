@@ -3,7 +3,7 @@
 use conefield_tests::hostile::{PARSERS, seeds};
 use std::path::{Path, PathBuf};
 
-/// The folder that fuzzing starts from: `CONEFIELD_CORPUS=DIR cargo test -p conefield-tests --test corpus`
+/// The folder that fuzzing starts from: `CONEFIELD_CORPUS=DIR cargo test --release -p conefield-tests --test corpus`
 /// writes it.
 #[test]
 fn the_corpus_for_fuzzing_is_small() {

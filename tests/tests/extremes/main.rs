@@ -1,7 +1,7 @@
 //! Numerical extremes, a table of cases, and how errors of single precision grow.
 //!
 //! The outcome is kept in `cases.md`. The ordinary cases run with the other tests; the long ones with
-//! `cargo test -p conefield-tests --test extremes -- --ignored`. With `CONEFIELD_BLESS=1` each part writes its
+//! `cargo test --release -p conefield-tests --test extremes -- --ignored`. With `CONEFIELD_BLESS=1` each part writes its
 //! table anew; otherwise all but the figures is compared.
 
 #[path = "../common/mod.rs"]
