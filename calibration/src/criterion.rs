@@ -174,7 +174,7 @@ impl Level {
 }
 
 /// The side of a level's pixels, in pixels of the scan.
-fn bin(scan: &Scan, width: usize) -> usize {
+pub(crate) fn bin(scan: &Scan, width: usize) -> usize {
     let [rows, columns] = scan.geometry.detector;
     rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1))
 }

@@ -4,6 +4,10 @@
 //! SART, three passes) of some views predicts the held-out ones. Pixels, voxels and the search range go from coarse to
 //! fine (`search`). The criterion needs no marker, no symmetry and no full circle.
 //!
+//! The held-out error has its minimum elsewhere if the views do not determine the object: on short arcs, and where it is cut
+//! off. So rays that are measured from both sides (`opposite`) must agree with a shift along u, and without such rays
+//! nothing is determined.
+//!
 //! The held-out error also depends on the size of the reconstructed object. Parameters that change this size
 //! ([`Parameter::by_pairs`]) are found by comparing pairs of views on the same planes (`consistency`, `newton`). This
 //! comparison is independent of the object.
@@ -16,6 +20,7 @@ mod criterion;
 mod direction;
 mod jitter;
 mod newton;
+mod opposite;
 mod parameters;
 mod search;
 
@@ -31,6 +36,7 @@ use conefield_core::scan::Scan;
 use consistency::Consistency;
 use criterion::Level;
 use newton::{Newton, Place};
+use opposite::Opposite;
 use search::{Evidence, Fit, Meter, Search};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -60,6 +66,12 @@ const ROUNDS: usize = 6;
 /// Reasons why the views do not determine a parameter.
 const FLAT_REASON: &str = "the views hardly depend on it, or another parameter changes them in the same way";
 const CUT_REASON: &str = "no two views show the same planes completely: the object is cut off at the detector's border";
+const ARC_REASON: &str =
+    "no rays are measured from both sides: the arc is too short, or the detector lies beside the axis";
+const OPPOSITE_REASON: &str = "the rays that are measured from both sides do not agree better with another value";
+const ROWS_REASON: &str = "the detector has too few rows";
+/// Fewest rows that show a rotation of the detector.
+const ROWS: usize = 4;
 const CIRCLE_REASON: &str = "on a circle a tilted detector gives the same views as an object that is wider at one end";
 /// Sources are on a circle if their heights and distances from the axis differ by less than this share of the distance.
 const CIRCLE: f64 = 0.01;
@@ -174,11 +186,25 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     let mut asked = settings.parameters.clone();
     asked.sort_unstable();
     asked.dedup();
-    let (paired, asked): (Vec<_>, Vec<_>) = asked.into_iter().partition(|p| p.by_pairs());
+    let (paired, mut asked): (Vec<_>, Vec<_>) = asked.into_iter().partition(|p| p.by_pairs());
     let mut at = Correction::default();
     let widths = widths(scan, settings.width);
     let finest = widths[widths.len() - 1];
     let first = Level::new(scan, widths[0], FOLDS, &at)?;
+    let opposite = on_a_circle(&scan.geometry.views).then(|| Opposite::of(scan.binned(criterion::bin(scan, finest))));
+    let shared = opposite.as_ref().is_none_or(Opposite::enough);
+    let reason = |p: &Parameter| match p {
+        _ if !shared => Some(ARC_REASON),
+        Parameter::Rotation if scan.geometry.detector[0] < ROWS => Some(ROWS_REASON),
+        _ => None,
+    };
+    let mut open: Vec<Found> = vec![];
+    for &parameter in &asked {
+        open.extend(
+            reason(&parameter).map(|reason| undetermined(parameter, reason, PREDICTION, &first.geometry, scan)),
+        );
+    }
+    asked.retain(|p| reason(p).is_none());
     let mut pairs = if paired.is_empty() { None } else { Some(Consistency::new(scan, FINER * finest, &at)?) };
     let work = planned(&first, &widths, &asked, settings.curves)
         + pairs.as_ref().map_or(0.0, |p| planned_pairs(p, &paired, settings.curves));
@@ -199,7 +225,7 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
         levels.push(level);
     }
     let last = Search { level: &levels[levels.len() - 1], ..coarse };
-    let (mut found, mut fit) = settled(&last, last.refine(&asked, at, 4)?, scan)?;
+    let (mut found, mut fit) = settled(&last, last.refine(&asked, at, 4)?, scan, opposite.as_ref())?;
     let mut by_pairs = vec![];
     if pairs.is_some() {
         let made = Consistency::new(scan, FINER * finest, &fit.correction)?;
@@ -217,7 +243,7 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     let level = Level::new(scan, finest, FOLDS, &fit.correction)?;
     let fine = Search { level: &level, ..coarse };
     let before = fine.predict(&Correction::default())?.error;
-    let (again, fit) = settled(&fine, fine.refine(&fit.active, fit.correction, 4)?, scan)?;
+    let (again, fit) = settled(&fine, fine.refine(&fit.active, fit.correction, 4)?, scan, opposite.as_ref())?;
     found.retain(|f| again.iter().all(|a| a.parameter != f.parameter));
     found.extend(again);
     let (mut correction, mut after) = (fit.correction, fit.prediction.error);
@@ -228,6 +254,7 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
         pairs = Some(made);
     }
     found.extend(by_pairs);
+    found.extend(open);
     found.sort_by_key(|f| f.parameter);
     if settings.curves {
         let middle = Search { level: &levels[levels.len().saturating_sub(2)], ..coarse };
@@ -307,9 +334,7 @@ fn compare_pairs(
     let mut found: Vec<Found> = vec![];
     for &parameter in asked {
         if let Some(reason) = reason(&parameter) {
-            let evidence = Evidence { deviation: f64::INFINITY, sensitivity: 0.0, sure: false };
-            let unchanged = finding(parameter, 0.0, evidence, PAIRS, geometry, scan);
-            found.push(Found { reason: Some(reason), ..unchanged });
+            found.push(undetermined(parameter, reason, PAIRS, geometry, scan));
         }
     }
     let active: Vec<Parameter> = asked.iter().copied().filter(|p| reason(p).is_none()).collect();
@@ -363,14 +388,41 @@ fn settle<F>(
     }
 }
 
-/// The same for a fit to held-out views.
-fn settled(fine: &Search<'_>, fit: Fit, scan: &Scan) -> Result<(Vec<Found>, Fit)> {
+/// The same for a fit to held-out views. Shared rays judge the shift along u, if the sources are on a circle.
+fn settled(fine: &Search<'_>, fit: Fit, scan: &Scan, opposite: Option<&Opposite>) -> Result<(Vec<Found>, Fit)> {
     let geometry = &fine.level.geometry;
     let findings = |fit: &Fit| -> Vec<Found> {
-        let all = fit.active.iter().zip(fine.evidence(fit));
-        all.map(|(&p, evidence)| finding(p, fit.correction.get(p), evidence, PREDICTION, geometry, scan)).collect()
+        let of = |(&p, evidence): (&Parameter, Evidence)| {
+            let value = fit.correction.get(p);
+            match opposite {
+                Some(opposite) if p == Parameter::OffsetU => judged(value, evidence, opposite, fit, geometry, scan),
+                _ => finding(p, value, evidence, PREDICTION, geometry, scan),
+            }
+        };
+        fit.active.iter().zip(fine.evidence(fit)).map(of).collect()
     };
     settle(fit, findings, |fit, gone| fine.without(fit, gone))
+}
+
+/// A shift along u that held-out views prefer. What shared rays prefer instead is part of its uncertainty.
+fn judged(value: f64, evidence: Evidence, opposite: &Opposite, fit: &Fit, geometry: &Geometry, scan: &Scan) -> Found {
+    let parameter = Parameter::OffsetU;
+    let Some(opinion) = opposite.opinion(&fit.correction) else {
+        return undetermined(parameter, ARC_REASON, PREDICTION, geometry, scan);
+    };
+    let beyond = (opinion.change.abs() - opinion.deviation).max(0.0);
+    let evidence = Evidence { deviation: evidence.deviation.hypot(beyond), ..evidence };
+    let found = finding(parameter, value, evidence, PREDICTION, geometry, scan);
+    if found.verdict == Verdict::Corrected && !opinion.better {
+        return undetermined(parameter, OPPOSITE_REASON, PREDICTION, geometry, scan);
+    }
+    found
+}
+
+/// The result for a parameter that the views do not determine.
+fn undetermined(parameter: Parameter, reason: &'static str, limits: Limits, geometry: &Geometry, scan: &Scan) -> Found {
+    let evidence = Evidence { deviation: f64::INFINITY, sensitivity: 0.0, sure: false };
+    Found { reason: Some(reason), ..finding(parameter, 0.0, evidence, limits, geometry, scan) }
 }
 
 /// Limits of a criterion: the least sensitivity, and the part of every deviation in pixels.
