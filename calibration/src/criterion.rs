@@ -41,6 +41,8 @@ pub(crate) struct Level {
     top: f64,
     /// Root mean square difference of adjacent columns in the held-out views.
     pub slope: f64,
+    /// Whether the object reaches the first or last columns.
+    pub cut: bool,
 }
 
 /// One split into training views and held-out views.
@@ -90,7 +92,8 @@ impl Level {
         let given = binned.geometry.views.clone();
         let views = known.views(&given);
         let seen = Scan { geometry: Geometry { views, ..binned.geometry.clone() }, ..binned };
-        let grid = grid(&seen, width);
+        let cut = cut(&seen, 2);
+        let grid = grid(&seen, width, cut);
         let magnification = setup(&seen.geometry).magnification;
         let (geometry, binned) = (Geometry { views: given, volume: grid, ..seen.geometry.clone() }, seen);
         let binned = Scan { geometry: geometry.clone(), ..binned };
@@ -111,7 +114,7 @@ impl Level {
             return Err(Error::invalid("scan", "projections", "no positive line integral", expected));
         }
         let slope = all().map(slope).sum::<f64>() / folds.len() as f64;
-        Ok(Self { geometry, bin, folds, magnification, top: top.into(), slope })
+        Ok(Self { geometry, bin, folds, magnification, top: top.into(), slope, cut })
     }
 
     /// Approximate work of a prediction, to compare levels.
@@ -220,22 +223,13 @@ pub(crate) fn spread(scan: Scan) -> Result<Scan> {
 
 /// Voxels as fine as the pixels, in the volume of the scan. If the object extends beyond the detector or the volume,
 /// the box is larger than the volume.
-fn grid(scan: &Scan, width: usize) -> VoxelGrid {
+fn grid(scan: &Scan, width: usize, wide: bool) -> VoxelGrid {
     let asked = scan.geometry.volume;
     let mut size = asked.size();
-    let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
-    let (_, rows, columns) = scan.projections.dim();
-    let cut = |axis: usize, last: usize| {
-        let side = |i: usize| {
-            let line = scan.projections.index_axis(ndarray::Axis(axis), i);
-            line.iter().filter(|x| **x > AIR * top).count() as f64 > 0.02 * line.len() as f64
-        };
-        side(0) || side(last)
-    };
-    if cut(2, columns - 1) {
+    if wide {
         size = [size[0] * GROWTH, size[1] * GROWTH, size[2]];
     }
-    if cut(1, rows - 1) {
+    if cut(scan, 1) {
         size[2] *= GROWTH;
     }
     for _ in 0..GROWN {
@@ -249,6 +243,16 @@ fn grid(scan: &Scan, width: usize) -> VoxelGrid {
     let most = (1.5 * width as f64) as usize;
     let n = if voxel > 0.0 { ((longest / voxel).ceil() as usize).clamp(8, most.max(8)) } else { width };
     VoxelGrid { spacing: per(size, asked.shape), ..asked }.with_longest(n)
+}
+
+/// Whether the object reaches the first or last line of the views along `axis`: 1 for rows, 2 for columns.
+fn cut(scan: &Scan, axis: usize) -> bool {
+    let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
+    let last = scan.projections.len_of(ndarray::Axis(axis)) - 1;
+    [0, last].into_iter().any(|i| {
+        let line = scan.projections.index_axis(ndarray::Axis(axis), i);
+        line.iter().filter(|x| **x > AIR * top).count() as f64 > 0.02 * line.len() as f64
+    })
 }
 
 fn per(size: Vec3, shape: [usize; 3]) -> Vec3 {

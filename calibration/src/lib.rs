@@ -59,6 +59,8 @@ const FLAT_PAIRS: f64 = 0.01;
 /// shift, so it is part of every deviation. For pairs of views, the sampling of the object by pixels has the same
 /// effect.
 const INEXACT: f64 = 0.02;
+/// The same if the object is cut off at the sides, also on a half-fan scan: the reconstruction is wrong there.
+const INEXACT_CUT: f64 = 0.1;
 const INEXACT_PAIRS: f64 = 0.1;
 /// Pairs of views are compared on pixels finer by this factor, at little cost; the largest number of Newton's steps.
 const FINER: usize = 2;
@@ -388,35 +390,41 @@ fn settle<F>(
     }
 }
 
-/// The same for a fit to held-out views. Shared rays judge the shift along u, if the sources are on a circle.
+/// The same for a fit to held-out views. Shared rays judge the result, if the sources are on a circle.
 fn settled(fine: &Search<'_>, fit: Fit, scan: &Scan, opposite: Option<&Opposite>) -> Result<(Vec<Found>, Fit)> {
     let geometry = &fine.level.geometry;
+    let limits = if fine.level.cut { Limits { inexact: INEXACT_CUT, ..PREDICTION } } else { PREDICTION };
     let findings = |fit: &Fit| -> Vec<Found> {
-        let of = |(&p, evidence): (&Parameter, Evidence)| {
-            let value = fit.correction.get(p);
-            match opposite {
-                Some(opposite) if p == Parameter::OffsetU => judged(value, evidence, opposite, fit, geometry, scan),
-                _ => finding(p, value, evidence, PREDICTION, geometry, scan),
-            }
+        let of = |(&p, evidence): (&Parameter, Evidence)| match opposite {
+            Some(opposite) => judged(p, evidence, limits, opposite, fit, geometry, scan),
+            None => finding(p, fit.correction.get(p), evidence, limits, geometry, scan),
         };
         fit.active.iter().zip(fine.evidence(fit)).map(of).collect()
     };
     settle(fit, findings, |fit, gone| fine.without(fit, gone))
 }
 
-/// A shift along u that held-out views prefer. What shared rays prefer instead is part of its uncertainty.
-fn judged(value: f64, evidence: Evidence, opposite: &Opposite, fit: &Fit, geometry: &Geometry, scan: &Scan) -> Found {
-    let parameter = Parameter::OffsetU;
-    let Some(opinion) = opposite.opinion(&fit.correction) else {
-        return undetermined(parameter, ARC_REASON, PREDICTION, geometry, scan);
-    };
-    let beyond = (opinion.change.abs() - opinion.deviation).max(0.0);
+/// The value of `parameter` that held-out views prefer. What shared rays prefer instead is part of its uncertainty. Every
+/// such ray shows a shift along u, so they must agree better with the shift.
+fn judged(
+    parameter: Parameter,
+    evidence: Evidence,
+    limits: Limits,
+    opposite: &Opposite,
+    fit: &Fit,
+    geometry: &Geometry,
+    scan: &Scan,
+) -> Found {
+    let opinion = opposite.opinion(&fit.correction, parameter);
+    let beyond = opinion.map_or(0.0, |o| (o.change.abs() - o.deviation).max(0.0));
     let evidence = Evidence { deviation: evidence.deviation.hypot(beyond), ..evidence };
-    let found = finding(parameter, value, evidence, PREDICTION, geometry, scan);
-    if found.verdict == Verdict::Corrected && !opinion.better {
-        return undetermined(parameter, OPPOSITE_REASON, PREDICTION, geometry, scan);
+    let found = finding(parameter, fit.correction.get(parameter), evidence, limits, geometry, scan);
+    let shift = parameter == Parameter::OffsetU && found.verdict == Verdict::Corrected;
+    match opinion {
+        None if shift => undetermined(parameter, ARC_REASON, limits, geometry, scan),
+        Some(o) if shift && !o.better => undetermined(parameter, OPPOSITE_REASON, limits, geometry, scan),
+        _ => found,
     }
-    found
 }
 
 /// The result for a parameter that the views do not determine.

@@ -22,14 +22,14 @@ pub(crate) struct Opposite {
     pairs: Vec<[usize; 2]>,
 }
 
-/// What shared rays say of a shift of the detector along u.
+/// What shared rays say of a parameter.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Opinion {
-    /// The shift that they prefer, from the corrected one, in mm.
+    /// The change that they prefer, from the corrected value, as in a [`Correction`].
     pub change: f64,
     /// Its standard deviation.
     pub deviation: f64,
-    /// Whether they agree better with the corrected shift than with none, by more than chance.
+    /// Whether they agree better with the corrected value than with the original one, by more than chance.
     pub better: bool,
 }
 
@@ -74,13 +74,13 @@ impl Opposite {
         self.differences(&Correction::default()).iter().flatten().count() >= FEWEST
     }
 
-    /// What the shared rays say of the shift along u of `correction`; `None` if there are too few.
-    pub fn opinion(&self, correction: &Correction) -> Option<Opinion> {
-        let pixel = Parameter::OffsetU.pixel(&self.scan.geometry);
-        let at = correction.get(Parameter::OffsetU);
-        let moved = |by: f64| self.differences(&correction.with(Parameter::OffsetU, at + by * pixel));
+    /// What the shared rays say of `parameter` in `correction`; `None` if there are too few, or none depends on it.
+    pub fn opinion(&self, correction: &Correction, parameter: Parameter) -> Option<Opinion> {
+        let pixel = parameter.pixel(&self.scan.geometry);
+        let at = correction.get(parameter);
+        let moved = |by: f64| self.differences(&correction.with(parameter, at + by * pixel));
         let [here, up, down] = [0.0, STEP, -STEP].map(moved);
-        let none = self.differences(&correction.with(Parameter::OffsetU, 0.0));
+        let none = self.differences(&correction.with(parameter, 0.0));
         // A step of Gauss-Newton, with the contributions of each view for its scatter.
         let views = self.scan.geometry.views.len();
         let (mut steep, mut count) = (0.0, 0usize);
@@ -167,13 +167,16 @@ mod tests {
         for (shift, said) in [(0.0, 0.0), (1.2, 0.0), (-0.5, 0.3), (18.0, 18.0), (18.0, 17.0)] {
             let opposite = Opposite::of(scan(360.0, shift, said));
             assert!(opposite.enough());
-            let none = opposite.opinion(&Correction::default()).unwrap();
+            let none = opposite.opinion(&Correction::default(), Parameter::OffsetU).unwrap();
             let truth = shift - said;
             assert!((none.change - truth).abs() < 3.0 * none.deviation + 0.1, "{shift}, {said}: {none:?}");
-            let right = opposite.opinion(&Correction::default().with(Parameter::OffsetU, truth)).unwrap();
+            let right =
+                opposite.opinion(&Correction::default().with(Parameter::OffsetU, truth), Parameter::OffsetU).unwrap();
             assert!(right.change.abs() < 3.0 * right.deviation + 0.03, "{shift}, {said}: {right:?}");
             assert_eq!(right.better, truth != 0.0, "{shift}, {said}: {right:?}");
-            let wrong = opposite.opinion(&Correction::default().with(Parameter::OffsetU, truth - 3.0)).unwrap();
+            let wrong = opposite
+                .opinion(&Correction::default().with(Parameter::OffsetU, truth - 3.0), Parameter::OffsetU)
+                .unwrap();
             assert!(!wrong.better, "{shift}, {said}: {wrong:?}");
         }
     }
