@@ -12,7 +12,7 @@
 //! `k = d·e₂/d·e₁`, and `R(k) = Σ g·|det|/(|d|·(d·e₁)²)·δ'(k(pixel) − k)`. The derivative of a Gaussian of the same
 //! width for both views replaces `δ'`. So there is no interpolation, and equal values stay equal.
 
-use crate::criterion::spread;
+use crate::criterion::{bin, spread};
 use crate::parameters::{Correction, Parameter};
 use conefield_core::geometry::{Geometry, Vec3, View, cross, dot, norm, sub};
 use conefield_core::scan::{Scan, Unit};
@@ -89,9 +89,7 @@ impl Consistency {
     /// Prepares `scan` with about `width` pixels along the longer side of the detector. Uses the planes that are
     /// complete in the geometry corrected by `known`.
     pub fn new(scan: &Scan, width: usize, known: &Correction) -> Result<Self> {
-        let [rows, columns] = scan.geometry.detector;
-        let bin = rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1));
-        let binned = Scan { unit: Unit::default(), ..spread(scan.binned(bin))? };
+        let binned = Scan { unit: Unit::default(), ..spread(scan.binned(bin(scan, width)))? };
         let p = &binned.projections;
         let top = p.iter().copied().fold(0.0f32, f32::max);
         if top <= 0.0 {

@@ -179,7 +179,10 @@ impl Level {
 /// The side of a level's pixels, in pixels of the scan.
 pub(crate) fn bin(scan: &Scan, width: usize) -> usize {
     let [rows, columns] = scan.geometry.detector;
-    rows.max(columns).div_ceil(width).clamp(1, (rows.min(columns) / 4).max(1))
+    let (shorter, longer) = (rows.min(columns), rows.max(columns));
+    // Some rows remain, unless there are hardly any.
+    let most = if shorter < 8 { longer } else { shorter } / 4;
+    longer.div_ceil(width).clamp(1, most.max(1))
 }
 
 impl Level {

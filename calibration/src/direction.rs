@@ -4,7 +4,7 @@
 //! With parallel rays, views in the wrong direction are exactly those of the mirrored object. The wider the cone, the
 //! less any object explains them. Reversed columns have the same effect.
 
-use crate::criterion::spread;
+use crate::criterion::{bin, spread};
 use crate::{COARSEST, Correction, Parameter, Settings, Watch, calibrate, on_a_circle};
 use conefield_core::backend::Backend;
 use conefield_core::error::Result;
@@ -48,9 +48,7 @@ pub fn directions(scan: &Scan, backend: &dyn Backend, watch: &dyn Watch) -> Resu
     if !on_a_circle(&scan.geometry.views) {
         return Ok(None);
     }
-    let [rows, columns] = scan.geometry.detector;
-    let bin = rows.max(columns).div_ceil(2 * COARSEST).clamp(1, (rows.min(columns) / 4).max(1));
-    let coarse = spread(scan.binned(bin))?;
+    let coarse = spread(scan.binned(bin(scan, 2 * COARSEST)))?;
     // Only a shift along u has another sign in the other direction. Other errors of the geometry affect both alike.
     let settings = Settings { parameters: vec![Parameter::OffsetU], width: COARSEST, curves: false };
     let error = |scan: &Scan, from: f64| -> Result<f64> {

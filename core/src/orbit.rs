@@ -88,6 +88,8 @@ pub struct Arcs {
     pub order: Vec<usize>,
     /// Start and length of each arc, rad; empty if no gap interrupts the whole turn.
     pub arcs: Vec<[f64; 2]>,
+    /// Views that are no further apart than this are at one angle, rad.
+    pub same: f64,
 }
 
 /// Gaps end arcs if they exceed the mean of the others by this factor: one gap, and several. The mean is weighted by
@@ -138,7 +140,7 @@ impl Arcs {
         });
         let mut arcs: Vec<[f64; 2]> = arcs.collect();
         arcs.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        Self { angles, steps, order, arcs }
+        Self { angles, steps, order, arcs, same }
     }
 
     /// Whether the views cover the whole turn.

@@ -44,11 +44,23 @@ impl ScanHeader {
         self.volume.iter().fold(1, |n, &k| n.saturating_mul(k as u64))
     }
 
+    /// The header after binning by `size` ([`Scan::binned`]).
+    pub fn binned(&self, size: usize) -> Self {
+        let block = block(self.detector, size);
+        Self { detector: [0, 1].map(|k| self.detector[k] / block[k]), ..*self }
+    }
+
     /// Number of samples along the rays of all pixels at a distance of one voxel of the longest side.
     pub fn samples(&self) -> f64 {
         let longest = self.volume.into_iter().max().unwrap_or(0);
         self.pixels() as f64 * longest as f64
     }
+}
+
+/// Rows and columns of a block of `size`: no more than the detector has, so that one of few rows is binned along its
+/// columns.
+fn block(detector: [usize; 2], size: usize) -> [usize; 2] {
+    detector.map(|n| size.min(n))
 }
 
 /// Measured line integrals `A = -ln(I/I0)` with their geometry.
@@ -126,22 +138,25 @@ impl Scan {
         Ok((self.select(&keep), self.select(&out)))
     }
 
-    /// The scan averaged over blocks of `size` × `size` pixels; rows and columns at the end that fill no block are
-    /// dropped. `size` is at least 1 and at most the detector's shorter side.
+    /// The scan averaged over blocks of `size` × `size` pixels, or as many as the detector has along an axis; rows and
+    /// columns at the end that fill no block are dropped. `size` is at least 1.
     pub fn binned(&self, size: usize) -> Scan {
         let g = &self.geometry;
-        let detector = g.detector.map(|n| n / size);
-        let larger = |a: Vec3| a.map(|x| x * size as f64);
+        let [tall, wide] = block(g.detector, size);
+        let detector = self.header().binned(size).detector;
+        let larger = |a: Vec3, by: usize| a.map(|x| x * by as f64);
         let binned = |w: &View| {
-            let [row, column] = detector.map(|n| (n * size) as f64 / 2.0 - 0.5);
-            View { source: w.source, detector: w.pixel(g.detector, row, column), u: larger(w.u), v: larger(w.v) }
+            let row = (detector[0] * tall) as f64 / 2.0 - 0.5;
+            let column = (detector[1] * wide) as f64 / 2.0 - 0.5;
+            let middle = w.pixel(g.detector, row, column);
+            View { source: w.source, detector: middle, u: larger(w.u, wide), v: larger(w.v, tall) }
         };
         let views: Vec<View> = g.views.iter().map(binned).collect();
         let mut projections = Array3::zeros((views.len(), detector[0], detector[1]));
         Zip::indexed(&mut projections).par_for_each(|(view, row, column), mean| {
-            let (row, column) = (row * size, column * size);
-            let block = self.projections.slice(s![view, row..row + size, column..column + size]);
-            *mean = block.sum() / (size * size) as f32;
+            let (row, column) = (row * tall, column * wide);
+            let block = self.projections.slice(s![view, row..row + tall, column..column + wide]);
+            *mean = block.sum() / (tall * wide) as f32;
         });
         let geometry = Geometry { detector, views, volume: g.volume };
         Scan { geometry, projections, unit: self.unit.clone(), provenance: self.provenance.clone() }

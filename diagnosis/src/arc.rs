@@ -1,14 +1,12 @@
 //! Angular positions of the views: the arc, its gaps, and angles in degrees that were read as radians.
 
 use conefield_core::geometry::View;
+use conefield_core::orbit::Arcs;
 use serde::Serialize;
 use std::f64::consts::TAU;
 
 /// A gap this wide, in degrees, is the open part of a short scan.
 const OPENING: f64 = 60.0;
-
-/// Gaps below this share of their mean, weighted by their width, lie between views at one angle.
-const SAME: f64 = 0.01;
 
 /// The views' directions from the axis, in degrees.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -44,8 +42,8 @@ pub(crate) fn scan_arc(views: &[View]) -> ScanArc {
         })
         .collect();
     // Further turns repeat angles: they leave no gaps.
-    let [sum, squares] = gaps.iter().fold([0.0, 0.0], |[s, q], g| [s + g[0], q + g[0] * g[0]]);
-    gaps.retain(|g| g[0] * sum > SAME * squares);
+    let same = Arcs::of(&turns).same.to_degrees();
+    gaps.retain(|g| g[0] > same);
     gaps.sort_unstable_by(|a, b| b[0].total_cmp(&a[0]));
     let wide = |i: usize| gaps.get(i).map_or(0.0, |g| g[0]);
     // The views of a short scan are close to each other, or too few to decide.
@@ -90,4 +88,26 @@ fn steps_of_degrees(turns: &[f64]) -> bool {
     let candidates = [step, TAU - step].into_iter().flat_map(|s| (0..120).map(move |k| s + TAU * f64::from(k)));
     let whole = |total: f64| [180.0, 360.0, 720.0].iter().any(|w| (total / w - 1.0).abs() < 2e-4);
     candidates.into_iter().any(|s| whole(s * n as f64) || whole(s * (n - 1) as f64))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_core::geometry::{Millimetres, Radians};
+
+    fn arc(degrees: f64, n: usize) -> ScanArc {
+        let mm = Millimetres;
+        let angle = |i: usize| Radians((20.0 + degrees * i as f64 / n as f64).to_radians());
+        let view = |i| View::circular(angle(i), mm(100.0), mm(150.0), [mm(1.0); 2], [mm(0.0); 2]);
+        scan_arc(&(0..n).map(view).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn arcs_and_gaps_do_not_depend_on_the_number_of_turns() {
+        for (degrees, n, covered) in [(90.0, 180, 90.0), (203.0, 58, 203.0), (360.0, 50, 360.0), (1440.0, 720, 360.0)] {
+            let found = arc(degrees, n);
+            assert!((found.covered_deg - covered).abs() < 1e-6, "{degrees}: {found:?}");
+            assert!(found.largest_gap_deg < 1.01 * found.mean_gap_deg, "{degrees}: {found:?}");
+        }
+    }
 }

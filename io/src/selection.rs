@@ -148,8 +148,8 @@ pub struct Selection {
     pub rows: Option<Lines>,
     /// The columns; all if `None`.
     pub columns: Option<Lines>,
-    /// Side of a new pixel in the remaining old ones; 0 and 1 change nothing. Lines at the end that fill no pixel are
-    /// dropped.
+    /// Side of a new pixel in the remaining old ones; 0 and 1 change nothing. A detector with fewer rows than that is
+    /// binned along its columns. Lines at the end that fill no pixel are dropped.
     pub bin: usize,
 }
 
@@ -178,14 +178,9 @@ impl Selection {
             return Ok(scan);
         }
         let [rows, columns] = scan.geometry.detector;
-        let most = rows.min(columns);
-        ensure(
-            self.bin <= most,
-            "command line",
-            "--bin",
-            self.bin,
-            format!("at most {most}, the detector's shorter side"),
-        )?;
+        let most = rows.max(columns);
+        let room = format!("at most {most}, the detector's longer side");
+        ensure(self.bin <= most, "command line", "--bin", self.bin, room)?;
         if mean == Mean::LineIntegrals {
             return Ok(scan.binned(self.bin));
         }

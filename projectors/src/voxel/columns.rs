@@ -22,6 +22,8 @@ const PLANES: usize = 8;
 const TILE: usize = 4;
 /// Most rows per voxel for [`Adjoint::gather`]; with more, [`Adjoint::scatter`] is used.
 const TAPS: usize = 8;
+/// With fewer rows, vectors of rows stay nearly empty.
+const FEWEST: usize = 5;
 /// Largest slant of a column: change in lines per rise along z.
 const SLANT: f64 = 0.5;
 
@@ -49,11 +51,14 @@ pub struct Column {
     length: [f64; 3],
 }
 
-/// The columns of a view, if this module can project it: no ray has z as its main axis, and columns run along z rather
-/// than across.
+/// The columns of a view, if this module can project it: it has some rows, no ray has z as its main axis, and columns run
+/// along z rather than across.
 pub fn of(geometry: &Geometry, view: usize) -> Option<Vec<Column>> {
     let (w, grid) = (&geometry.views[view], &geometry.volume);
     let [rows, columns] = geometry.detector;
+    if rows < FEWEST {
+        return None;
+    }
     let downwards = w.v[2] < 0.0;
     let v = if downwards { w.v.map(|x| -x) } else { w.v };
     let lowest = if downwards { rows as f64 - 1.0 } else { 0.0 };

@@ -254,11 +254,6 @@ struct GaussianPlan {
     outline: Outline,
 }
 
-/// The scan header after binning.
-fn binned(header: &ScanHeader, bin: usize) -> ScanHeader {
-    ScanHeader { detector: header.detector.map(|n| n / bin), ..*header }
-}
-
 impl Plan for GaussianPlan {
     fn outline(&self) -> Outline {
         self.outline.clone()
@@ -266,7 +261,7 @@ impl Plan for GaussianPlan {
 
     fn needs(&self, scan: &ScanHeader) -> Needs {
         let n = self.pipeline.layout().len() as u64;
-        let seen = binned(scan, self.bin);
+        let seen = scan.binned(self.bin);
         let bins = if self.bin > 1 { 4 * seen.pixels() } else { 0 };
         let begun = first().needs(scan).working + self.start.bytes(scan.voxels());
         let training = ViewTraining::bytes(&seen, self.most as u64);
@@ -303,8 +298,8 @@ impl Plan for GaussianPlan {
         let Fitted { scene, found, .. } = fit(job.scan, &self.scene, &mut pipeline)?;
         found.iter().for_each(|line| observer.note(line));
         let [rows, columns] = job.scan.geometry.detector;
-        let room = format!("1 to {}, the detector's shorter side", rows.min(columns));
-        ensure(self.bin <= rows.min(columns), "spec", "bin", self.bin, room)?;
+        let room = format!("1 to {}, the detector's longer side", rows.max(columns));
+        ensure(self.bin <= rows.max(columns), "spec", "bin", self.bin, room)?;
         let within = Within::of(job, self.scene.surround, observer)?;
         let job = &Within::job(within.as_ref(), job);
         let widths = [NARROWEST * scene.voxel_mm() / scene.side, WIDEST];

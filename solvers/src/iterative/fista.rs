@@ -161,11 +161,6 @@ struct Built {
 }
 
 impl Built {
-    /// The scan header after binning of its detector.
-    fn binned(&self, header: ScanHeader) -> ScanHeader {
-        ScanHeader { detector: header.detector.map(|n| n / self.bin), ..header }
-    }
-
     /// The basis on voxels of any size; `None` if it refuses the grid.
     fn expansion(&self, volume: [usize; 3]) -> Option<(Box<dyn Expansion>, VoxelGrid)> {
         let grid = VoxelGrid { shape: volume, spacing: [1.0; 3], center: [0.0; 3] };
@@ -191,14 +186,9 @@ impl Iterative for Built {
         let stages = [self.data.describe(), self.prior.describe(), self.basis.describe()].join("; ");
         let voxels = job.scan.geometry.volume;
         let expansion = self.basis.on(&voxels).map_err(|e| e.within("basis"))?;
-        let shortest = job.scan.geometry.detector[0].min(job.scan.geometry.detector[1]);
-        ensure(
-            self.bin <= shortest,
-            "spec",
-            "bin",
-            self.bin,
-            format!("at most {shortest}, the detector's shorter side"),
-        )?;
+        let longest = job.scan.geometry.detector[0].max(job.scan.geometry.detector[1]);
+        let room = format!("at most {longest}, the detector's longer side");
+        ensure(self.bin <= longest, "spec", "bin", self.bin, room)?;
         let grid = projected(expansion.as_ref(), voxels);
         let opened = self.shared.open_on(grid, self.bin, &format!("{}; {stages}", self.describe()), job, observer)?;
         let job = &opened.job(job);
@@ -209,7 +199,7 @@ impl Iterative for Built {
             observer.note(&format!("{air:.0} % of the pixels are air (views binned by {})", self.bin));
         }
         let data = self.data.of(problem.scan.projections.view()).map_err(|e| e.within("data"))?;
-        let space = Space::new(self.binned(job.scan.header()));
+        let space = Space::new(job.scan.header().binned(self.bin));
         let start = self.shared.known(job, &space)?;
         let mut arrays = Arrays::new(self, expansion, &voxels, &space, start)?;
         arrays.begin(&problem);
@@ -238,11 +228,11 @@ impl Iterative for Built {
 
     fn seen(&self, header: &ScanHeader) -> ScanHeader {
         let volume = self.expansion(header.volume).map_or(header.volume, |(e, grid)| projected(e.as_ref(), grid).shape);
-        ScanHeader { volume, ..self.binned(*header) }
+        ScanHeader { volume, ..header.binned(self.bin) }
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
-        let header = &self.binned(*header);
+        let header = &header.binned(self.bin);
         let space = Space::tally(*header);
         if self.air {
             space.hold(Problem::air_bytes(header));
