@@ -32,7 +32,7 @@ def on_files(files, config):
 
 
 def find_program():
-    built = [ROOT / "target" / kind / "conefield" for kind in ("debug", "release")]
+    built = [ROOT / "target" / "release" / "conefield"]
     named = [Path(os.environ["CONEFIELD"])] if "CONEFIELD" in os.environ else []
     for path in named or built:
         if path.is_file():

@@ -353,7 +353,16 @@ mod tests {
         two.projections.indexed_iter_mut().for_each(|((_, _, c), x)| *x = if c % 2 == 0 { 0.0 } else { 10.0 });
         let light = bin.take(two, Mean::Light).unwrap().projections[[0, 0, 0]];
         assert!((light - 2f32.ln()).abs() < 1e-3, "{light}");
-        let too_large = Selection { bin: 7, ..Selection::default() }.of(whole).unwrap_err().to_string();
-        assert!(too_large.contains("--bin") && too_large.contains("at most 6"), "{too_large}");
+        // A detector with fewer rows is binned along its columns.
+        let mut one = whole.clone();
+        one.geometry.detector[0] = 1;
+        one.projections = whole.projections.slice(ndarray::s![.., ..1, ..]).to_owned();
+        let binned = bin.of(one.clone()).unwrap();
+        assert_eq!(binned.geometry.detector, [1, one.geometry.detector[1] / 2]);
+        let mean = 0.5 * (one.projections[[0, 0, 0]] + one.projections[[0, 0, 1]]);
+        assert!((binned.projections[[0, 0, 0]] - mean).abs() < 1e-6);
+        assert_eq!(binned.geometry.views[0].v, one.geometry.views[0].v);
+        let too_large = Selection { bin: 99, ..Selection::default() }.of(whole).unwrap_err().to_string();
+        assert!(too_large.contains("--bin") && too_large.contains("the detector's longer side"), "{too_large}");
     }
 }

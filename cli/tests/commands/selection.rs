@@ -68,7 +68,7 @@ fn import_and_convert_take_the_same_part() {
         (["--views", "1,1"], ["--views", "repeats view 1"]),
         (["--rows", "4:20"], ["--rows", "the 10"]),
         (["--columns", "5:5"], ["--columns", "at least one"]),
-        (["--bin", "11"], ["--bin", "at most 10"]),
+        (["--bin", "99"], ["--bin", "the detector's longer side"]),
     ] {
         for command in [vec!["import", &scanner, "-o"], vec!["convert", &whole]] {
             let said = refused(1, &[&command[..], &[&text(&at("none"))], &options].concat());
