@@ -404,8 +404,8 @@ fn settled(fine: &Search<'_>, fit: Fit, scan: &Scan, opposite: Option<&Opposite>
     settle(fit, findings, |fit, gone| fine.without(fit, gone))
 }
 
-/// The value of `parameter` that held-out views prefer. What shared rays prefer instead is part of its uncertainty. Every
-/// such ray shows a shift along u, so they must agree better with the shift.
+/// The value of `parameter` that held-out views prefer. What shared rays prefer instead is part of its uncertainty. They
+/// must agree better with a shift along u, which every such ray shows, and with every change if the object is cut off.
 fn judged(
     parameter: Parameter,
     evidence: Evidence,
@@ -415,16 +415,17 @@ fn judged(
     geometry: &Geometry,
     scan: &Scan,
 ) -> Found {
-    let opinion = opposite.opinion(&fit.correction, parameter);
-    let beyond = opinion.map_or(0.0, |o| (o.change.abs() - o.deviation).max(0.0));
+    let Some(opinion) = opposite.opinion(&fit.correction, parameter) else {
+        return undetermined(parameter, ARC_REASON, limits, geometry, scan);
+    };
+    let beyond = (opinion.change.abs() - opinion.deviation).max(0.0);
     let evidence = Evidence { deviation: evidence.deviation.hypot(beyond), ..evidence };
     let found = finding(parameter, fit.correction.get(parameter), evidence, limits, geometry, scan);
-    let shift = parameter == Parameter::OffsetU && found.verdict == Verdict::Corrected;
-    match opinion {
-        None if shift => undetermined(parameter, ARC_REASON, limits, geometry, scan),
-        Some(o) if shift && !o.better => undetermined(parameter, OPPOSITE_REASON, limits, geometry, scan),
-        _ => found,
+    let asked = parameter == Parameter::OffsetU || limits.inexact > INEXACT;
+    if found.verdict == Verdict::Corrected && asked && !opinion.better {
+        return undetermined(parameter, OPPOSITE_REASON, limits, geometry, scan);
     }
+    found
 }
 
 /// The result for a parameter that the views do not determine.
