@@ -83,7 +83,7 @@ fn scan(kind: Kind, seed: u64) -> Scan {
     } else {
         bodies.push(body([within(-2.0, 2.0), within(-2.0, 2.0), 0.0], [size, within(0.7, 1.0) * size, 14.0], 0.02));
         for _ in 0..5 {
-            let (r, a) = (0.8 * size * within(0.0, 1.0), within(0.0, 6.28));
+            let (r, a) = (0.8 * size * within(0.0, 1.0), within(0.0, std::f64::consts::TAU));
             let axes = [0, 1, 2].map(|_| within(2.0, 6.0));
             bodies.push(body([r * a.cos(), r * a.sin(), within(-8.0, 8.0)], axes, within(-0.01, 0.02)));
         }
