@@ -58,9 +58,9 @@ impl ScanHeader {
 }
 
 /// Rows and columns of a block of `size`: no more than the detector has, so that one of few rows is binned along its
-/// columns.
+/// columns, and at least one.
 fn block(detector: [usize; 2], size: usize) -> [usize; 2] {
-    detector.map(|n| size.min(n))
+    detector.map(|n| size.min(n).max(1))
 }
 
 /// Measured line integrals `A = -ln(I/I0)` with their geometry.
@@ -228,5 +228,7 @@ mod tests {
             assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-9), "{a:?} {b:?}");
         }
         assert_eq!(scan.binned(1).projections, scan.projections);
+        let none = ScanHeader { views: 0, detector: [0; 2], volume: [4; 3] };
+        assert_eq!(none.binned(4), none);
     }
 }
