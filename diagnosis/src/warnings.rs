@@ -123,7 +123,8 @@ fn truncated(s: &Survey, warn: Warn) {
 }
 
 fn outside(s: &Survey, warn: Warn) {
-    if !s.outside.is_seen() || !s.check.complaints.is_empty() {
+    // A body that the detector cuts off has been warned of, with the same advice.
+    if !s.outside.is_seen() || s.truncation.views > 0.02 || !s.check.complaints.is_empty() {
         return;
     }
     let along: Vec<&str> = ["x", "y", "z"].into_iter().zip(s.outside.along).filter(|a| a.1).map(|a| a.0).collect();
