@@ -116,7 +116,7 @@ fn a_volume_of_some_slices_is_as_good_as_the_whole_one() {
     assert!(heard.said("as rays beside it are attenuated too"), "{:?}", heard.notes);
     let [without, with] = [without, with].map(|v| psnr(&v, &truth));
     println!("{without:.2} to {with:.2} dB, {whole:.2} dB in the whole volume");
-    assert!(with > whole - 1.0 && with > without + 6.0, "{without} to {with} dB, {whole} dB in the whole volume");
+    assert!(with > whole - 2.0 && with > without + 20.0, "{without} to {with} dB, {whole} dB in the whole volume");
 }
 
 #[test]

@@ -175,11 +175,7 @@ fn all() -> Vec<Named> {
         add(name, views(&turn, |_| shift), columns);
     }
     let (columns, shift) = reaching(6.0);
-    add(
-        "two turns, the detector moves across",
-        views(&[turn.clone(), turn.clone()].concat(), |i| if i < 180 { shift } else { -shift }),
-        columns,
-    );
+    add(views(&[turn.clone(), turn.clone()].concat(), |i| if i < 180 { shift } else { -shift }), columns);
     add("the detector moves across after half a turn", views(&turn, |i| if i < 90 { shift } else { -shift }), columns);
     add(
         "the detector moves across, two short arcs",
@@ -305,7 +301,6 @@ fn usual_geometries_are_right_without_warnings() {
         "there and back",
         "half of it denser",
         "golden angles",
-        "two turns, the detector moves across",
         "the detector wobbles",
         "rows upwards",
         "columns backwards",
