@@ -170,7 +170,11 @@ fn each_fault_gives_its_own_warning() {
     let tall = VoxelGrid { shape: [48, 48, 48], spacing: [1.2, 1.2, 1.5], center: [0.0; 3] };
     Setting { volume: tall, radius: 10.0, ..clean() }.warns(W::Coverage, &["72.0 mm", "height 50.0 mm", "smaller"]);
     let aside = VoxelGrid { center: [30.0, 0.0, 0.0], ..clean().volume };
-    Setting { volume: aside, ..clean() }.warns(W::Coverage, &["radius 49.8 mm"]);
+    Setting { volume: aside, radius: 10.0, at: [20.0, 0.0], ..clean() }.warns(W::Coverage, &["radius 49.8 mm"]);
+    assert_eq!(Setting { volume: aside, ..clean() }.kinds(), [W::Outside, W::Coverage]);
+    let few = VoxelGrid { shape: [48, 48, 4], ..clean().volume };
+    let slices = Setting { volume: few, ..clean() };
+    assert_eq!(slices.kinds(), [], "the object is no longer than the slices");
     Setting { offset: [0.0, 75.0], ..clean() }.warns(W::Offset, &["75.00 mm", "nearly", "5.00 mm"]);
     let off = Setting { offset: [0.0, 100.0], ..clean() };
     let warnings = survey(&off.scan()).warnings;
