@@ -175,7 +175,11 @@ fn all() -> Vec<Named> {
         add(name, views(&turn, |_| shift), columns);
     }
     let (columns, shift) = reaching(6.0);
-    add(views(&[turn.clone(), turn.clone()].concat(), |i| if i < 180 { shift } else { -shift }), columns);
+    add(
+        "two turns, the detector moves across",
+        views(&[turn.clone(), turn.clone()].concat(), |i| if i < 180 { shift } else { -shift }),
+        columns,
+    );
     add("the detector moves across after half a turn", views(&turn, |i| if i < 90 { shift } else { -shift }), columns);
     add(
         "the detector moves across, two short arcs",
