@@ -64,6 +64,12 @@ fn one_directory(counted: Option<usize>, stored: usize) -> impl Fn(&Path) + Sync
     }
 }
 
+/// A view of Varian's format, named in `args`.
+fn hnd(what: &'static str, args: &'static str) -> Case {
+    let make = |d: &Path| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0");
+    refused(what, make, args, &["a.hnd", "Varian's HND", "rtkprojections"])
+}
+
 pub fn cases() -> Vec<Case> {
     vec![
         refused("an empty file", changed(scanner_tiff, FILE, cut(0)), IMPORT, &["counts.tif"]),
@@ -213,29 +219,9 @@ pub fn cases() -> Vec<Case> {
             IMPORT,
             &["Proj_00001.hnd", "Varian's HND", "rtkprojections"],
         ),
-        refused(
-            "HND of Varian, asked about",
-            |d| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0"),
-            "info a.hnd",
-            &["a.hnd", "Varian's HND", "rtkprojections"],
-        ),
-        refused(
-            "HND of Varian in place of a description",
-            |d| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0"),
-            "import a.hnd -o scan",
-            &["a.hnd", "Varian's HND", "rtkprojections"],
-        ),
-        refused(
-            "HND of Varian in place of a volume",
-            |d| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0"),
-            "simulate a.hnd -o scan",
-            &["a.hnd", "Varian's HND", "rtkprojections"],
-        ),
-        refused(
-            "HND of Varian in place of a scan",
-            |d| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0"),
-            "reconstruct a.hnd --spec fdk -o run",
-            &["a.hnd", "Varian's HND", "rtkprojections"],
-        ),
+        hnd("HND of Varian, asked about", "info a.hnd"),
+        hnd("HND of Varian in place of a description", "import a.hnd -o scan"),
+        hnd("HND of Varian in place of a volume", "simulate a.hnd -o scan"),
+        hnd("HND of Varian in place of a scan", "reconstruct a.hnd --spec fdk -o run"),
     ]
 }
