@@ -30,9 +30,6 @@ enum Fault {
     MORE_RESOLUTIONS,
     NAN_RESOLUTION,
     NEGATIVE_RESOLUTION,
-    NO_HALVES,
-    NAN_HALVES,
-    WRONG_HALVES,
     BEFORE_GRADIENTS,
     WRONG_GRADIENT,
     WRONG_INPUT_GRADIENT,
@@ -94,7 +91,6 @@ static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
         .blocks = FAULT == TWIN_BLOCKS ? 3 : 1,
         .macs = 3,
         .grads = CONEFIELD_GRADS_DENSE,
-        .halves = FAULT == NO_HALVES || FAULT == NAN_HALVES || FAULT == WRONG_HALVES,
     };
     return CONEFIELD_OK;
 }
@@ -164,25 +160,6 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
     return CONEFIELD_OK;
 }
 
-/* Treats every parameter as 1, or returns NaN. */
-static ConefieldStatus forward_halves(const void *stage, uint32_t format, const uint16_t *params, struct ConefieldTile x,
-                                      struct ConefieldTileMut y, struct ConefieldTileMut tape,
-                                      struct ConefieldText *error) {
-    (void)format, (void)params;
-    static const float ones[] = {1.0f, 1.0f, 1.0f};
-    ConefieldStatus status = forward(stage, ones, x, y, tape, error);
-    if (FAULT == NAN_HALVES) y.data[0] = NAN;
-    return status;
-}
-
-static ConefieldStatus backward_halves(const void *stage, uint32_t format, const uint16_t *params, struct ConefieldTile x,
-                                       struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
-                                       struct ConefieldTileMut dx, struct ConefieldText *error) {
-    (void)format, (void)params;
-    static const float ones[] = {1.0f, 1.0f, 1.0f};
-    return backward(stage, ones, x, tape, dy, grads, dx, error);
-}
-
 /* Every channel resolves 8 cells. */
 static ConefieldStatus resolutions(const void *stage, double *cells, size_t count, struct ConefieldText *error) {
     (void)stage, (void)error;
@@ -215,8 +192,6 @@ static const struct ConefieldMap MAP = {
     .reduce = FAULT == REDUCES_NOTHING ? reduce : NULL,
     .passes = passes,
     .forward_pass = FAULT == NO_FORWARD_PASS ? NULL : forward_pass,
-    .forward_halves = FAULT == NO_HALVES ? NULL : forward_halves,
-    .backward_halves = backward_halves,
     .resolutions = resolutions,
 };
 

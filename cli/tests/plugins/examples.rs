@@ -99,9 +99,6 @@ fn the_planes_run_in_every_shipped_spec() {
     for spec in CHAINS {
         run(spec, spec, &[]);
     }
-    for tables in ["f16", "bf16"] {
-        run(tables, "balanced", &["training.rays=128", &format!("precision.tables={tables}")]);
-    }
     let weights = |run: &std::path::Path| {
         let weights = conefield_io::read_weights(run.join("weights.safetensors")).unwrap();
         weights.tensors.into_keys().filter(|name| name.starts_with("encoder.")).collect::<Vec<_>>()

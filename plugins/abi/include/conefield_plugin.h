@@ -1,4 +1,4 @@
-/* The contract between conefield and its plugins, version 2.2. Made from plugins/abi/src/lib.rs. */
+/* The contract between conefield and its plugins, version 3.0. Made from plugins/abi/src/lib.rs. */
 
 #ifndef CONEFIELD_PLUGIN_H
 #define CONEFIELD_PLUGIN_H
@@ -9,12 +9,12 @@
 /*
  Major version of this contract. Plugins with another one are refused.
  */
-#define CONEFIELD_ABI_MAJOR 2
+#define CONEFIELD_ABI_MAJOR 3
 
 /*
  Minor version: increases whenever tables grow.
  */
-#define CONEFIELD_ABI_MINOR 2
+#define CONEFIELD_ABI_MINOR 0
 
 /*
  Points to features.
@@ -52,22 +52,22 @@
 #define CONEFIELD_PRIOR 6
 
 /*
- Penalty of coefficients with its proximal map, for iterative methods. Since 2.2.
+ Penalty of coefficients with its proximal map, for iterative methods.
  */
 #define CONEFIELD_REGULARIZER 7
 
 /*
- Distance between computed and measured line integrals, for iterative methods. Since 2.2.
+ Distance between computed and measured line integrals, for iterative methods.
  */
 #define CONEFIELD_DATA_TERM 8
 
 /*
- Coefficients to voxels, for iterative methods. Since 2.2.
+ Coefficients to voxels, for iterative methods.
  */
 #define CONEFIELD_BASIS 9
 
 /*
- A field with line integrals of its own. Since 2.2.
+ A field with line integrals of its own.
  */
 #define CONEFIELD_LINE_FIELD 10
 
@@ -95,16 +95,6 @@
  Many parameters, few affected by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
  */
 #define CONEFIELD_GRADS_SCATTER 2
-
-/*
- Parameters are IEEE 754 `binary16`.
- */
-#define CONEFIELD_F16 0
-
-/*
- Parameters are `bfloat16`: the upper halves of floats.
- */
-#define CONEFIELD_BF16 1
 
 /*
  `reduce` removes output channels.
@@ -205,10 +195,6 @@ typedef struct ConefieldInfo {
    1 if it has double-precision kernels.
    */
   uint32_t double_precision;
-  /*
-   1 if it has kernels for half-precision parameters.
-   */
-  uint32_t halves;
 } ConefieldInfo;
 
 /*
@@ -523,40 +509,6 @@ typedef struct ConefieldMap {
                                   struct ConefieldTileMut tape,
                                   struct ConefieldText *error);
   /*
-   `forward` with 16-bit parameters in `format`, [`CONEFIELD_F16`] or [`CONEFIELD_BF16`]: the result of `forward`
-   for the same values. Used if a spec sets half-precision tables. NULL if there is none.
-   */
-  ConefieldStatus (*forward_halves)(const void *stage,
-                                    uint32_t format,
-                                    const uint16_t *params,
-                                    struct ConefieldTile x,
-                                    struct ConefieldTileMut y,
-                                    struct ConefieldTileMut tape,
-                                    struct ConefieldText *error);
-  /*
-   `forward_pass` with 16-bit parameters, as `forward_halves`. NULL if `forward_pass` or `forward_halves` is NULL.
-   */
-  ConefieldStatus (*forward_pass_halves)(const void *stage,
-                                         uint32_t format,
-                                         size_t pass,
-                                         const uint16_t *params,
-                                         struct ConefieldTile x,
-                                         struct ConefieldTileMut y,
-                                         struct ConefieldTileMut tape,
-                                         struct ConefieldText *error);
-  /*
-   `backward` with 16-bit parameters, as `forward_halves`. Gradients are floats. NULL if `forward_halves` is NULL.
-   */
-  ConefieldStatus (*backward_halves)(const void *stage,
-                                     uint32_t format,
-                                     const uint16_t *params,
-                                     struct ConefieldTile x,
-                                     struct ConefieldTileMut tape,
-                                     struct ConefieldTile dy,
-                                     struct ConefieldGrads grads,
-                                     struct ConefieldTileMut dx,
-                                     struct ConefieldText *error);
-  /*
    For an encoder: writes the resolution of each of its `count` channels in cells along the unit cube's side,
    finite numbers above 0. Projectors may count in the finest cell, and channels finer than the data can be left
    out. Returns [`CONEFIELD_UNSUPPORTED`] if unknown. NULL: unknown.
@@ -566,8 +518,8 @@ typedef struct ConefieldMap {
                                  size_t count,
                                  struct ConefieldText *error);
   /*
-   For a line field, since 2.2: overwrites `out` with the line integrals of `count` rays, in cube sides; 0 for a
-   ray that misses the box. NULL otherwise.
+   For a line field: overwrites `out` with the line integrals of `count` rays, in cube sides; 0 for a ray that
+   misses the box. NULL otherwise.
    */
   ConefieldStatus (*project)(const void *stage,
                              const float *params,
@@ -742,19 +694,19 @@ typedef struct ConefieldInitializer {
                            uint8_t *filled,
                            struct ConefieldText *error);
   /*
-   Optional, since 2.1. Refuses parameters that do not fit, before a run begins.
+   Optional. Refuses parameters that do not fit, before a run begins.
    */
   ConefieldStatus (*check)(const void *stage,
                            const struct ConefieldBlock *blocks,
                            size_t block_count,
                            struct ConefieldText *error);
   /*
-   Optional, since 2.1. The weights file named by the settings; [`CONEFIELD_UNSUPPORTED`] if there is none. The
+   Optional. The weights file named by the settings; [`CONEFIELD_UNSUPPORTED`] if there is none. The
    host reads the file and continues with the stage that `with_weights` creates.
    */
   ConefieldStatus (*weights)(const void *stage, struct ConefieldStr *path);
   /*
-   Since 2.1, required together with `weights`. Creates a stage with these weights, which are valid during the
+   Required together with `weights`. Creates a stage with these weights, which are valid during the
    call.
    */
   ConefieldStatus (*with_weights)(const void *stage,
@@ -763,7 +715,7 @@ typedef struct ConefieldInitializer {
                                   void **out,
                                   struct ConefieldText *error);
   /*
-   Optional, since 2.1. The file of a known volume that the field learns in `steps` steps after weights are
+   Optional. The file of a known volume that the field learns in `steps` steps after weights are
    initialized; [`CONEFIELD_UNSUPPORTED`] if there is none.
    */
   ConefieldStatus (*volume)(const void *stage, struct ConefieldStr *path, uint64_t *steps);
@@ -1175,7 +1127,7 @@ typedef struct ConefieldStage {
    */
   const struct ConefieldPrior *prior;
   /*
-   Functions of a regularizer; otherwise NULL. Since 2.2, like the remaining fields.
+   Functions of a regularizer; otherwise NULL.
    */
   const struct ConefieldRegularizer *regularizer;
   /*

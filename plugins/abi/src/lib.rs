@@ -22,9 +22,9 @@
 use std::ffi::c_void;
 
 /// Major version of this contract. Plugins with another one are refused.
-pub const CONEFIELD_ABI_MAJOR: u32 = 2;
+pub const CONEFIELD_ABI_MAJOR: u32 = 3;
 /// Minor version: increases whenever tables grow.
-pub const CONEFIELD_ABI_MINOR: u32 = 2;
+pub const CONEFIELD_ABI_MINOR: u32 = 0;
 
 /// Return value of a function.
 pub type ConefieldStatus = i32;
@@ -53,13 +53,13 @@ pub const CONEFIELD_INITIALIZER: u32 = 4;
 pub const CONEFIELD_LOSS: u32 = 5;
 /// Penalizes the values of a field on small blocks of neighbouring points.
 pub const CONEFIELD_PRIOR: u32 = 6;
-/// Penalty of coefficients with its proximal map, for iterative methods. Since 2.2.
+/// Penalty of coefficients with its proximal map, for iterative methods.
 pub const CONEFIELD_REGULARIZER: u32 = 7;
-/// Distance between computed and measured line integrals, for iterative methods. Since 2.2.
+/// Distance between computed and measured line integrals, for iterative methods.
 pub const CONEFIELD_DATA_TERM: u32 = 8;
-/// Coefficients to voxels, for iterative methods. Since 2.2.
+/// Coefficients to voxels, for iterative methods.
 pub const CONEFIELD_BASIS: u32 = 9;
-/// A field with line integrals of its own. Since 2.2.
+/// A field with line integrals of its own.
 pub const CONEFIELD_LINE_FIELD: u32 = 10;
 
 /// A row depends on itself only.
@@ -73,11 +73,6 @@ pub const CONEFIELD_GRADS_NONE: u32 = 0;
 pub const CONEFIELD_GRADS_DENSE: u32 = 1;
 /// Many parameters, few affected by a row: workers own the ranges of `partition`. Such a stage keeps no tape.
 pub const CONEFIELD_GRADS_SCATTER: u32 = 2;
-
-/// Parameters are IEEE 754 `binary16`.
-pub const CONEFIELD_F16: u32 = 0;
-/// Parameters are `bfloat16`: the upper halves of floats.
-pub const CONEFIELD_BF16: u32 = 1;
 
 /// `reduce` removes output channels.
 pub const CONEFIELD_OUTPUTS: u32 = 0;
@@ -214,8 +209,6 @@ pub struct ConefieldInfo {
     pub coarse_to_fine: u32,
     /// 1 if it has double-precision kernels.
     pub double_precision: u32,
-    /// 1 if it has kernels for half-precision parameters.
-    pub halves: u32,
 }
 
 /// One named block of parameters. Blocks are consecutive and cover all parameters.
@@ -364,46 +357,6 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// `forward` with 16-bit parameters in `format`, [`CONEFIELD_F16`] or [`CONEFIELD_BF16`]: the result of `forward`
-    /// for the same values. Used if a spec sets half-precision tables. NULL if there is none.
-    pub forward_halves: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            format: u32,
-            params: *const u16,
-            x: ConefieldTile,
-            y: ConefieldTileMut,
-            tape: ConefieldTileMut,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// `forward_pass` with 16-bit parameters, as `forward_halves`. NULL if `forward_pass` or `forward_halves` is NULL.
-    pub forward_pass_halves: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            format: u32,
-            pass: usize,
-            params: *const u16,
-            x: ConefieldTile,
-            y: ConefieldTileMut,
-            tape: ConefieldTileMut,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// `backward` with 16-bit parameters, as `forward_halves`. Gradients are floats. NULL if `forward_halves` is NULL.
-    pub backward_halves: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            format: u32,
-            params: *const u16,
-            x: ConefieldTile,
-            tape: ConefieldTileMut,
-            dy: ConefieldTile,
-            grads: ConefieldGrads,
-            dx: ConefieldTileMut,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
     /// For an encoder: writes the resolution of each of its `count` channels in cells along the unit cube's side,
     /// finite numbers above 0. Projectors may count in the finest cell, and channels finer than the data can be left
     /// out. Returns [`CONEFIELD_UNSUPPORTED`] if unknown. NULL: unknown.
@@ -415,8 +368,8 @@ pub struct ConefieldMap {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// For a line field, since 2.2: overwrites `out` with the line integrals of `count` rays, in cube sides; 0 for a
-    /// ray that misses the box. NULL otherwise.
+    /// For a line field: overwrites `out` with the line integrals of `count` rays, in cube sides; 0 for a ray that
+    /// misses the box. NULL otherwise.
     pub project: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -588,7 +541,7 @@ pub struct ConefieldInitializer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Optional, since 2.1. Refuses parameters that do not fit, before a run begins.
+    /// Optional. Refuses parameters that do not fit, before a run begins.
     pub check: Option<
         unsafe extern "C" fn(
             stage: *const c_void,
@@ -597,10 +550,10 @@ pub struct ConefieldInitializer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Optional, since 2.1. The weights file named by the settings; [`CONEFIELD_UNSUPPORTED`] if there is none. The
+    /// Optional. The weights file named by the settings; [`CONEFIELD_UNSUPPORTED`] if there is none. The
     /// host reads the file and continues with the stage that `with_weights` creates.
     pub weights: Option<unsafe extern "C" fn(stage: *const c_void, path: *mut ConefieldStr) -> ConefieldStatus>,
-    /// Since 2.1, required together with `weights`. Creates a stage with these weights, which are valid during the
+    /// Required together with `weights`. Creates a stage with these weights, which are valid during the
     /// call.
     pub with_weights: Option<
         unsafe extern "C" fn(
@@ -611,7 +564,7 @@ pub struct ConefieldInitializer {
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
-    /// Optional, since 2.1. The file of a known volume that the field learns in `steps` steps after weights are
+    /// Optional. The file of a known volume that the field learns in `steps` steps after weights are
     /// initialized; [`CONEFIELD_UNSUPPORTED`] if there is none.
     pub volume:
         Option<unsafe extern "C" fn(stage: *const c_void, path: *mut ConefieldStr, steps: *mut u64) -> ConefieldStatus>,
@@ -971,7 +924,7 @@ pub struct ConefieldStage {
     pub loss: *const ConefieldLoss,
     /// Functions of a prior; otherwise NULL.
     pub prior: *const ConefieldPrior,
-    /// Functions of a regularizer; otherwise NULL. Since 2.2, like the remaining fields.
+    /// Functions of a regularizer; otherwise NULL.
     pub regularizer: *const ConefieldRegularizer,
     /// Functions of a data term; otherwise NULL.
     pub data_term: *const ConefieldDataTerm,

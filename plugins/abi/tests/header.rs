@@ -18,7 +18,7 @@ fn the_header_is_current() {
         style: cbindgen::Style::Both,
         documentation_style: cbindgen::DocumentationStyle::C,
         header: Some(
-            "/* The contract between conefield and its plugins, version 2.2. Made from plugins/abi/src/lib.rs. */"
+            "/* The contract between conefield and its plugins, version 3.0. Made from plugins/abi/src/lib.rs. */"
                 .into(),
         ),
         trailer: Some(
@@ -62,7 +62,7 @@ fn the_header_is_current() {
 #[test]
 #[cfg(target_pointer_width = "64")]
 fn the_layout_is_pinned() {
-    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (2, 2));
+    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (3, 0));
     let sizes = [
         size_of::<ConefieldStr>(),
         size_of::<ConefieldText>(),
@@ -93,7 +93,7 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldStage>(),
         size_of::<ConefieldPlugin>(),
     ];
-    let first = [16, 24, 32, 32, 24, 80, 32, 16, 40, 168, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32];
+    let first = [16, 24, 32, 32, 24, 80, 32, 16, 40, 144, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32];
     assert_eq!(sizes[..20], first);
     assert_eq!(sizes[20..], [72, 32, 64, 56, 88, 56, 152, 88]);
     let plugin = [
@@ -141,16 +141,13 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldMap, wgsl),
         offset_of!(ConefieldMap, passes),
         offset_of!(ConefieldMap, forward_pass),
-        offset_of!(ConefieldMap, forward_halves),
-        offset_of!(ConefieldMap, forward_pass_halves),
-        offset_of!(ConefieldMap, backward_halves),
         offset_of!(ConefieldMap, resolutions),
         offset_of!(ConefieldMap, project),
         offset_of!(ConefieldMap, backproject),
         offset_of!(ConefieldMap, project_f64),
         offset_of!(ConefieldMap, backproject_f64),
     ];
-    let at: Vec<usize> = (0..21).map(|i| 8 * i).collect();
+    let at: Vec<usize> = (0..18).map(|i| 8 * i).collect();
     assert_eq!(map[..], at);
     let projector = [
         offset_of!(ConefieldProjector, size),
@@ -175,12 +172,10 @@ fn the_layout_is_pinned() {
         offset_of!(ConefieldInfo, identity),
         offset_of!(ConefieldInfo, coarse_to_fine),
         offset_of!(ConefieldInfo, double_precision),
-        offset_of!(ConefieldInfo, halves),
     ];
-    assert_eq!(info, [0, 8, 16, 24, 32, 40, 48, 56, 60, 64, 68, 72, 76]);
+    assert_eq!(info, [0, 8, 16, 24, 32, 40, 48, 56, 60, 64, 68, 72]);
 }
 
-/// The layout of the kinds added in 2.2.
 #[test]
 #[cfg(target_pointer_width = "64")]
 fn the_layout_of_pieces_of_iterative_methods_is_pinned() {

@@ -19,7 +19,7 @@ use std::{fmt, ptr, slice};
 /// Longest text in a table.
 const LONGEST_TEXT: usize = 1 << 20;
 /// Size in bytes of a stage's table in the first minor version.
-const FIRST_STAGE: usize = offset_of!(ConefieldStage, regularizer);
+const FIRST_STAGE: usize = size_of::<ConefieldStage>();
 /// Maximum number of stages in a library.
 const MOST_STAGES: usize = 1024;
 
@@ -116,11 +116,11 @@ pub(crate) trait FunctionsOf: Copy {
 tables! {
     Map(ConefieldMap)
         CONEFIELD_ENCODER Encoder CONEFIELD_NORMALIZER Normalizer CONEFIELD_FIELD Field CONEFIELD_LINE_FIELD LineField:
-        map, from offset_of!(ConefieldMap, project), needs [info forward backward];
+        map, from size_of::<ConefieldMap>(), needs [info forward backward];
     Projector(ConefieldProjector) CONEFIELD_PROJECTOR Projector:
         projector, from size_of::<ConefieldProjector>(), needs [max_samples sample];
     Initializer(ConefieldInitializer) CONEFIELD_INITIALIZER Initializer:
-        initializer, from offset_of!(ConefieldInitializer, check), needs [apply];
+        initializer, from size_of::<ConefieldInitializer>(), needs [apply];
     Loss(ConefieldLoss) CONEFIELD_LOSS Loss: loss, from size_of::<ConefieldLoss>(), needs [at];
     Prior(ConefieldPrior) CONEFIELD_PRIOR Prior: prior, from size_of::<ConefieldPrior>(), needs [blocks block];
     Regularizer(ConefieldRegularizer) CONEFIELD_REGULARIZER Regularizer:

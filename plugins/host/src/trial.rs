@@ -7,11 +7,10 @@ use bytemuck::Pod;
 use conefield_core::basis::{BasisOperator, Expansion};
 use conefield_core::data_term::Misfit;
 use conefield_core::error::{Error, Result};
-use conefield_core::half::{Half, round};
 use conefield_core::pages::Pages;
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
-use conefield_core::stage::{GradKind, Grads, Halves, Kernel, Lines, Reader, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
+use conefield_core::stage::{GradKind, Grads, Lines, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
 use ndarray::{Array3, ArrayView3, ArrayViewMut3};
 use std::ops::Range;
 use std::sync::mpsc;
@@ -148,33 +147,12 @@ fn try_map(stage: &dyn Stage) -> Result<Option<String>> {
             return Ok(Some(c));
         }
     }
-    if let Some(c) = try_kernel(stage, stage.kernel(), &mut params)? {
-        return Ok(Some(c));
-    }
-    let Some(Halves { f16, bf16 }) = stage.halves() else { return Ok(None) };
-    let complaint = match try_halves(stage, f16, &mut params)? {
-        None => try_halves(stage, bf16, &mut params)?,
-        some => some,
-    };
-    Ok(complaint.map(|c| format!("with parameters in halves, {c}")))
+    try_kernel(stage, &mut params)
 }
 
-/// The first complaint about a half-precision kernel.
-fn try_halves<H: Half>(
-    stage: &dyn Stage,
-    kernel: &dyn Kernel<f32, H>,
-    params: &mut Guarded<f32>,
-) -> Result<Option<String>> {
-    let mut halves = Pages::<H>::zeros(params.inner().len());
-    if halves.len() <= MANY {
-        round(params.inner(), &mut halves);
-    }
-    try_kernel(stage, &Reader { kernel, params: &halves }, params)
-}
-
-/// The first complaint about a kernel of a stage.
-fn try_kernel(stage: &dyn Stage, kernel: &dyn Kernel<f32>, params: &mut Guarded<f32>) -> Result<Option<String>> {
-    let info = stage.info();
+/// The first complaint about the kernel of a stage.
+fn try_kernel(stage: &dyn Stage, params: &mut Guarded<f32>) -> Result<Option<String>> {
+    let (info, kernel) = (stage.info(), stage.kernel());
     let range: Range<usize> = match info.grads {
         GradKind::Scatter => stage.partition().into_iter().min_by_key(Range::len).unwrap_or(0..info.params),
         _ => 0..info.params,

@@ -150,7 +150,6 @@ impl Built {
             let mut info = info(&i, blocks.len(), partition.len());
             info.coarse_to_fine = matches!(&stage, AnyStage::Encoder(e) if e.coarse_to_fine()).into();
             info.double_precision = s.reference().is_some().into();
-            info.halves = s.halves().is_some().into();
             MapInfo { info, blocks, partition }
         });
         let volume = if let AnyStage::Initializer(i) = &stage { i.volume() } else { None };
@@ -253,6 +252,5 @@ fn info(i: &Info, blocks: usize, partitions: usize) -> ConefieldInfo {
         identity: i.identity.into(),
         coarse_to_fine: 0,
         double_precision: 0,
-        halves: 0,
     }
 }

@@ -6,11 +6,10 @@ use super::{Foreign, call, raw_ray};
 use crate::library::Handle;
 use crate::trial::{self, GUARD, UNTOUCHED_64};
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::half::{Bf16, F16};
 use conefield_core::registry::Kind;
 use conefield_core::stage::{
-    Encoder, Field, GradKind, Grads, Halves, Info, Kernel, Lines, Normalizer, Parameter, Reduced, Scope, Stage, Tile,
-    TileMut, UnitRay,
+    Encoder, Field, GradKind, Grads, Info, Kernel, Lines, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+    UnitRay,
 };
 use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
@@ -56,7 +55,7 @@ impl MapStage {
         able(&own, &said).map_err(|what| own.wrong("info", what))?;
         let parameters = parameters(&own, &said)?;
         let partition = partition(&own, &said)?;
-        let passes = passes(&own, &said).map_err(|what| own.wrong("info", &what))?;
+        let passes = passes(&own).map_err(|what| own.wrong("info", &what))?;
         let resolutions = resolutions(&own, info.output)?;
         Ok(Self { own, info, said, passes, resolutions, parameters, partition })
     }
@@ -120,7 +119,6 @@ fn said(own: &Foreign<ConefieldMap>) -> Result<ConefieldInfo> {
         identity: 0,
         coarse_to_fine: 0,
         double_precision: 0,
-        halves: 0,
     };
     // SAFETY: the stage is alive, `i` is writable.
     own.run("info", |stage, _| own.functions.info.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &mut i) }))?;
@@ -160,10 +158,6 @@ fn able(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<(), &'static s
             i.double_precision == 0 || (f.forward_f64.is_some() && f.backward_f64.is_some()),
             "it declares double-precision kernels but has none",
         ),
-        (
-            i.halves == 0 || (f.forward_halves.is_some() && f.backward_halves.is_some()),
-            "it declares half-precision kernels but has none",
-        ),
         (!lines || (f.project.is_some() && f.backproject.is_some()), "it has no line integrals of its own"),
         (
             !lines || (f.project_f64.is_some() && f.backproject_f64.is_some()),
@@ -174,16 +168,13 @@ fn able(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<(), &'static s
 }
 
 /// Number of forward passes.
-fn passes(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<usize, String> {
+fn passes(own: &Foreign<ConefieldMap>) -> Result<usize, String> {
     let f = &own.functions;
     // SAFETY: the stage is alive.
     let passes = f.passes.map_or(1, |f| unsafe { f(own.handle.stage) });
     if passes == 0 || passes > MOST_PASSES || (passes > 1 && f.forward_pass.is_none()) {
         let there = if f.forward_pass.is_some() { "a" } else { "no" };
         return Err(format!("it goes forward in {passes} passes with {there} function forward_pass"));
-    }
-    if i.halves != 0 && passes > 1 && f.forward_pass_halves.is_none() {
-        return Err(format!("it goes forward in {passes} passes with no function forward_pass_halves"));
     }
     Ok(passes)
 }
@@ -298,24 +289,13 @@ across! {
     f64, ConefieldTile64 ConefieldTileMut64;
 }
 
-/// As `call`, for a function with the half-precision format as first argument, if any.
-macro_rules! with_format {
-    ($own:expr, ($($format:expr)?), $function:ident($($argument:expr),*)) => {
-        call!($own, $function($($format,)? $($argument),*))
-    };
-}
-
-/// A kernel in `$real` with parameters stored as `$param`, which `$format` identifies for the library.
 macro_rules! kernel {
-    (
-        $real:ty, $param:ty, $tile_mut:ident $grads:ident,
-        $forward:ident $backward:ident $format:tt $(passes: $forward_pass:ident)?
-    ) => {
-        impl Kernel<$real, $param> for MapStage {
-            fn forward(&self, params: &[$param], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
-                let (rows, params) = (x.rows, params.as_ptr().cast());
+    ($real:ty, $tile_mut:ident $grads:ident, $forward:ident $backward:ident $($forward_pass:ident)?) => {
+        impl Kernel<$real> for MapStage {
+            fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
+                let (rows, params) = (x.rows, params.as_ptr());
                 let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                if let Err(e) = with_format!(self.own, $format, $forward(params, x, out, tape)) {
+                if let Err(e) = call!(self.own, $forward(params, x, out, tape)) {
                     self.own.fault.set(e);
                     y.data.fill(<$real>::NAN);
                 }
@@ -323,20 +303,20 @@ macro_rules! kernel {
 
             fn backward(
                 &self,
-                params: &[$param],
+                params: &[$real],
                 x: Tile<'_, $real>,
                 tape: TileMut<'_, $real>,
                 dy: Tile<'_, $real>,
                 grads: Grads<'_, $real>,
                 mut dx: Option<TileMut<'_, $real>>,
             ) {
-                let (rows, params) = (x.rows, params.as_ptr().cast());
+                let (rows, params) = (x.rows, params.as_ptr());
                 let nowhere = $tile_mut { data: ptr::null_mut(), channels: 0, rows, stride: rows };
                 let (x, tape, dy) = (x.data.across(rows), tape.data.across(rows), dy.data.across(rows));
                 let to = dx.as_mut().map_or(nowhere, |dx| dx.data.across(rows));
                 let (start, length) = (grads.range.start, grads.values.len());
                 let grads = $grads { data: grads.values.as_mut_ptr(), start, length };
-                if let Err(e) = with_format!(self.own, $format, $backward(params, x, tape, dy, grads, to)) {
+                if let Err(e) = call!(self.own, $backward(params, x, tape, dy, grads, to)) {
                     self.own.fault.set(e);
                     dx.iter_mut().for_each(|dx| dx.data.fill(<$real>::NAN));
                 }
@@ -350,7 +330,7 @@ macro_rules! kernel {
                 fn forward_pass(
                     &self,
                     pass: usize,
-                    params: &[$param],
+                    params: &[$real],
                     x: Tile<'_, $real>,
                     y: TileMut<'_, $real>,
                     tape: TileMut<'_, $real>,
@@ -358,9 +338,9 @@ macro_rules! kernel {
                     if self.passes <= 1 || self.own.functions.$forward_pass.is_none() {
                         return self.forward(params, x, y, tape);
                     }
-                    let (rows, params) = (x.rows, params.as_ptr().cast());
+                    let (rows, params) = (x.rows, params.as_ptr());
                     let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                    if let Err(e) = with_format!(self.own, $format, $forward_pass(pass, params, x, out, tape)) {
+                    if let Err(e) = call!(self.own, $forward_pass(pass, params, x, out, tape)) {
                         self.own.fault.set(e);
                         y.data.fill(<$real>::NAN);
                     }
@@ -370,16 +350,8 @@ macro_rules! kernel {
     };
 }
 
-kernel! { f32, f32, ConefieldTileMut ConefieldGrads, forward backward () passes: forward_pass }
-kernel! { f64, f64, ConefieldTileMut64 ConefieldGrads64, forward_f64 backward_f64 () }
-kernel! {
-    f32, F16, ConefieldTileMut ConefieldGrads,
-    forward_halves backward_halves (CONEFIELD_F16) passes: forward_pass_halves
-}
-kernel! {
-    f32, Bf16, ConefieldTileMut ConefieldGrads,
-    forward_halves backward_halves (CONEFIELD_BF16) passes: forward_pass_halves
-}
+kernel! { f32, ConefieldTileMut ConefieldGrads, forward backward forward_pass }
+kernel! { f64, ConefieldTileMut64 ConefieldGrads64, forward_f64 backward_f64 }
 
 impl Stage for MapStage {
     fn info(&self) -> Info {
@@ -402,10 +374,6 @@ impl Stage for MapStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         (self.said.double_precision != 0).then_some(self as _)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        (self.said.halves != 0).then(|| Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

@@ -25,9 +25,6 @@ pub static MAP: ConefieldMap = ConefieldMap {
     wgsl: Some(wgsl),
     passes: Some(passes),
     forward_pass: Some(forward_pass),
-    forward_halves: Some(forward_halves),
-    forward_pass_halves: Some(forward_pass_halves),
-    backward_halves: Some(backward_halves),
     resolutions: Some(resolutions),
     project: Some(project),
     backproject: Some(backproject),
@@ -137,11 +134,11 @@ strided! { ConefieldTile f32 ConefieldTileMut f32 ConefieldTile64 f64 ConefieldT
 type Map<'a> = (&'a dyn Stage, &'a MapInfo);
 
 /// `forward` of a kernel, or one of its passes.
-unsafe fn run_forward<R: Real, P>(
+unsafe fn run_forward<R: Real>(
     (stage, known): Map<'_>,
-    kernel: &dyn Kernel<R, P>,
+    kernel: &dyn Kernel<R>,
     pass: Option<usize>,
-    params: *const P,
+    params: *const R,
     [x, y, tape]: [Strided<R>; 3],
 ) -> Result<()> {
     let rows = x.rows;
@@ -161,10 +158,10 @@ unsafe fn run_forward<R: Real, P>(
     stage.fault()
 }
 
-unsafe fn run_backward<R: Real, P>(
+unsafe fn run_backward<R: Real>(
     (stage, known): Map<'_>,
-    kernel: &dyn Kernel<R, P>,
-    params: *const P,
+    kernel: &dyn Kernel<R>,
+    params: *const R,
     [x, tape, dy, dx]: [Strided<R>; 4],
     grads: Grads<'_, R>,
 ) -> Result<()> {
@@ -200,24 +197,6 @@ fn have<T>(part: Option<T>, what: &str) -> Result<T> {
     part.ok_or_else(|| Error::unsupported("this stage", format!("it has no {what}")))
 }
 
-/// Runs `$run` with the kernel for the stored format of the parameters.
-macro_rules! in_halves {
-    ($map:expr, $format:expr, |$kernel:ident| $run:expr) => {{
-        let halves = have($map.0.halves(), "kernel that reads halves")?;
-        match $format {
-            CONEFIELD_F16 => {
-                let $kernel = halves.f16;
-                $run
-            }
-            CONEFIELD_BF16 => {
-                let $kernel = halves.bf16;
-                $run
-            }
-            other => return Err(Error::unsupported("halves", format!("the format {other} is unknown"))),
-        }
-    }};
-}
-
 shims! {
     fn forward(map: map, params: *const f32, x: ConefieldTile, y: ConefieldTileMut, tape: ConefieldTileMut; error) {
         run_forward(map, map.0.kernel(), None, params, [x.into(), y.into(), tape.into()])?;
@@ -249,29 +228,6 @@ shims! {
     ) {
         let kernel = have(map.0.reference(), "kernel in double precision")?;
         run_backward(map, kernel, params, [x.into(), tape.into(), dy.into(), dx.into()], grads64(to))?;
-    }
-
-    fn forward_halves(
-        map: map, format: u32, params: *const u16, x: ConefieldTile, y: ConefieldTileMut, tape: ConefieldTileMut; error
-    ) {
-        let tiles = [x.into(), y.into(), tape.into()];
-        in_halves!(map, format, |kernel| run_forward(map, kernel, None, params.cast(), tiles))?;
-    }
-
-    fn forward_pass_halves(
-        map: map, format: u32, pass: usize, params: *const u16, x: ConefieldTile, y: ConefieldTileMut,
-        tape: ConefieldTileMut; error
-    ) {
-        let tiles = [x.into(), y.into(), tape.into()];
-        in_halves!(map, format, |kernel| run_forward(map, kernel, Some(pass), params.cast(), tiles))?;
-    }
-
-    fn backward_halves(
-        map: map, format: u32, params: *const u16, x: ConefieldTile, tape: ConefieldTileMut, dy: ConefieldTile,
-        to: ConefieldGrads, dx: ConefieldTileMut; error
-    ) {
-        let tiles = [x.into(), tape.into(), dy.into(), dx.into()];
-        in_halves!(map, format, |kernel| run_backward(map, kernel, params.cast(), tiles, grads(to)))?;
     }
 }
 
