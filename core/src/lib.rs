@@ -9,7 +9,7 @@
 //! - [`arena`]: parameters, gradients and optimizer state by name.
 //! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them; [`finite`]: the
 //!   search for values that are not allowed.
-//! - [`settings`], [`precision`], [`spec`], [`registry`]: what a user writes, and the available types.
+//! - [`settings`], [`spec`], [`registry`]: what a user writes, and the available types.
 //! - [`host`]: stages on the host, to inspect a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes; [`resident`]: volumes that stay on a device.
 //! - [`basis`], [`data_term`], [`regularizer`]: parts of an iterative method; [`space`]: its arrays and their memory.
@@ -39,7 +39,6 @@ pub mod outside;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;
-pub mod precision;
 pub mod prelude;
 pub mod prior;
 pub mod random;

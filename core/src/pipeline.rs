@@ -3,7 +3,6 @@
 use crate::arena::{Arena, Block, Layout};
 use crate::error::{Result, ensure};
 use crate::opened::Opened;
-use crate::precision::Tables;
 use crate::scene::Scene;
 use crate::simd::Real;
 use crate::stage::{
@@ -24,8 +23,6 @@ pub struct Pipeline {
     pub field: Arc<dyn Field>,
     /// Rays to samples.
     pub projector: Arc<dyn Projector>,
-    /// How tables of features are read.
-    pub tables: Tables,
     layout: Layout,
     ranges: Vec<Range<usize>>,
     /// The whole encoder and its number of open channels, if some are closed.
@@ -63,10 +60,10 @@ impl Pipeline {
         }
         let out = check("field", field.as_ref(), width)?;
         ensure(out == 1, "spec", "field", format!("{out} channels out"), "1, the attenuation")?;
-        let (tables, layout) = (Tables::default(), Layout::default());
+        let layout = Layout::default();
         let (encoder, field, projector) = (Arc::from(encoder), Arc::from(field), Arc::from(projector));
         let normalizers = normalizers.into_iter().map(Arc::from).collect();
-        let mut pipeline = Self { encoder, normalizers, field, projector, tables, layout, ranges: vec![], whole: None };
+        let mut pipeline = Self { encoder, normalizers, field, projector, layout, ranges: vec![], whole: None };
         pipeline.lay_out();
         // Checks, for any scene, that the encoder reports the lengths that the projector's settings are relative to.
         pipeline.fitted(pipeline.lengths(1.0, 1.0))?;

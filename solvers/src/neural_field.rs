@@ -7,7 +7,6 @@ use crate::training::CallbackSpec;
 use conefield_core::error::Result;
 use conefield_core::method::{Context, Line, Method, Plan, StageLine};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::precision::Precision;
 use conefield_core::scene::SceneSettings;
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
@@ -23,9 +22,6 @@ pub struct NeuralField {
     /// How the scan is mapped to the unit cube of the stages.
     #[serde(default)]
     pub scene: SceneSettings,
-    /// Arithmetic precision of the field.
-    #[serde(default, skip_serializing_if = "Precision::is_single")]
-    pub precision: Precision,
     /// Encoder: points to features.
     #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn EncoderSpec>")]
@@ -109,8 +105,6 @@ impl NeuralField {
         }
         let field = self.field.build(width).map_err(|e| e.within("field"))?;
         let projector = self.projector.build().map_err(|e| e.within("projector"))?;
-        let mut pipeline = Pipeline::new(encoder, normalizers, field, projector)?;
-        pipeline.tables = self.precision.tables;
-        Ok(pipeline)
+        Pipeline::new(encoder, normalizers, field, projector)
     }
 }

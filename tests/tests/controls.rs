@@ -11,7 +11,6 @@ use conefield_core::arena::{Arena, InitReport, Layout};
 use conefield_core::basis::{Basis, BasisOperator, Expansion};
 use conefield_core::data_term::{DataTerm, Misfit};
 use conefield_core::geometry::{Geometry, VoxelGrid};
-use conefield_core::half::Stored;
 use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::prior::{Blocks, Prior};
 use conefield_core::regularizer::{Penalty, Regularizer};
@@ -19,8 +18,8 @@ use conefield_core::settings::{Initializer, LossSpec};
 use conefield_core::simd::Real;
 use conefield_core::space::Space;
 use conefield_core::stage::{
-    Encoder, GradKind, Grads, Halves, Info, Kernel, Lengths, Parameter, Projector, Reduced, Samples, Scope, Stage,
-    Tile, TileMut, UnitRay,
+    Encoder, GradKind, Grads, Info, Kernel, Lengths, Parameter, Projector, Reduced, Samples, Scope, Stage, Tile,
+    TileMut, UnitRay,
 };
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use conefield_core::wgsl::Fragment;
@@ -71,10 +70,6 @@ enum Fault {
     MissingBlock,
     /// Two blocks have one name.
     TwinNames,
-    /// What reads halves is a percent off.
-    CoarseHalves,
-    /// What reads halves goes another way back.
-    HalvesGradient,
     /// Some parameters are not initialised.
     PartialInit,
     /// It says that it does nothing.
@@ -87,8 +82,6 @@ enum Fault {
     TooManyKept,
     /// Passes leave another number than forward.
     Pass,
-    /// The same of what reads halves.
-    HalvesPass,
     /// A channel has no resolution.
     FewResolutions,
     /// A resolution is NaN.
@@ -116,12 +109,12 @@ impl Toy {
     }
 }
 
-impl<R: Real, P: Stored<R>> Kernel<R, P> for Toy {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
+impl<R: Real> Kernel<R> for Toy {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
         let calls = self.calls.fetch_add(1, Ordering::Relaxed);
         let rows = x.rows;
         for (c, &from) in self.channels.iter().enumerate() {
-            let w = params[c].value();
+            let w = params[c];
             let everything: R = x.data.iter().copied().sum();
             for i in 0..rows {
                 let mut v = w * x.channel(from)[i] + w * w;
@@ -130,7 +123,6 @@ impl<R: Real, P: Stored<R>> Kernel<R, P> for Toy {
                     Fault::TileSize => v += R::of(rows as f64 * 1e-6),
                     Fault::Remembers => v += R::of(f64::from(calls) * 1e-6),
                     Fault::Overflows => v = v * v / (v + R::of(1e-9)),
-                    Fault::CoarseHalves if size_of::<P>() == 2 => v *= R::of(1.01),
                     Fault::Coarse if size_of::<R>() == 4 => v = R::of((v.f64() * 1e3).round() * 1e-3),
                     _ => {}
                 }
@@ -145,16 +137,16 @@ impl<R: Real, P: Stored<R>> Kernel<R, P> for Toy {
         }
     }
 
-    fn forward_pass(&self, _: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+    fn forward_pass(&self, _: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         self.forward(params, x, TileMut::new(&mut *y.data, y.rows), tape);
-        if self.fault == (if size_of::<P>() == 2 { Fault::HalvesPass } else { Fault::Pass }) {
+        if self.fault == Fault::Pass {
             y.data[0] += R::ONE;
         }
     }
 
     fn backward(
         &self,
-        params: &[P],
+        params: &[R],
         x: Tile<'_, R>,
         _: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -163,14 +155,13 @@ impl<R: Real, P: Stored<R>> Kernel<R, P> for Toy {
     ) {
         assert!(self.fault != Fault::Panics, "as ordered");
         for c in grads.range.clone() {
-            let w = params[c].value();
+            let w = params[c];
             let rows = if self.fault == Fault::LastRow { x.rows - 1 } else { x.rows };
             let mut sum = R::ZERO;
             for i in 0..rows {
                 sum += dy.channel(c)[i] * (x.channel(self.channels[c])[i] + w + w);
             }
             match self.fault {
-                Fault::HalvesGradient if size_of::<P>() == 2 => sum *= R::of(1.01),
                 Fault::Gradient => sum *= R::of(1.01),
                 Fault::Forgotten if c == 1 => sum = R::ZERO,
                 Fault::RangeDependent if grads.range.len() == 1 => sum *= R::of(1.0 + 1e-6),
@@ -189,7 +180,7 @@ impl<R: Real, P: Stored<R>> Kernel<R, P> for Toy {
         for (c, &from) in self.channels.iter().enumerate() {
             let sign = if self.fault == Fault::InputGradient { R::of(-1.0) } else { R::ONE };
             for i in 0..x.rows {
-                dx.channel(from)[i] += sign * params[c].value() * dy.channel(c)[i];
+                dx.channel(from)[i] += sign * params[c] * dy.channel(c)[i];
             }
         }
     }
@@ -238,10 +229,6 @@ impl Stage for Toy {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         self.double.then_some(self as _)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        Some(Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {
@@ -314,8 +301,6 @@ fn every_fault_fails_its_property_and_the_sound_stage_none() {
         (Fault::SkipsOutput, "outputs overwrite"),
         (Fault::Overflows, "extremes"),
         (Fault::Coarse, "single precision: outputs"),
-        (Fault::CoarseHalves, "halves: outputs"),
-        (Fault::HalvesGradient, "halves: gradients"),
         (Fault::Remembers, "threads"),
         (Fault::Overlap, "partition"),
         (Fault::Gap, "partition"),
@@ -328,7 +313,6 @@ fn every_fault_fails_its_property_and_the_sound_stage_none() {
         (Fault::WrongChannel, "keep outputs"),
         (Fault::TooManyKept, "keep outputs"),
         (Fault::Pass, "passes"),
-        (Fault::HalvesPass, "halves: passes"),
         (Fault::FewResolutions, "resolutions"),
         (Fault::NanResolution, "resolutions"),
         (Fault::NegativeResolution, "resolutions"),

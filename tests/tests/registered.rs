@@ -11,7 +11,6 @@ use conefield_conformance::{
 use conefield_core::arena::Weights;
 use conefield_core::basis::BasisSpec;
 use conefield_core::data_term::DataTermSpec;
-use conefield_core::precision::Tables;
 use conefield_core::registry::{Kind, Settings, stage_types};
 use conefield_core::regularizer::RegularizerSpec;
 use conefield_core::settings::{
@@ -54,7 +53,7 @@ fn on_a_device(stage: &dyn Stage, options: &Options) {
         return println!("{}: it has no WGSL and runs on the CPU alone", stage.describe());
     }
     if let Some(shared) = device::shared("the WGSL of a stage") {
-        expect(check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, Tables::F32, p, x, dy, rows)));
+        expect(check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows)));
     }
 }
 

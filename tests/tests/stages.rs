@@ -12,7 +12,6 @@ use conefield_core::basis::BasisSpec;
 use conefield_core::data_term::DataTermSpec;
 use conefield_core::loss::Loss;
 use conefield_core::opened::Opened;
-use conefield_core::precision::Tables;
 use conefield_core::registry::{Kind, Settings, names};
 use conefield_core::regularizer::RegularizerSpec;
 use conefield_core::settings::{
@@ -45,7 +44,7 @@ fn on_a_device(stage: &dyn Stage, options: &Options) {
         return;
     }
     if let Some(shared) = device::shared("the WGSL of a stage") {
-        expect(check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, Tables::F32, p, x, dy, rows)));
+        expect(check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows)));
     }
 }
 

@@ -1,16 +1,14 @@
-//! Adam (Kingma & Ba 2015, algorithm 1) over the whole arena in one pass, which also updates the half-precision copy.
+//! Adam (Kingma & Ba 2015, algorithm 1) over the whole arena in one pass.
 
-use crate::halves::Rounded;
 use conefield_core::arena::Arena;
 use conefield_core::backend::Adam;
-use conefield_core::half::{F16, Half, round};
 use conefield_core::simd::{Op, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use rayon::prelude::*;
 
 const BLOCK: usize = 16_384;
 
-/// One step with the arena's gradients, which are reset to zero. Updates `copy` to the new parameters.
-pub fn update(arena: &mut Arena, adam: &Adam, copy: Option<&mut Rounded>) {
+/// One step with the arena's gradients, which are reset to zero.
+pub fn update(arena: &mut Arena, adam: &Adam) {
     let bias1 = 1.0 - adam.beta1.powf(adam.step as f64);
     let bias2 = 1.0 - adam.beta2.powf(adam.step as f64);
     let rule = Rule {
@@ -20,23 +18,13 @@ pub fn update(arena: &mut Arena, adam: &Adam, copy: Option<&mut Rounded>) {
         root: (1.0 / bias2.sqrt()) as f32,
         eps: adam.eps as f32,
     };
-    match copy {
-        None => sweep::<F16>(arena, rule, &mut []),
-        Some(Rounded::F16(copy)) => sweep(arena, rule, copy),
-        Some(Rounded::Bf16(copy)) => sweep(arena, rule, copy),
-    }
-}
-
-/// `copy` has the length of the arena or is empty.
-fn sweep<H: Half>(arena: &mut Arena, rule: Rule, copy: &mut [H]) {
     let Arena { params, grads, first, second } = arena;
-    let mut copies = copy.chunks_mut(BLOCK);
     let blocks: Vec<_> = params
         .chunks_mut(BLOCK)
         .zip(grads.chunks_mut(BLOCK))
         .zip(first.chunks_mut(BLOCK))
         .zip(second.chunks_mut(BLOCK))
-        .map(|(((p, g), m), v)| Block { rule, p, g, m, v, copy: copies.next().unwrap_or_default() })
+        .map(|(((p, g), m), v)| Block { rule, p, g, m, v })
         .collect();
     blocks.into_par_iter().for_each(run);
 }
@@ -50,21 +38,20 @@ struct Rule {
     eps: f32,
 }
 
-struct Block<'a, H> {
+struct Block<'a> {
     rule: Rule,
     p: &'a mut [f32],
     g: &'a mut [f32],
     m: &'a mut [f32],
     v: &'a mut [f32],
-    copy: &'a mut [H],
 }
 
-impl<H: Half> Op for Block<'_, H> {
+impl Op for Block<'_> {
     type Number = f32;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
-        let Self { rule, p, g, m, v, copy } = self;
+        let Self { rule, p, g, m, v } = self;
         let number = |x: f32| V::<S, f32>::splat(s, x);
         let zero = number(0.0);
         let mut i = 0;
@@ -80,14 +67,12 @@ impl<H: Half> Op for Block<'_, H> {
             store::<S, f32>(zero, g, i);
             i += V::<S, f32>::LEN;
         }
-        round(p, copy);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::precision::Tables;
 
     #[test]
     fn follows_the_algorithm_in_double_precision() {
@@ -104,34 +89,11 @@ mod tests {
                 let (mh, vh) = (m[i] / (1.0 - 0.9f64.powi(step as i32)), v[i] / (1.0 - 0.999f64.powi(step as i32)));
                 p[i] -= 1e-2 * mh / (vh.sqrt() + 1e-8);
             }
-            update(&mut arena, &Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step }, None);
+            update(&mut arena, &Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step });
             assert!(arena.grads.iter().all(|&g| g == 0.0));
         }
         for i in 0..n {
             assert!((f64::from(arena.params[i]) - p[i]).abs() < 1e-5, "{} {}", arena.params[i], p[i]);
-        }
-    }
-
-    #[test]
-    fn the_copy_is_that_of_the_new_parameters() {
-        let n = 2 * BLOCK + 37;
-        let start: Vec<f32> = (0..n).map(|i| (i as f32 * 0.37).sin() * 10f32.powi(i as i32 % 13 - 7)).collect();
-        let mut plain = Arena::new(n);
-        plain.params.copy_from_slice(&start);
-        plain.grads.iter_mut().zip(&start).for_each(|(g, p)| *g = 3.0 * p);
-        let adam = Adam { lr: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, step: 1 };
-        for tables in [Tables::F16, Tables::Bf16] {
-            let mut arena = plain.clone();
-            let mut copy = Rounded::new(tables, &arena.params).unwrap();
-            update(&mut arena, &adam, Some(&mut copy));
-            let mut alone = plain.clone();
-            update(&mut alone, &adam, None);
-            assert!(arena == alone && arena.params != plain.params);
-            match (copy, Rounded::new(tables, &arena.params).unwrap()) {
-                (Rounded::F16(a), Rounded::F16(b)) => assert!(a == b),
-                (Rounded::Bf16(a), Rounded::Bf16(b)) => assert!(a == b),
-                _ => panic!("another format"),
-            }
         }
     }
 
@@ -141,7 +103,7 @@ mod tests {
         arena.first.fill(1e-29);
         arena.second.fill(1e-35);
         for step in 1..=4000 {
-            update(&mut arena, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step }, None);
+            update(&mut arena, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step });
         }
         assert!(arena.first.iter().chain(arena.second.iter()).all(|&x| x == 0.0));
     }

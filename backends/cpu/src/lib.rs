@@ -5,12 +5,10 @@
 //! processes its share in groups: normalize, evaluate the field, integrate, compute the loss and run backward, tile by
 //! tile, while a tile is in the cache ([`rows`]). Dense stages sum their gradients in one copy per slot, merged in
 //! order. Stages with scattered parameters process the rows of the wave a second time, each worker with its own range
-//! of parameters ([`step`]). Half-precision tables are a copy of the parameters ([`halves`]) renewed by each update
-//! ([`adam`]). A field with line integrals of its own takes another path ([`lines`]). The number of slots and the order
-//! of every sum depend on the plan only, so that results are bit-identical on any number of threads.
+//! of parameters ([`step`]). A field with line integrals of its own takes another path ([`lines`]). The number of slots
+//! and the order of every sum depend on the plan only, so that results are bit-identical on any number of threads.
 
 pub mod adam;
-pub mod halves;
 pub mod lines;
 pub mod rows;
 pub mod step;
@@ -18,10 +16,8 @@ pub mod step;
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::precision::Tables;
 use conefield_core::simd;
 use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay, titled};
-use halves::Rounded;
 use rayon::prelude::*;
 use rows::{Belong, Encoded, Kernels, Scratch};
 use step::Slots;
@@ -48,8 +44,6 @@ impl Backend for Cpu {
     }
 
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
-        let tables = pipeline.tables;
-        let mut halves = false;
         let mut notes = vec![];
         for (name, stage) in pipeline.stages() {
             let info = stage.info();
@@ -59,14 +53,6 @@ impl Backend for Cpu {
                     format!("{name} on the CPU backend"),
                     "a stage with scattered parameters must not keep a tape",
                 ));
-            }
-            if info.grads == GradKind::Scatter && tables != Tables::F32 {
-                halves = true;
-                if stage.halves().is_none() {
-                    let why =
-                        format!("it cannot read its parameters in {tables}; it can with precision.tables = \"f32\"");
-                    return Err(Error::unsupported(format!("{name} on the CPU backend"), why));
-                }
             }
             notes.push(match (info.identity, info.grads) {
                 (true, _) => format!("{name}: identity, left out"),
@@ -80,19 +66,14 @@ impl Backend for Cpu {
                 }
             });
         }
-        if halves {
-            notes.push(format!("tables are read from a copy in {tables}"));
-        }
-        let kernels = kernels(pipeline, None)?;
-        let copy = if halves { Rounded::BYTES * pipeline.layout().len() } else { 0 };
+        let kernels = kernels(pipeline);
         let evaluating = rayon::current_num_threads() * CHUNK_ROWS * kernels.encoded_numbers() * size_of::<f32>();
         let explain = Explain {
             backend: format!("cpu, {}, {} threads", simd::level_name(), rayon::current_num_threads()),
             notes,
-            scratch_bytes: Slots::bytes(&kernels) + evaluating + copy,
+            scratch_bytes: Slots::bytes(&kernels) + evaluating,
         };
-        let tables = if halves { tables } else { Tables::F32 };
-        Ok((Box::new(CpuExecutable { slots: None, clean: false, tables, copy: None, current: false }), explain))
+        Ok((Box::new(CpuExecutable { slots: None, clean: false }), explain))
     }
 }
 
@@ -101,43 +82,16 @@ struct CpuExecutable {
     slots: Option<Slots<f32>>,
     /// Whether the arena's gradients are known to be zero.
     clean: bool,
-    /// Storage precision of tables.
-    tables: Tables,
-    /// The copy that tables are read from, if not the arena.
-    copy: Option<Rounded>,
-    /// Whether the copy is up to date.
-    current: bool,
 }
 
-/// The kernels of `pipeline`, which [`Backend::compile`] has checked.
-fn kernels<'a>(pipeline: &'a Pipeline, copy: Option<&'a Rounded>) -> Result<Kernels<'a, f32>> {
-    let lacks = || Error::unsupported("the CPU backend", "a stage that is not the one which it was compiled for");
-    Kernels::reading(pipeline, copy).ok_or_else(lacks)
-}
-
-impl CpuExecutable {
-    /// The kernels with their parameters; updates the copy if needed.
-    fn kernels<'a>(&'a mut self, model: &'a Model) -> Result<Kernels<'a, f32>> {
-        self.refresh(model);
-        kernels(&model.pipeline, self.copy.as_ref())
-    }
-
-    /// Updates the copy from the arena.
-    fn refresh(&mut self, model: &Model) {
-        let params = &model.arena.params;
-        match &mut self.copy {
-            _ if self.current => {}
-            Some(copy) => copy.renew(params),
-            None => self.copy = Rounded::new(self.tables, params),
-        }
-        self.current = true;
-    }
+/// The kernels for training.
+fn kernels(pipeline: &Pipeline) -> Kernels<'_, f32> {
+    Kernels::new(pipeline, |stage| stage.kernel())
 }
 
 impl Executable for CpuExecutable {
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats> {
-        self.refresh(model);
-        let kernels = kernels(&model.pipeline, self.copy.as_ref())?;
+        let kernels = kernels(&model.pipeline);
         if !self.clean {
             model.arena.grads.fill(0.0);
         }
@@ -167,13 +121,13 @@ impl Executable for CpuExecutable {
     }
 
     fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()> {
-        adam::update(&mut model.arena, adam, self.copy.as_mut().filter(|_| self.current));
+        adam::update(&mut model.arena, adam);
         self.clean = true;
         Ok(())
     }
 
     fn evaluate(&mut self, model: &Model, points: &[[f32; 3]], out: &mut [f32]) -> Result<()> {
-        let kernels = self.kernels(model)?;
+        let kernels = kernels(&model.pipeline);
         out.par_chunks_mut(CHUNK_ROWS).zip(points.par_chunks(CHUNK_ROWS)).for_each_init(
             || (Encoded::default(), Scratch::default()),
             |(encoded, scratch), (out, points)| {
@@ -190,7 +144,7 @@ impl Executable for CpuExecutable {
 
     fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>> {
         let mut encoded = Encoded::default();
-        encoded.forward(&self.kernels(model)?, &model.arena.params, points);
+        encoded.forward(&kernels(&model.pipeline), &model.arena.params, points);
         model.pipeline.fault()?;
         Ok(encoded.features().to_vec())
     }
@@ -200,7 +154,7 @@ impl Executable for CpuExecutable {
             lines::project(lines, &model.arena.params, rays, out);
             return model.pipeline.fault();
         }
-        let kernels = self.kernels(model)?;
+        let kernels = kernels(&model.pipeline);
         let projector = model.pipeline.projector.as_ref();
         let longest = rays.iter().map(|ray| projector.max_samples(ray)).max().unwrap_or(0);
         let each = (CHUNK_ROWS / longest.max(1)).clamp(1, CHUNK_RAYS);
@@ -231,9 +185,5 @@ impl Executable for CpuExecutable {
             },
         );
         model.pipeline.fault()
-    }
-
-    fn renew(&mut self) {
-        self.current = false;
     }
 }

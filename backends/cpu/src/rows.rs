@@ -1,6 +1,5 @@
 //! Forward and backward of a group of rows, tile by tile.
 
-use crate::halves::Rounded;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::simd::Real;
 use conefield_core::stage::{GradKind, Grads, Info, Kernel, Scope, Stage, TILE_ROWS, Tile, TileMut};
@@ -9,7 +8,7 @@ use std::ops::Range;
 /// A stage ready to run: its kernel, widths and place in the arena.
 pub struct Step<'a, R: Real> {
     /// The arithmetic.
-    pub kernel: Box<dyn Kernel<R> + 'a>,
+    pub kernel: &'a dyn Kernel<R>,
     /// Widths and counts.
     pub info: Info,
     /// Its parameter range in the arena.
@@ -31,7 +30,7 @@ impl<R: Real> Step<'_, R> {
 
     /// The kernel for whole tiles; `None` if it needs rows one at a time.
     fn whole(&self, belong: Belong) -> Option<&(dyn Kernel<R> + '_)> {
-        if self.off_rays(belong) { self.kernel.points() } else { Some(self.kernel.as_ref()) }
+        if self.off_rays(belong) { self.kernel.points() } else { Some(self.kernel) }
     }
 }
 
@@ -43,16 +42,8 @@ pub struct Kernels<'a, R: Real> {
 }
 
 impl<'a, R: Real> Kernels<'a, R> {
-    /// The kernels of `pipeline` in the precision that `pick` chooses; `None` if a stage lacks it.
-    pub fn new(pipeline: &'a Pipeline, pick: impl Fn(&'a dyn Stage) -> Option<&'a dyn Kernel<R>>) -> Option<Self> {
-        Self::of(pipeline, |stage, _| Some(Box::new(pick(stage)?)))
-    }
-
-    /// `pick` gets each stage with its parameter range in the arena.
-    fn of(
-        pipeline: &'a Pipeline,
-        pick: impl Fn(&'a dyn Stage, Range<usize>) -> Option<Box<dyn Kernel<R> + 'a>>,
-    ) -> Option<Self> {
+    /// The kernels of `pipeline` that `pick` chooses.
+    pub fn new(pipeline: &'a Pipeline, pick: impl Fn(&'a dyn Stage) -> &'a dyn Kernel<R>) -> Self {
         let mut steps = vec![];
         let mut learns = false;
         let (mut input, mut end) = (0..0, 0);
@@ -67,10 +58,10 @@ impl<'a, R: Real> Kernels<'a, R> {
             let output = end..end + info.output;
             end = if steps.is_empty() { output.end } else { output.end + info.tape };
             let read = std::mem::replace(&mut input, output.clone());
-            let (kernel, params) = (pick(stage, range.clone())?, range.clone());
+            let (kernel, params) = (pick(stage), range.clone());
             steps.push(Step { kernel, info, params, partition, hands_on, input: read, output });
         }
-        Some(Self { steps, scope: pipeline.scope() })
+        Self { steps, scope: pipeline.scope() }
     }
 
     /// Number of passes of the encoder.
@@ -116,17 +107,6 @@ impl<'a, R: Real> Kernels<'a, R> {
 
     fn widest(&self) -> usize {
         self.steps.iter().map(|s| s.info.output).max().unwrap_or(1).max(3)
-    }
-}
-
-impl<'a> Kernels<'a, f32> {
-    /// The kernels for training. Stages with scattered parameters read them from `copy`, if given; `None` if one of
-    /// them has no kernel for it.
-    pub fn reading(pipeline: &'a Pipeline, copy: Option<&'a Rounded>) -> Option<Self> {
-        Self::of(pipeline, |stage, range| match copy {
-            Some(copy) if stage.info().grads == GradKind::Scatter => copy.kernel(stage, range),
-            _ => Some(Box::new(stage.kernel())),
-        })
     }
 }
 
@@ -415,7 +395,7 @@ impl<R: Real> Scratch<R> {
                 let (y, tape) = (TileMut::new(y, n), TileMut::new(tape, n));
                 match s.whole(belong) {
                     Some(kernel) => kernel.forward(params, x, y, tape),
-                    None => self.single.forward(s.kernel.as_ref(), params, x, y, tape),
+                    None => self.single.forward(s.kernel, params, x, y, tape),
                 }
             }
             let y = &kernels.steps[kernels.steps.len() - 1].output;
@@ -471,7 +451,7 @@ impl<R: Real> Scratch<R> {
                 let dx_here = s.hands_on.then(|| TileMut::new(&mut dx[..s.info.input * n], n));
                 match s.whole(self.belong) {
                     Some(kernel) => kernel.backward(params, x, tape, g, grads, dx_here),
-                    None => self.single.backward(s.kernel.as_ref(), params, x, tape, g, grads, dx_here),
+                    None => self.single.backward(s.kernel, params, x, tape, g, grads, dx_here),
                 }
                 if !s.hands_on {
                     continue 'tiles;

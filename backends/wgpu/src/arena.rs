@@ -1,10 +1,9 @@
 //! Parameters, gradients and moments on the device, in one buffer each or in several, as its limits require.
 
 use crate::Shared;
-use crate::compose::{self, Chain};
+use crate::compose::Chain;
 use crate::device::Gpu;
 use crate::kernel::Buffers;
-use crate::wave::MOST_GROUPS;
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
 use conefield_core::pages::copy;
@@ -31,12 +30,6 @@ pub fn allocate(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, params: usize, 
             buffers.reserve(gpu, &format!("{part}_{s}"), bytes, U::STORAGE | U::COPY_SRC | U::COPY_DST)?;
         }
     }
-    if chain.halves().is_some() {
-        for s in 0..chain.segments() {
-            let bytes = 2 * segment(chain, s, params, size).len() as u64;
-            buffers.reserve(gpu, &format!("halves_{s}"), bytes, U::STORAGE)?;
-        }
-    }
     if chain.dense_bytes() > 0 {
         buffers.reserve(gpu, "dense", chain.dense_bytes(), U::UNIFORM | U::STORAGE | U::COPY_DST)?;
     }
@@ -59,29 +52,13 @@ pub fn upload(shared: &Shared, buffers: &Buffers, chain: &Chain, arena: &Arena) 
         }
     }
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
-    refresh(shared, buffers, chain, &mut encoder)?;
+    refresh(buffers, chain, &mut encoder, size);
     gpu.queue.submit([encoder.finish()]);
     gpu.fault()
 }
 
-/// Updates the copies from which kernels read parameters: those that every row reads, and half-precision tables.
-pub fn refresh(shared: &Shared, buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder) -> Result<()> {
-    let (gpu, size) = (&shared.gpu, shared.target().segment);
-    copy_dense(buffers, chain, encoder, size);
-    if let Some(tables) = chain.halves() {
-        let kernel = shared.kernels.get(gpu, "halve", &compose::halve(tables))?;
-        for s in 0..chain.segments() {
-            let own = |name: &str| buffers.get(&format!("{name}_{s}"));
-            let bound = kernel.bind_as(gpu, own)?;
-            let words = own("halves").map_or(0, |b| b.size() / 4);
-            let groups = words.div_ceil(256).clamp(1, MOST_GROUPS as u64) as u32;
-            kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, groups);
-        }
-    }
-    Ok(())
-}
-
-fn copy_dense(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder, size: usize) {
+/// Updates the copy of the parameters that every row reads.
+pub fn refresh(buffers: &Buffers, chain: &Chain, encoder: &mut wgpu::CommandEncoder, size: usize) {
     let Some(dense) = buffers.get("dense") else { return };
     for (first, range) in chain.dense_ranges() {
         let (mut at, mut from) = (4 * first as u64, range.start);

@@ -12,7 +12,6 @@ use crate::source::{Access, Source};
 use conefield_core::error::{Error, Result};
 use conefield_core::loss::Loss;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::precision::Tables;
 use conefield_core::prior::Prior;
 use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage, titled};
 use conefield_core::wgsl::{self, Fragment, RANDOM, RAY, Sum};
@@ -96,8 +95,6 @@ pub struct Chain {
     blocks: Vec<String>,
     /// Parameters of the arena.
     params: usize,
-    /// Storage precision of parameters with scattered gradients.
-    tables: Tables,
     target: Target,
 }
 
@@ -124,7 +121,6 @@ impl Chain {
             sums: vec![],
             blocks: vec![],
             params: pipeline.layout().len(),
-            tables: pipeline.tables,
             target,
         };
         for (i, ((name, stage), range)) in pipeline.stages().into_iter().zip(pipeline.ranges()).enumerate() {
@@ -140,10 +136,10 @@ impl Chain {
     }
 
     /// One stage alone, with all its functions.
-    pub fn single(stage: &dyn Stage, tables: Tables, target: Target) -> Result<Self> {
+    pub fn single(stage: &dyn Stage, target: Target) -> Result<Self> {
         let params = stage.info().params;
         let (links, sums, blocks) = (vec![], vec![], vec![]);
-        let mut chain = Self { links, encoder: false, dense: 0, tape: 0, sums, blocks, params, tables, target };
+        let mut chain = Self { links, encoder: false, dense: 0, tape: 0, sums, blocks, params, target };
         chain.link("stage", stage, 0..params, true)?;
         chain.blocks = blocks_of(&chain.sums);
         Ok(chain)
@@ -197,12 +193,6 @@ impl Chain {
         &self.links
     }
 
-    /// Precision of the copy from which tables are read; `None` if there is no copy.
-    pub fn halves(&self) -> Option<Tables> {
-        let scattered = self.links.iter().any(|l| l.info.grads == GradKind::Scatter);
-        (scattered && self.tables != Tables::F32).then_some(self.tables)
-    }
-
     /// The ranges of the arena in the copy that every row reads, each with its position in the copy.
     pub fn dense_ranges(&self) -> impl Iterator<Item = (usize, Range<usize>)> {
         self.links.iter().filter_map(|l| Some((l.dense?, l.range.clone())))
@@ -244,11 +234,6 @@ impl Chain {
         for s in 0..self.segments() {
             source.bind(&format!("params_{s}"), Access::Read, "array<vec2<f32>>");
         }
-        if self.halves().is_some() {
-            for s in 0..self.segments() {
-                source.bind(&format!("halves_{s}"), Access::Read, "array<u32>");
-            }
-        }
         if links.iter().any(|l| l.dense.is_some()) {
             let vectors = self.dense.div_ceil(4);
             // Kernels with a uniform buffer compile fast. But `backward` reads it slowly, for a reason that is not known: on an H200
@@ -262,14 +247,6 @@ impl Chain {
         // One number at a time: on an H200, reading both of a pair took twice as long.
         self.each_segment(&mut text, |s, i| format!("let at = {i}; return params_{s}[at >> 1u][at & 1u];"));
         text += "    return 0.0;\n}\n";
-        if let Some(tables) = self.halves() {
-            text += "fn arena_half(i: u32) -> f32 {\n";
-            self.each_segment(&mut text, |s, i| match tables {
-                Tables::F16 => format!("let at = {i}; return unpack2x16float(halves_{s}[at >> 1u])[at & 1u];"),
-                _ => format!("let at = {i}; return bitcast<f32>((halves_{s}[at >> 1u] >> ((at & 1u) * 16u)) << 16u);"),
-            });
-            text += "    return 0.0;\n}\n";
-        }
         if gradients {
             let atomics = self.target.atomics;
             for s in 0..self.segments() {
@@ -299,12 +276,9 @@ impl Chain {
 
     /// The functions of `link` and those that it calls.
     fn include(&self, source: &mut Source, link: &Link, pass: Pass) {
-        let Link { name, prefix, fragment, info, range, dense, tape, wants_dx } = link;
+        let Link { name, prefix, fragment, range, dense, tape, wants_dx, .. } = link;
         let first = range.start;
         let param = match dense {
-            None if self.halves().is_some() && info.grads == GradKind::Scatter => {
-                format!("arena_half({first}u + i)")
-            }
             Some(first) => format!("dense[({first}u + i) >> 2u][({first}u + i) & 3u]"),
             None => format!("arena_param({first}u + i)"),
         };
@@ -863,38 +837,6 @@ fn derivatives() -> Source {
     source.bind("dmu", Access::Write, "array<f32>");
     source.bind("losses", Access::Write, "array<f32>");
     source.add("total", include_str!("kernels/total.wgsl"));
-    source
-}
-
-/// Rounds parameters to half precision, two per word.
-pub fn halve(tables: Tables) -> Source {
-    let mut source = Source::default();
-    source.bind("params", Access::Read, "array<f32>");
-    source.bind("halves", Access::Write, "array<u32>");
-    let pack = match tables {
-        // Finite values stay finite.
-        Tables::F16 => {
-            "fn within(x: f32) -> f32 {
-    let finite = (bitcast<u32>(x) & 0x7fffffffu) < 0x7f800000u;
-    return select(x, clamp(x, -65504.0, 65504.0), finite);
-}
-fn pack(a: f32, b: f32) -> u32 { return pack2x16float(vec2<f32>(within(a), within(b))); }"
-        }
-        // To the nearest, ties to even.
-        _ => {
-            "fn round16(x: f32) -> u32 {
-    let bits = bitcast<u32>(x);
-    let magnitude = bits & 0x7fffffffu;
-    let finite = min(magnitude, 0x7f7f0000u);
-    let rounded = (finite + 0x7fffu + ((finite >> 16u) & 1u)) >> 16u;
-    let special = select(0x7f80u, 0x7fc0u, magnitude > 0x7f800000u);
-    return ((bits >> 16u) & 0x8000u) | select(special, rounded, magnitude < 0x7f800000u);
-}
-fn pack(a: f32, b: f32) -> u32 { return round16(a) | (round16(b) << 16u); }"
-        }
-    };
-    source.add("pack", pack);
-    source.add("halve", include_str!("kernels/halve.wgsl"));
     source
 }
 

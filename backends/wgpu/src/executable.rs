@@ -162,8 +162,7 @@ impl Wgpu {
     /// Peak memory on the device in bytes.
     pub fn device_bytes(&self) -> u64 {
         let rows = u64::from(self.most) * self.row_bytes();
-        let halves = self.chain.halves().map_or(0, |_| 2);
-        (16 + halves) * self.chain.params() as u64 + rows + self.partial_bytes()
+        16 * self.chain.params() as u64 + rows + self.partial_bytes()
     }
 
     /// Peak host memory for copies in bytes.
@@ -559,7 +558,7 @@ impl Executable for Wgpu {
                 encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("adam"), timestamp_writes });
             kernel.launch(&mut pass, &bound, count.div_ceil(256).clamp(1, MOST_GROUPS) as u32);
         }
-        arena::refresh(&self.shared, &self.buffers, &self.chain, &mut encoder)?;
+        arena::refresh(&self.buffers, &self.chain, &mut encoder, self.shared.target().segment);
         self.update = Some(encoder);
         self.clean = true;
         self.gpu().fault()

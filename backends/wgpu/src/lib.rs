@@ -136,9 +136,6 @@ impl Backend for Wgpu {
         if chain.tape() > 0 {
             notes.push(format!("stages keep {} numbers per sample between forward, backward and sums", chain.tape()));
         }
-        if let Some(tables) = chain.halves() {
-            notes.push(format!("tables are read from a copy in {tables}"));
-        }
         if chain.segments() > 1 {
             notes.push(format!(
                 "parameters in {} buffers of at most {} bytes",

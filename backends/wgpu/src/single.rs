@@ -10,7 +10,6 @@ use crate::wave::{GpuRay, MOST_GROUPS};
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;
-use conefield_core::precision::Tables;
 use conefield_core::prior::Prior;
 use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
 use wgpu::BufferUsages as U;
@@ -18,17 +17,9 @@ use wgpu::BufferUsages as U;
 impl Shared {
     /// Runs a stage forward and backward on `x` and `dy`, channel-major with `rows` rows. Returns its outputs, the
     /// gradients of its parameters and those of its inputs.
-    pub fn pass(
-        &self,
-        stage: &dyn Stage,
-        tables: Tables,
-        params: &[f32],
-        x: &[f32],
-        dy: &[f32],
-        rows: usize,
-    ) -> Result<[Vec<f32>; 3]> {
+    pub fn pass(&self, stage: &dyn Stage, params: &[f32], x: &[f32], dy: &[f32], rows: usize) -> Result<[Vec<f32>; 3]> {
         let (gpu, target) = (&self.gpu, self.target());
-        let chain = Chain::single(stage, tables, target)?;
+        let chain = Chain::single(stage, target)?;
         let info = stage.info();
         let mut buffers = Buffers::default();
         let mut arena = Arena::new(params.len());

@@ -11,7 +11,6 @@ mod call;
 mod channels;
 mod data_terms;
 mod gradients;
-mod halves;
 mod lines;
 mod losses;
 mod priors;
@@ -134,9 +133,6 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     report.add("finite differences: inputs", || gradients::inputs(stage, options));
     report.add("single precision: outputs", || gradients::single_outputs(stage, options));
     report.add("single precision: gradients", || gradients::single_gradients(stage, options));
-    report.add("halves: outputs", || halves::outputs(stage, options));
-    report.add("halves: gradients", || halves::gradients(stage, options));
-    report.add("halves: passes", || halves::passes(stage, options));
     report.add("tile sizes: outputs", || behaviour::tile_outputs(stage, options));
     report.add("points off any ray", || behaviour::points(stage, options));
     report.add("passes", || behaviour::passes(stage, options));

@@ -1,22 +1,18 @@
 //! Errors of single against double precision, stage by stage and of whole steps, as inputs and sizes grow.
 //!
-//! Both get the same numbers, exact in single precision. The differences come from the rounding of the work itself, and of tables
-//! that are read in half precision.
+//! Both get the same numbers, exact in single precision. The differences come from the rounding of the work itself.
 
 use crate::common::{self, scan, spec};
 use crate::page;
-use conefield_backend_cpu::halves::Rounded;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::backend::{TrainRay, Work};
-use conefield_core::half::{Half, round};
 use conefield_core::pipeline::Model;
-use conefield_core::precision::Tables;
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
 use conefield_core::simd::Real;
-use conefield_core::stage::{Grads, Kernel, Reader, Stage, Tile, TileMut};
+use conefield_core::stage::{Grads, Kernel, Stage, Tile, TileMut};
 use conefield_report::{CurveOptions, curves_png_with};
 use conefield_solvers::losses::L2;
 use serde_json::{Value, json};
@@ -68,28 +64,8 @@ impl<'a> Pair<'a> {
     }
 
     pub fn errors(&self) -> Errors {
-        self.errors_of(self.stage.kernel())
-    }
-
-    /// With parameters read as `tables` says.
-    fn errors_in(&self, tables: Tables) -> Errors {
-        let halves = || self.stage.halves().expect("built-in stages with tables read halves");
-        match tables {
-            Tables::F32 => self.errors(),
-            Tables::F16 => self.errors_read(halves().f16),
-            Tables::Bf16 => self.errors_read(halves().bf16),
-        }
-    }
-
-    fn errors_read<H: Half>(&self, kernel: &dyn Kernel<f32, H>) -> Errors {
-        let mut params = vec![H::default(); self.params.len()];
-        round(&self.params, &mut params);
-        self.errors_of(&Reader { kernel, params: &params })
-    }
-
-    fn errors_of(&self, kernel: &dyn Kernel<f32>) -> Errors {
         let exact = self.stage.reference().expect("every built-in stage has one");
-        let [y, g, dx] = self.work(kernel);
+        let [y, g, dx] = self.work(self.stage.kernel());
         let [y64, g64, dx64] = self.work(exact);
         let finite = [&y, &g, &dx].into_iter().flatten().all(|v| v.is_finite());
         Errors { outputs: apart(&y, &y64), params: apart(&g, &g64), inputs: apart(&dx, &dx64), finite }
@@ -159,37 +135,8 @@ fn stages() -> Vec<(String, String, Errors, f64)> {
     all
 }
 
-/// Rows of stages whose tables are read in halves: numbers of order one, as they start, and what a format has no number
-/// for, of which nothing but the largest or 0 is left.
-fn halves() -> Vec<(String, String, Errors, f64)> {
-    let mut all = vec![];
-    let grid = encoder(json!({"type": "hash-grid", "levels": 1, "log2_table_size": 12})).build().unwrap();
-    let voxels: Box<dyn FieldSpec> = serde_json::from_value(json!({"type": "voxel-grid", "resolution": 70})).unwrap();
-    let voxels = voxels.build(3).unwrap();
-    for (tables, rounding, range) in [(Tables::F16, 2e-3, 1e-4..6e4), (Tables::Bf16, 1.6e-2, 1e-38..1e38)] {
-        for size in [1e-30, 1e-4, 1.0, 1e5, 1e30] {
-            let errors = Pair::new(grid.as_ref(), Some(size), 0.0..1.0, 400, 11).errors_in(tables);
-            let limit = if range.contains(&size) { rounding } else { 1.0 };
-            all.push((
-                format!("hash-grid, 16 cells, {tables}"),
-                format!("0e0 to 1e0, parameters to ± {size:e}"),
-                errors,
-                limit,
-            ));
-        }
-        let errors = Pair::new(voxels.as_ref(), Some(3.0), 0.0..1.0, 400, 11).errors_in(tables);
-        all.push((
-            format!("voxel-grid, 70 cells, {tables}"),
-            "0e0 to 1e0, parameters to ± 3e0".into(),
-            errors,
-            rounding,
-        ));
-    }
-    all
-}
-
 /// Errors of loss and gradients of a step with this number of rays and samples.
-fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
+fn step(rays: usize, samples: usize) -> [f64; 2] {
     let mut value = crate::scans::field();
     value["projector"]["samples"] = json!(samples);
     let pipeline = common::pipeline(&spec(&value).unwrap());
@@ -206,9 +153,8 @@ fn step(rays: usize, samples: usize, tables: Tables) -> [f64; 2] {
     let params: Vec<f32> = start.iter().enumerate().map(moved).collect();
     let exact: Vec<f64> = params.iter().map(|p| f64::from(*p)).collect();
     let work = Work { step: 4, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
-    let copy = Rounded::new(tables, &params);
-    let single = Kernels::reading(&pipeline, copy.as_ref()).unwrap();
-    let double = Kernels::new(&pipeline, |s| s.reference()).unwrap();
+    let single = Kernels::new(&pipeline, |s| s.kernel());
+    let double = Kernels::new(&pipeline, |s| s.reference().unwrap());
     let (mut g, mut g64) = (vec![0.0f32; params.len()], vec![0.0f64; params.len()]);
     let projector = pipeline.projector.as_ref();
     let found = Slots::new(&single).step(&single, projector, &params, &mut g, &work);
@@ -227,7 +173,7 @@ pub fn check() {
     );
     let mut faults = vec![];
     let mut row = |cells: [String; 5]| text += &format!("| {} |\n", cells.map(|c| page::escaped(&c)).join(" | "));
-    for (name, inputs, e, limit) in stages().into_iter().chain(halves()) {
+    for (name, inputs, e, limit) in stages().into_iter() {
         if !e.finite || e.outputs > limit {
             faults.push(format!("{name} of {inputs}: {:.1e}, limit {limit:.1e}, finite {}", e.outputs, e.finite));
         }
@@ -235,7 +181,7 @@ pub fn check() {
     }
     let mut curves = vec![("loss of a step".to_owned(), vec![]), ("gradients of a step".to_owned(), vec![])];
     for (rays, samples) in [(1, 1), (8, 8), (64, 20), (64, 256), (512, 256)] {
-        let [loss, gradients] = step(rays, samples, Tables::F32);
+        let [loss, gradients] = step(rays, samples);
         if loss > 1e-5 || gradients > 1e-4 {
             faults.push(format!("a step of {rays} rays: loss {loss:.1e}, gradients {gradients:.1e}"));
         }
@@ -251,30 +197,17 @@ pub fn check() {
             "-".into(),
         ]);
     }
-    for (tables, limit) in [(Tables::F16, 5e-4), (Tables::Bf16, 4e-3)] {
-        for (rays, samples) in [(64, 20), (512, 256)] {
-            let [loss, gradients] = step(rays, samples, tables);
-            let name = format!("a whole step, {rays} × {samples} samples, {tables}");
-            if loss > limit || gradients > limit {
-                faults.push(format!("{name}: loss {loss:.1e}, gradients {gradients:.1e}"));
-            }
-            row([name, "as trained".into(), cell(loss), cell(gradients), "-".into()]);
-        }
-    }
     assert!(faults.is_empty(), "{}", faults.join("\n"));
     let of = |name: &str, values: Vec<(f64, f64)>| (name.to_owned(), values);
-    let grid = |cells: u32, tables: Tables| {
+    let grid = |cells: u32| {
         let s = encoder(json!({"type": "hash-grid", "levels": 1, "base_resolution": cells, "log2_table_size": 12}));
-        Pair::new(s.build().unwrap().as_ref(), Some(1.0), 0.0..1.0, 400, 11).errors_in(tables).outputs
+        Pair::new(s.build().unwrap().as_ref(), Some(1.0), 0.0..1.0, 400, 11).errors().outputs
     };
     let frequency = |top: f64| {
         let s = encoder(json!({"type": "frequency", "bands": 2, "max_frequency": top}));
         Pair::new(s.build().unwrap().as_ref(), None, 0.0..1.0, 400, 11).errors().outputs
     };
-    for tables in [Tables::F32, Tables::F16, Tables::Bf16] {
-        let name = format!("hash grid in {tables}, by cells a side");
-        curves.push(of(&name, (1..=20).map(|k| (2f64.powi(k), grid(1 << k, tables))).collect()));
-    }
+    curves.push(of("hash grid, by cells a side", (1..=20).map(|k| (2f64.powi(k), grid(1 << k))).collect()));
     curves.push(of("frequency, by turns a side", (0..=10).map(|k| (2f64.powi(k), frequency(2f64.powi(k)))).collect()));
     if page::blessing() {
         let options = CurveOptions { log_x: true, log_y: true, ..CurveOptions::default() };

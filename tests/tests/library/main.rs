@@ -12,7 +12,6 @@ mod core_modules;
 mod drift;
 mod gaussians;
 mod guard;
-mod halves;
 mod lines;
 mod live;
 mod masks;

@@ -120,7 +120,7 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
         .collect();
     let losses: [&dyn Loss; 2] = [&L2 {}, &Huber { delta: 0.5 }];
     for loss in losses {
-        let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
+        let kernels = Kernels::new(&pipeline, |s| s.reference().unwrap());
         let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, priors: &priors };
         let case = Case { pipeline: &pipeline, kernels, work };
         let (value, grads) = case.step(&params);
@@ -141,7 +141,7 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
             Work { priors: &priors[..1], ..case.work.clone() },
         ];
         for work in parts {
-            let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
+            let kernels = Kernels::new(&pipeline, |s| s.reference().unwrap());
             let (_, other) = Case { pipeline: &pipeline, kernels, work }.step(&params);
             assert!(case.compare(&params, &other, &sampled).is_err());
         }

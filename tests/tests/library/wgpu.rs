@@ -10,7 +10,6 @@ use conefield_core::backend::{Adam, Backend, BlockWork, TrainRay, Work};
 use conefield_core::loss::Loss;
 use conefield_core::method::{Job, Limits, PretrainJob, Record};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::precision::Tables;
 use conefield_core::prior::Prior;
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
@@ -81,7 +80,7 @@ fn steps_agree(settings: &Value) {
     for (k, loss) in losses.into_iter().enumerate() {
         let text = loss.describe();
         let work = Work { step: 4, seed: 9, loss, rays: &rays, points: &points, priors: &priors };
-        let kernels = Kernels::new(&pipeline, |s| s.reference()).unwrap();
+        let kernels = Kernels::new(&pipeline, |s| s.reference().unwrap());
         let mut exact = vec![0.0; params.len()];
         let projector = pipeline.projector.as_ref();
         let want = Slots::new(&kernels).step(&kernels, projector, &params, &mut exact, &work);
@@ -377,9 +376,7 @@ fn a_perturbed_constant_fails_the_parity_check() {
         let settings = json!({"type": "mlp", "width": 5, "depth": 2, "skips": []});
         let spec: Box<dyn conefield_core::settings::FieldSpec> = serde_json::from_value(settings).unwrap();
         let stage = Changed { inner: Arc::from(spec.build(3).unwrap()), change, scope: Scope::Row };
-        conefield_conformance::check_wgsl(&stage, &options, &|s, p, x, dy, rows| {
-            shared.pass(s, Tables::F32, p, x, dy, rows)
-        })
+        conefield_conformance::check_wgsl(&stage, &options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows))
     };
     assert!(check(Some).passed());
     let perturbed: [fn(String) -> Option<String>; 4] = [
@@ -398,8 +395,7 @@ fn a_perturbed_constant_fails_the_parity_check() {
 #[test]
 fn stages_of_random_shapes_agree() {
     let Some(shared) = crate::device::shared("random shapes") else { return };
-    let pass =
-        |s: &dyn Stage, p: &[f32], x: &[f32], dy: &[f32], rows: usize| shared.pass(s, Tables::F32, p, x, dy, rows);
+    let pass = |s: &dyn Stage, p: &[f32], x: &[f32], dy: &[f32], rows: usize| shared.pass(s, p, x, dy, rows);
     let mut n = 0u64;
     let mut below = |k: u64| {
         n += 1;

@@ -9,7 +9,6 @@ use conefield_conformance::{
     check_regularizer, check_wgsl,
 };
 use conefield_core::arena::Weights;
-use conefield_core::precision::Tables;
 use conefield_core::registry::{self, Make, Origin};
 use conefield_core::stage::{Projector, Stage};
 use conefield_core::{Error, Result};
@@ -335,7 +334,7 @@ impl Device {
             return report;
         }
         self.beside(report, stage.wgsl().is_some(), |shared| {
-            check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, Tables::F32, p, x, dy, rows))
+            check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows))
         })
     }
 
