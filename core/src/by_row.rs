@@ -1,16 +1,14 @@
 //! Stages written for one row at a time: the simple way to an encoder, normalizer or field.
 //!
 //! A [`RowMap`] defines the channels of one row and their gradients. [`ByRow`] makes a complete [`Stage`] of it, with
-//! tiles, double-precision checks, half-precision parameters and masked channels. Stages that need maximum speed
-//! implement [`Stage`] and [`Kernel`] directly. A field with line integrals of its own defines them ray by ray
-//! ([`RayMap`], [`ByRay`]).
+//! tiles, double-precision checks and masked channels. Stages that need maximum speed implement [`Stage`] and
+//! [`Kernel`] directly. A field with line integrals of its own defines them ray by ray ([`RayMap`], [`ByRay`]).
 
 use crate::error::{Error, Result};
-use crate::half::Stored;
 use crate::simd::Real;
 use crate::stage::{
-    Encoder, Field, GradKind, Grads, Halves, Info, Kernel, Lines, Normalizer, Parameter, Reduced, Scope, Stage, Tile,
-    TileMut, UnitRay,
+    Encoder, Field, GradKind, Grads, Info, Kernel, Lines, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+    UnitRay,
 };
 use crate::wgsl::Fragment;
 use std::ops::Range;
@@ -19,8 +17,7 @@ use std::sync::Arc;
 /// Up to this many parameters, each worker sums gradients in its own copy. Above it, one worker sums all.
 const FEW: usize = 1 << 20;
 
-/// A map of the channels of one row. One source serves `f32`, `f64` and parameters in halves: `params[i].value()` is
-/// parameter `i`.
+/// A map of the channels of one row. One source serves `f32` and `f64`.
 pub trait RowMap: Send + Sync + 'static {
     /// Input and output channels. An encoder has 3 inputs, a field 1 output.
     fn widths(&self) -> [usize; 2];
@@ -36,10 +33,10 @@ pub trait RowMap: Send + Sync + 'static {
     }
 
     /// Computes the output channels `y` from the input channels `x`. `y` is 0 on entry.
-    fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]);
+    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]);
 
     /// Given `dy = ∂L/∂y`, adds `∂L/∂params` to `grads` and `∂L/∂x` to `dx`, which is 0 on entry.
-    fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]);
+    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]);
 
     /// A line for `explain` that begins with the type name.
     fn describe(&self) -> String;
@@ -117,8 +114,8 @@ impl<T: RowMap> ByRow<T> {
     }
 }
 
-impl<T: RowMap, R: Real, P: Stored<R>> Kernel<R, P> for ByRow<T> {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+impl<T: RowMap, R: Real> Kernel<R> for ByRow<T> {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
         let [mut row, mut out] = self.map.widths().map(|n| vec![R::ZERO; n]);
         for i in 0..x.rows {
             Self::take(x, i, &self.inputs, &mut row);
@@ -132,7 +129,7 @@ impl<T: RowMap, R: Real, P: Stored<R>> Kernel<R, P> for ByRow<T> {
 
     fn backward(
         &self,
-        params: &[P],
+        params: &[R],
         x: Tile<'_, R>,
         _: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -187,10 +184,6 @@ impl<T: RowMap> Stage for ByRow<T> {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        Some(Halves::of(self))
     }
 
     /// Only for the whole map: a reduced stage runs on the CPU.
@@ -296,9 +289,6 @@ impl<T: RayMap> Stage for ByRay<T> {
     }
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         self.0.reference()
-    }
-    fn halves(&self) -> Option<Halves<'_>> {
-        self.0.halves()
     }
     fn wgsl(&self) -> Option<Fragment> {
         self.0.wgsl()

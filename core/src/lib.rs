@@ -1,7 +1,7 @@
 //! The contracts between conefield's stages, backends and methods.
 //!
 //! - [`geometry`], [`orbit`], [`scan`], [`outside`], [`parts`]: measurements in millimetres, and the resulting volumes.
-//! - [`simd`], [`half`], [`dense`], [`activation`], [`trilinear`], [`stage`]: the arithmetic of stages.
+//! - [`simd`], [`dense`], [`activation`], [`trilinear`], [`stage`]: the arithmetic of stages.
 //! - [`by_row`]: stages written for one row at a time; [`prelude`]: imports for their authors.
 //! - [`support`]: where the object can be; [`scene`]: the mapping between the world and the stages.
 //! - [`loss`], [`prior`]: what training minimizes.
@@ -29,7 +29,6 @@ pub mod error;
 pub mod files;
 pub mod finite;
 pub mod geometry;
-pub mod half;
 pub mod host;
 pub mod loss;
 pub mod method;

@@ -1,9 +1,8 @@
 //! An encoder with only its coarse levels open, for coarse-to-fine training.
 
 use crate::error::{Error, Result, ensure};
-use crate::half::{Bf16, F16};
 use crate::simd::Real;
-use crate::stage::{Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Stage, Tile, TileMut};
+use crate::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Stage, Tile, TileMut};
 use crate::wgsl::{Fragment, functions, hosted};
 use std::ops::Range;
 use std::sync::Arc;
@@ -42,11 +41,11 @@ impl Opened {
         Ok(Self { whole, open: Arc::from(kept.stage), channels, params })
     }
 
-    fn forward_of<R: Real, P>(
+    fn forward_of<R: Real>(
         &self,
-        kernel: &dyn Kernel<R, P>,
+        kernel: &dyn Kernel<R>,
         pass: Option<usize>,
-        params: &[P],
+        params: &[R],
         x: Tile<'_, R>,
         y: TileMut<'_, R>,
         tape: TileMut<'_, R>,
@@ -62,10 +61,10 @@ impl Opened {
         }
     }
 
-    fn backward_of<R: Real, P>(
+    fn backward_of<R: Real>(
         &self,
-        kernel: &dyn Kernel<R, P>,
-        params: &[P],
+        kernel: &dyn Kernel<R>,
+        params: &[R],
         (x, tape, dy): (Tile<'_, R>, TileMut<'_, R>, Tile<'_, R>),
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
@@ -82,9 +81,9 @@ impl Opened {
 
 /// The kernels of one precision, for the open channels.
 macro_rules! kernels {
-    ($real:ty, $stored:ty, $pick:ident) => {
-        impl Kernel<$real, $stored> for Opened {
-            fn forward(&self, params: &[$stored], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
+    ($real:ty, $pick:ident) => {
+        impl Kernel<$real> for Opened {
+            fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
                 if let Some(kernel) = $pick(&*self.open) {
                     self.forward_of(kernel, None, params, x, y, tape);
                 }
@@ -97,7 +96,7 @@ macro_rules! kernels {
             fn forward_pass(
                 &self,
                 pass: usize,
-                params: &[$stored],
+                params: &[$real],
                 x: Tile<'_, $real>,
                 y: TileMut<'_, $real>,
                 tape: TileMut<'_, $real>,
@@ -109,7 +108,7 @@ macro_rules! kernels {
 
             fn backward(
                 &self,
-                params: &[$stored],
+                params: &[$real],
                 x: Tile<'_, $real>,
                 tape: TileMut<'_, $real>,
                 dy: Tile<'_, $real>,
@@ -123,10 +122,8 @@ macro_rules! kernels {
         }
     };
 }
-kernels!(f32, f32, single);
-kernels!(f64, f64, double);
-kernels!(f32, F16, f16);
-kernels!(f32, Bf16, bf16);
+kernels!(f32, single);
+kernels!(f64, double);
 
 fn single(open: &dyn Encoder) -> Option<&dyn Kernel<f32>> {
     Some(open.kernel())
@@ -134,14 +131,6 @@ fn single(open: &dyn Encoder) -> Option<&dyn Kernel<f32>> {
 
 fn double(open: &dyn Encoder) -> Option<&dyn Kernel<f64>> {
     open.reference()
-}
-
-fn f16(open: &dyn Encoder) -> Option<&dyn Kernel<f32, F16>> {
-    open.halves().map(|h| h.f16)
-}
-
-fn bf16(open: &dyn Encoder) -> Option<&dyn Kernel<f32, Bf16>> {
-    open.halves().map(|h| h.bf16)
 }
 
 impl Stage for Opened {
@@ -163,10 +152,6 @@ impl Stage for Opened {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         self.open.reference().map(|_| self as _)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        self.open.halves().map(|_| Halves::of(self))
     }
 
     /// The closed channels are one additional range.

@@ -5,7 +5,6 @@ pub use crate::by_row::{ByRay, ByRow, RayMap, RowMap, Sums};
 pub use crate::data_term::{DataTerm, DataTermSpec, Misfit};
 pub use crate::error::{Error, Result, ensure};
 pub use crate::geometry::VoxelGrid;
-pub use crate::half::Stored;
 pub use crate::loss::{Loss, NoiseModel};
 pub use crate::prior::{Blocks, Prior};
 pub use crate::random::{mix, unit};

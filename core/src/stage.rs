@@ -3,7 +3,6 @@
 //! A tile is channel-major: channel `c` of row `i` is at index `c·rows + i`. Rows are samples, in ray-major order.
 
 use crate::error::{Error, Result};
-use crate::half::{Bf16, F16, Half};
 use crate::simd::Real;
 use crate::wgsl::Fragment;
 use std::ops::Range;
@@ -164,17 +163,17 @@ impl Parameter {
     }
 }
 
-/// The arithmetic of a stage in one precision, with parameters stored as `P`.
-pub trait Kernel<R: Real, P = R>: Send + Sync {
+/// The arithmetic of a stage in one precision.
+pub trait Kernel<R: Real>: Send + Sync {
     /// Computes `y = f(x; params)`. Fills `tape` (`[info.tape][rows]`) for [`Kernel::backward`].
-    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>);
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>);
 
     /// `tape` holds the values of the forward pass and may be used as scratch. Given `dy = ∂L/∂y`, *adds* `∂L/∂params`
     /// to `grads` and, if `dx` is given, overwrites it with `∂L/∂x`. The summation order of a parameter's gradient must
     /// not depend on `grads.range`.
     fn backward(
         &self,
-        params: &[P],
+        params: &[R],
         x: Tile<'_, R>,
         tape: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -189,20 +188,20 @@ pub trait Kernel<R: Real, P = R>: Send + Sync {
     }
 
     /// Pass `pass` of [`Kernel::forward`]; all [`Kernel::passes`] in order give the whole.
-    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+    fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         debug_assert_eq!(pass, 0);
         self.forward(params, x, y, tape);
     }
 
     /// For a stage that looks along rays ([`Scope::Ray`]): the same function of points off any ray, each row a ray of
     /// one sample. Without it, a host passes such rows one at a time, which is slow.
-    fn points(&self) -> Option<&(dyn Kernel<R, P> + '_)> {
+    fn points(&self) -> Option<&(dyn Kernel<R> + '_)> {
         None
     }
 }
 
-impl<R: Real, P, K: Kernel<R, P> + ?Sized> Kernel<R, P> for &K {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+impl<R: Real, K: Kernel<R> + ?Sized> Kernel<R> for &K {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         (**self).forward(params, x, y, tape);
     }
 
@@ -210,17 +209,17 @@ impl<R: Real, P, K: Kernel<R, P> + ?Sized> Kernel<R, P> for &K {
         (**self).passes()
     }
 
-    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+    fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         (**self).forward_pass(pass, params, x, y, tape);
     }
 
-    fn points(&self) -> Option<&(dyn Kernel<R, P> + '_)> {
+    fn points(&self) -> Option<&(dyn Kernel<R> + '_)> {
         (**self).points()
     }
 
     fn backward(
         &self,
-        params: &[P],
+        params: &[R],
         x: Tile<'_, R>,
         tape: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -228,57 +227,6 @@ impl<R: Real, P, K: Kernel<R, P> + ?Sized> Kernel<R, P> for &K {
         dx: Option<TileMut<'_, R>>,
     ) {
         (**self).backward(params, x, tape, dy, grads, dx);
-    }
-}
-
-/// A stage's arithmetic with half-precision parameters, equivalent to [`Stage::kernel`] on the same values. Gradients
-/// are `f32`.
-#[derive(Clone, Copy)]
-pub struct Halves<'a> {
-    /// For `binary16`.
-    pub f16: &'a dyn Kernel<f32, F16>,
-    /// For `bfloat16`.
-    pub bf16: &'a dyn Kernel<f32, Bf16>,
-}
-
-impl<'a> Halves<'a> {
-    /// From a kernel that implements both.
-    pub fn of<K: Kernel<f32, F16> + Kernel<f32, Bf16>>(kernel: &'a K) -> Self {
-        Self { f16: kernel, bf16: kernel }
-    }
-}
-
-/// A kernel that reads its own half-precision parameters instead of those passed to it.
-pub struct Reader<'a, H> {
-    /// The arithmetic.
-    pub kernel: &'a dyn Kernel<f32, H>,
-    /// Its parameters.
-    pub params: &'a [H],
-}
-
-impl<H: Half> Kernel<f32> for Reader<'_, H> {
-    fn forward(&self, _: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
-        self.kernel.forward(self.params, x, y, tape);
-    }
-
-    fn passes(&self) -> usize {
-        self.kernel.passes()
-    }
-
-    fn forward_pass(&self, pass: usize, _: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
-        self.kernel.forward_pass(pass, self.params, x, y, tape);
-    }
-
-    fn backward(
-        &self,
-        _: &[f32],
-        x: Tile<'_, f32>,
-        tape: TileMut<'_, f32>,
-        dy: Tile<'_, f32>,
-        grads: Grads<'_, f32>,
-        dx: Option<TileMut<'_, f32>>,
-    ) {
-        self.kernel.backward(self.params, x, tape, dy, grads, dx);
     }
 }
 
@@ -298,12 +246,6 @@ pub trait Stage: Send + Sync {
 
     /// The same formula in double precision, for checking gradients.
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
-        None
-    }
-
-    /// The arithmetic with half-precision parameters, or `None` if there is none. Hosts use it for
-    /// [`GradKind::Scatter`] stages if a spec asks for it ([`crate::precision::Precision`]).
-    fn halves(&self) -> Option<Halves<'_>> {
         None
     }
 

@@ -5,7 +5,6 @@
 //! position is `p = clamp(x·scale + shift, 0, n − 1)`, the cell is `⌊p⌋` (the last cell if `p = n − 1`) and the
 //! fraction is the remainder.
 
-use crate::half::Stored;
 use crate::simd::{Real, Select, Simd, SimdBase, SimdFloat, V, load, store};
 use crate::stage::Tile;
 use std::ops::Range;
@@ -147,14 +146,14 @@ impl<R: Real> Located<R> {
 
     /// The interpolated features of row `i` from `table`, the grid's entries.
     #[inline(always)]
-    pub fn gather<P: Stored<R>, const F: usize>(&self, i: usize, offsets: &[usize; 8], table: &[[P; F]]) -> [R; F] {
+    pub fn gather<const F: usize>(&self, i: usize, offsets: &[usize; 8], table: &[[R; F]]) -> [R; F] {
         let weights = self.weights(i);
         let cell = &table[self.base[i]..];
         let mut sum = [R::ZERO; F];
         for c in 0..8 {
             let entry = &cell[offsets[c]];
             for f in 0..F {
-                sum[f] += weights[c] * entry[f].value();
+                sum[f] += weights[c] * entry[f];
             }
         }
         sum

@@ -10,12 +10,9 @@ use crate::levels::{
     BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, kernel_of_levels, start, stretch,
 };
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, run};
-use conefield_core::stage::{
-    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -191,15 +188,15 @@ impl<R: Real> Located<R> {
     }
 }
 
-struct Forward<'a, R, P> {
+struct Forward<'a, R> {
     stage: &'a BSplineGridStage,
     levels: Range<usize>,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
+impl<R: Real> Forward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
@@ -217,11 +214,8 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
                             let weight = R::Four::<S>::splat(s, located.weight[0][r][i] * located.weight[1][r][j]);
                             let run = &table[level.run(&located.cells, r, i, j, F)..][..TAPS * F];
                             for q in 0..F {
-                                let mut lanes = [R::ZERO; 4];
-                                for k in 0..4 {
-                                    lanes[k] = run[4 * q + k].value();
-                                }
-                                sums[q] = R::Four::<S>::from_slice(s, &lanes).mul_add(weight, sums[q]);
+                                let four = R::Four::<S>::from_slice(s, &run[4 * q..4 * q + 4]);
+                                sums[q] = four.mul_add(weight, sums[q]);
                             }
                         }
                     }
@@ -277,16 +271,16 @@ fn add<S: Simd, R: Real, const F: usize>(
     }
 }
 
-struct Backward<'a, R, P> {
+struct Backward<'a, R> {
     stage: &'a BSplineGridStage,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
+impl<R: Real> Backward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
@@ -348,9 +342,9 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
 }
 
 /// Derivative of `Σ dy·y` of row `r` with respect to its position in cells.
-fn slope_of<R: Real, P: Stored<R>, const F: usize>(
+fn slope_of<R: Real, const F: usize>(
     level: &Level,
-    table: &[P],
+    table: &[R],
     located: &Located<R>,
     r: usize,
     dy: &[R; F],
@@ -362,7 +356,7 @@ fn slope_of<R: Real, P: Stored<R>, const F: usize>(
         for j in 0..TAPS {
             let run = &table[level.run(&located.cells, r, i, j, F)..][..TAPS * F];
             for k in 0..TAPS {
-                let value: R = (0..F).map(|f| run[k * F + f].value() * dy[f]).sum();
+                let value: R = (0..F).map(|f| run[k * F + f] * dy[f]).sum();
                 sum[0] += by[0][i] * weight[1][j] * weight[2][k] * value;
                 sum[1] += weight[0][i] * by[1][j] * weight[2][k] * value;
                 sum[2] += weight[0][i] * weight[1][j] * by[2][k] * value;
@@ -405,10 +399,6 @@ impl Stage for BSplineGridStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        Some(Halves::of(self))
     }
 
     /// A worker owns some planes of equal x of a large level: at most 16 parts, because each visits every row again.

@@ -1,13 +1,10 @@
 //! Several encoders side by side: points `[n, 3]` to the channels of the first part, then of the second, and so on.
 
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::half::{Bf16, F16};
 use conefield_core::random::mix;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::Real;
-use conefield_core::stage::{
-    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::{Fragment, functions, hosted};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -56,16 +53,6 @@ struct ConcatMember {
     outputs: Range<usize>,
     params: Range<usize>,
     tape: Range<usize>,
-}
-
-impl ConcatMember {
-    /// The kernel for half-precision parameters, if it has parameters.
-    fn in_halves<P>(&self, pick: fn(Halves<'_>) -> &dyn Kernel<f32, P>) -> Option<Own<'_, f32, P>> {
-        match self.info.params {
-            0 => Some(Own::Alone(self.stage.kernel())),
-            _ => self.stage.halves().map(|h| Own::Reads(pick(h))),
-        }
-    }
 }
 
 /// The stage that [`Concat`] builds.
@@ -123,34 +110,18 @@ impl ConcatStage {
     }
 }
 
-/// A kernel of a part, on parameters stored as `P`.
-enum Own<'a, R: Real, P> {
-    Reads(&'a dyn Kernel<R, P>),
-    /// For a part without parameters.
-    Alone(&'a dyn Kernel<R>),
-}
-
-impl<R: Real, P> Own<'_, R, P> {
-    fn passes(&self) -> usize {
-        match self {
-            Self::Reads(kernel) => kernel.passes(),
-            Self::Alone(kernel) => kernel.passes(),
-        }
-    }
-}
-
 /// The kernel of a part in one precision.
-type Pick<R, P> = fn(&ConcatMember) -> Option<Own<'_, R, P>>;
+type Pick<R> = fn(&ConcatMember) -> Option<&dyn Kernel<R>>;
 
 fn channels<'a, R: Real>(data: &'a mut [R], range: &Range<usize>, rows: usize) -> TileMut<'a, R> {
     TileMut::new(&mut data[range.start * rows..range.end * rows], rows)
 }
 
 impl ConcatStage {
-    fn forward_parts<R: Real, P>(
+    fn forward_parts<R: Real>(
         &self,
-        pick: Pick<R, P>,
-        params: &[P],
+        pick: Pick<R>,
+        params: &[R],
         x: Tile<'_, R>,
         y: TileMut<'_, R>,
         tape: TileMut<'_, R>,
@@ -158,48 +129,42 @@ impl ConcatStage {
         for part in &self.parts {
             let y = channels(y.data, &part.outputs, x.rows);
             let tape = channels(tape.data, &part.tape, x.rows);
-            match pick(part) {
-                Some(Own::Reads(kernel)) => kernel.forward(&params[part.params.clone()], x, y, tape),
-                Some(Own::Alone(kernel)) => kernel.forward(&[], x, y, tape),
-                None => {}
+            if let Some(kernel) = pick(part) {
+                kernel.forward(&params[part.params.clone()], x, y, tape);
             }
         }
     }
 
     /// Sum of the passes of all parts.
-    fn passes_of_parts<R: Real, P>(&self, pick: Pick<R, P>) -> usize {
-        self.parts.iter().map(|part| pick(part).map_or(0, |own| own.passes())).sum()
+    fn passes_of_parts<R: Real>(&self, pick: Pick<R>) -> usize {
+        self.parts.iter().map(|part| pick(part).map_or(0, Kernel::passes)).sum()
     }
 
-    fn forward_pass_of_parts<R: Real, P>(
+    fn forward_pass_of_parts<R: Real>(
         &self,
-        pick: Pick<R, P>,
+        pick: Pick<R>,
         mut pass: usize,
-        params: &[P],
+        params: &[R],
         x: Tile<'_, R>,
         y: TileMut<'_, R>,
         tape: TileMut<'_, R>,
     ) {
         for part in &self.parts {
-            let Some(own) = pick(part) else { continue };
-            if pass >= own.passes() {
-                pass -= own.passes();
+            let Some(kernel) = pick(part) else { continue };
+            if pass >= kernel.passes() {
+                pass -= kernel.passes();
                 continue;
             }
             let y = channels(y.data, &part.outputs, x.rows);
             let tape = channels(tape.data, &part.tape, x.rows);
-            match own {
-                Own::Reads(kernel) => kernel.forward_pass(pass, &params[part.params.clone()], x, y, tape),
-                Own::Alone(kernel) => kernel.forward_pass(pass, &[], x, y, tape),
-            }
-            return;
+            return kernel.forward_pass(pass, &params[part.params.clone()], x, y, tape);
         }
     }
 
-    fn backward_parts<R: Real, P>(
+    fn backward_parts<R: Real>(
         &self,
-        pick: Pick<R, P>,
-        params: &[P],
+        pick: Pick<R>,
+        params: &[R],
         x: Tile<'_, R>,
         tape: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -225,13 +190,8 @@ impl ConcatStage {
             let part_dx = dx.as_mut().map(|dx| TileMut::new(if i == 0 { &mut *dx.data } else { &mut one }, n));
             let (tape, grads) = (channels(tape.data, &part.tape, n), Grads { values, range: own });
             let dy = Tile::new(dy.channels(part.outputs.clone()), n);
-            match pick(part) {
-                Some(Own::Reads(kernel)) => {
-                    kernel.backward(&params[part.params.clone()], x, tape, dy, grads, part_dx);
-                }
-                Some(Own::Alone(kernel)) => kernel.backward(&[], x, tape, dy, grads, part_dx),
-                None => continue,
-            }
+            let Some(kernel) = pick(part) else { continue };
+            kernel.backward(&params[part.params.clone()], x, tape, dy, grads, part_dx);
             if let (Some(dx), true) = (&mut dx, i > 0) {
                 dx.data.iter_mut().zip(&one).for_each(|(sum, &d)| *sum += d);
             }
@@ -241,20 +201,20 @@ impl ConcatStage {
 
 /// The kernels of one precision, from the parts' kernels that `$pick` finds.
 macro_rules! kernels {
-    ($real:ty, $stored:ty, $pick:expr) => {
-        impl Kernel<$real, $stored> for ConcatStage {
-            fn forward(&self, params: &[$stored], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
+    ($real:ty, $pick:expr) => {
+        impl Kernel<$real> for ConcatStage {
+            fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
                 self.forward_parts($pick, params, x, y, tape);
             }
 
             fn passes(&self) -> usize {
-                self.passes_of_parts::<$real, $stored>($pick)
+                self.passes_of_parts::<$real>($pick)
             }
 
             fn forward_pass(
                 &self,
                 pass: usize,
-                params: &[$stored],
+                params: &[$real],
                 x: Tile<'_, $real>,
                 y: TileMut<'_, $real>,
                 tape: TileMut<'_, $real>,
@@ -264,7 +224,7 @@ macro_rules! kernels {
 
             fn backward(
                 &self,
-                params: &[$stored],
+                params: &[$real],
                 x: Tile<'_, $real>,
                 tape: TileMut<'_, $real>,
                 dy: Tile<'_, $real>,
@@ -276,10 +236,8 @@ macro_rules! kernels {
         }
     };
 }
-kernels!(f32, f32, |p| Some(Own::Reads(p.stage.kernel())));
-kernels!(f64, f64, |p| p.stage.reference().map(Own::Reads));
-kernels!(f32, F16, |p| p.in_halves(|h| h.f16));
-kernels!(f32, Bf16, |p| p.in_halves(|h| h.bf16));
+kernels!(f32, |p| Some(p.stage.kernel()));
+kernels!(f64, |p| p.stage.reference());
 
 impl Stage for ConcatStage {
     fn info(&self) -> Info {
@@ -309,10 +267,6 @@ impl Stage for ConcatStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         self.parts.iter().all(|p| p.stage.reference().is_some()).then_some(self as _)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        self.parts.iter().all(|p| p.in_halves(|h| h.f16).is_some()).then(|| Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

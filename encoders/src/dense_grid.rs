@@ -7,12 +7,9 @@
 
 use crate::levels::{LevelCode, by_channel, by_features, functions, kernel_of_levels};
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{
-    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
 use conefield_core::wgsl::{Fragment, TRILINEAR};
 use schemars::JsonSchema;
@@ -127,15 +124,15 @@ impl DenseGridStage {
     }
 }
 
-struct Forward<'a, R, P> {
+struct Forward<'a, R> {
     stage: &'a DenseGridStage,
     levels: Range<usize>,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
+impl<R: Real> Forward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::default();
@@ -162,16 +159,16 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     }
 }
 
-struct Backward<'a, R, P> {
+struct Backward<'a, R> {
     stage: &'a DenseGridStage,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
+impl<R: Real> Backward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::default();
@@ -208,7 +205,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                 if let Some(dx) = &mut self.dx {
                     for i in 0..n {
                         let cell = &table[located.base(i)..];
-                        let corners = offsets.map(|o| (0..F).map(|f| cell[o][f].value() * dy[i][f]).sum());
+                        let corners = offsets.map(|o| (0..F).map(|f| cell[o][f] * dy[i][f]).sum());
                         for (d, slope) in located.slopes(i, corners).into_iter().enumerate() {
                             dx.channel(d)[at + i] += slope;
                         }
@@ -256,10 +253,6 @@ impl Stage for DenseGridStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        Some(Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

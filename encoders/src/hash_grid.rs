@@ -6,12 +6,9 @@
 
 use crate::levels::{self, BLOCK, LevelCode, by_channel, functions, kernel_of_levels, prefetch};
 use conefield_core::error::{Result, ensure};
-use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{
-    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -332,82 +329,50 @@ fn add<S: Simd, R: Real, const F: usize>(s: S, grads: &mut [[R; F]], ends: [u32;
     }
 }
 
-/// Half-precision entries of a block, widened together: a loop over neighbours becomes vector code.
-struct Wide<R, P, const F: usize> {
-    read: [[[P; F]; 2]; 4 * BLOCK],
-    wide: [[[R; F]; 2]; 4 * BLOCK],
-}
-
-impl<R: Real, P: Stored<R>, const F: usize> Wide<R, P, F> {
-    fn new() -> Self {
-        Self { read: [[[P::default(); F]; 2]; 4 * BLOCK], wide: [[[R::ZERO; F]; 2]; 4 * BLOCK] }
-    }
-
-    /// The features of the first `n` rows at `located`, on a `DENSE` or hashed level.
-    #[inline(always)]
-    fn interpolate<S: Simd, const DENSE: bool>(
-        &mut self,
-        s: S,
-        table: &[[P; F]],
-        located: &Located<R>,
-        n: usize,
-        out: &mut [[R; F]; BLOCK],
-    ) {
-        let widen = size_of::<P>() < size_of::<R>();
-        if widen {
-            for i in 0..n {
-                for e in 0..4 {
-                    let [near, far] = located.ends(DENSE, e, i);
-                    self.read[4 * i + e] = [*entry(table, near), *entry(table, far)];
-                }
-            }
-            let read = self.read.as_flattened().as_flattened();
-            for (wide, &read) in self.wide.as_flattened_mut().as_flattened_mut().iter_mut().zip(read) {
-                *wide = read.value();
+/// The features of the first `n` rows at `located`, on a `DENSE` or hashed level.
+#[inline(always)]
+fn interpolate<S: Simd, R: Real, const F: usize, const DENSE: bool>(
+    s: S,
+    table: &[[R; F]],
+    located: &Located<R>,
+    n: usize,
+    out: &mut [[R; F]; BLOCK],
+) {
+    for i in 0..n {
+        let mut sum = [R::Four::<S>::splat(s, R::ZERO); 4];
+        for e in 0..4 {
+            let ends = located.ends(DENSE, e, i).map(|i| *entry(table, i));
+            let (w, ends) = (R::Four::<S>::splat(s, located.weight[e][i]), fours(s, &ends));
+            for q in 0..registers(F) {
+                sum[q] = ends[q].mul_add(w, sum[q]);
             }
         }
-        for i in 0..n {
-            let mut sum = [R::Four::<S>::splat(s, R::ZERO); 4];
-            for e in 0..4 {
-                let [near, far] = located.ends(DENSE, e, i);
-                let ends = if widen {
-                    self.wide[4 * i + e]
-                } else {
-                    [entry(table, near).map(|p| p.value()), entry(table, far).map(|p| p.value())]
-                };
-                let (w, ends) = (R::Four::<S>::splat(s, located.weight[e][i]), fours(s, &ends));
-                for q in 0..registers(F) {
-                    sum[q] = ends[q].mul_add(w, sum[q]);
-                }
-            }
-            let along = located.along::<S, F>(s, i);
-            if F < 4 {
-                let both = sum[0] * along[0];
-                let other = if F == 1 { both.rotate_elements_left::<1>() } else { both.rotate_elements_left::<2>() };
-                out[i].copy_from_slice(&(both + other).as_slice()[..F]);
-            } else {
-                for q in 0..F / 4 {
-                    let other = q + F / 4;
-                    let both = sum[other].mul_add(along[other], sum[q] * along[q]);
-                    out[i][4 * q..4 * q + 4].copy_from_slice(both.as_slice());
-                }
+        let along = located.along::<S, F>(s, i);
+        if F < 4 {
+            let both = sum[0] * along[0];
+            let other = if F == 1 { both.rotate_elements_left::<1>() } else { both.rotate_elements_left::<2>() };
+            out[i].copy_from_slice(&(both + other).as_slice()[..F]);
+        } else {
+            for q in 0..F / 4 {
+                let other = q + F / 4;
+                let both = sum[other].mul_add(along[other], sum[q] * along[q]);
+                out[i][4 * q..4 * q + 4].copy_from_slice(both.as_slice());
             }
         }
     }
 }
 
-struct Forward<'a, R, P> {
+struct Forward<'a, R> {
     stage: &'a HashGridStage,
     levels: Range<usize>,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
+impl<R: Real> Forward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
-        let mut wide = Wide::<R, P, F>::new();
         let mut located = Located::new();
         let mut out = [[R::ZERO; F]; BLOCK];
         for level in &self.stage.levels[self.levels.clone()] {
@@ -417,10 +382,10 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
                 let n = BLOCK.min(self.x.rows - at);
                 located.locate(s, level, self.stage.primes, self.x, at, n);
                 if level.dense {
-                    wide.interpolate::<S, true>(s, table, &located, n, &mut out);
+                    interpolate::<S, R, F, true>(s, table, &located, n, &mut out);
                 } else {
                     prefetch(table, located.near.iter().chain(&located.far), n);
-                    wide.interpolate::<S, false>(s, table, &located, n, &mut out);
+                    interpolate::<S, R, F, false>(s, table, &located, n, &mut out);
                 }
                 for (f, channel) in level.outputs.iter().enumerate() {
                     if let Some(c) = *channel {
@@ -434,7 +399,7 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     }
 }
 
-impl<R: Real, P: Stored<R>> Op for Forward<'_, R, P> {
+impl<R: Real> Op for Forward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -494,16 +459,16 @@ fn scatter<S: Simd, R: Real, const F: usize, const DENSE: bool>(
     }
 }
 
-struct Backward<'a, R, P> {
+struct Backward<'a, R> {
     stage: &'a HashGridStage,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
+impl<R: Real> Backward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
@@ -557,7 +522,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                     for i in 0..n {
                         let v: [R; 8] = std::array::from_fn(|c| {
                             let entry = &table[located.ends(level.dense, c >> 1, i)[c & 1] as usize];
-                            (0..F).map(|f| entry[f].value() * dy[i][f]).sum()
+                            (0..F).map(|f| entry[f] * dy[i][f]).sum()
                         });
                         for d in 0..3 {
                             // Beyond the rim a position is clamped, whatever its value.
@@ -586,7 +551,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
     }
 }
 
-impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
+impl<R: Real> Op for Backward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -639,10 +604,6 @@ impl Stage for HashGridStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        Some(Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

@@ -25,7 +25,7 @@ pub fn start(seed: u64, params: &mut [f32]) {
 /// Runs `features` of an operation with the stage's number of features as a constant.
 macro_rules! by_features {
     ($op:ident) => {
-        impl<R: Real, P: Stored<R>> Op for $op<'_, R, P> {
+        impl<R: Real> Op for $op<'_, R> {
             type Number = R;
             type Out = ();
             #[inline(always)]
@@ -45,8 +45,8 @@ pub(crate) use by_features;
 /// The kernel of a stage with `levels`: its `Forward` over a range of levels, one pass each, and its `Backward`.
 macro_rules! kernel_of_levels {
     ($stage:ident) => {
-        impl<R: Real, P: Stored<R>> Kernel<R, P> for $stage {
-            fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        impl<R: Real> Kernel<R> for $stage {
+            fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
                 run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
             }
 
@@ -54,13 +54,13 @@ macro_rules! kernel_of_levels {
                 self.levels.len()
             }
 
-            fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+            fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
                 run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
             }
 
             fn backward(
                 &self,
-                params: &[P],
+                params: &[R],
                 x: Tile<'_, R>,
                 _: TileMut<'_, R>,
                 dy: Tile<'_, R>,

@@ -19,12 +19,9 @@ use crate::levels::{
     start,
 };
 use conefield_core::error::{Result, ensure};
-use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{
-    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -293,22 +290,19 @@ fn add<R: Real, const F: usize>(grads: &mut [[R; F]], corners: [u32; 4], sums: &
     }
 }
 
-struct Forward<'a, R, P> {
+struct Forward<'a, R> {
     stage: &'a PermutohedralStage,
     levels: Range<usize>,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
+impl<R: Real> Forward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
         let mut out = [[R::ZERO; F]; BLOCK];
-        // Half-precision entries are widened a block at a time: a loop over neighbours becomes vector code.
-        let widen = size_of::<P>() < size_of::<R>();
-        let (mut read, mut wide) = ([[[P::default(); F]; 4]; BLOCK], [[[R::ZERO; F]; 4]; BLOCK]);
         for level in &self.stage.levels[self.levels.clone()] {
             let (table, _) = self.params[level.table.range()].as_chunks::<F>();
             assert_eq!(table.len(), level.last as usize + 1);
@@ -318,24 +312,9 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
                 if level.side == 0 {
                     prefetch(table, located.entry.iter(), n);
                 }
-                if widen {
-                    for i in 0..n {
-                        for c in 0..4 {
-                            read[i][c] = *at(table, located.entry[c][i]);
-                        }
-                    }
-                    let read = read.as_flattened().as_flattened();
-                    for (wide, &read) in wide.as_flattened_mut().as_flattened_mut().iter_mut().zip(read) {
-                        *wide = read.value();
-                    }
-                }
                 for i in 0..n {
-                    if !widen {
-                        for c in 0..4 {
-                            wide[i][c] = at(table, located.entry[c][i]).map(|p| p.value());
-                        }
-                    }
-                    let (corners, weights) = (fours(s, &wide[i]), located.weights::<S, F>(s, i));
+                    let corners = located.corners(i).map(|c| *at(table, c));
+                    let (corners, weights) = (fours(s, &corners), located.weights::<S, F>(s, i));
                     let mut sum = [corners[0] * weights[0], R::Four::<S>::splat(s, R::ZERO)];
                     for q in 1..F {
                         let to = if F == 8 { q % 2 } else { 0 };
@@ -388,16 +367,16 @@ fn scatter<S: Simd, R: Real, const F: usize>(
     }
 }
 
-struct Backward<'a, R, P> {
+struct Backward<'a, R> {
     stage: &'a PermutohedralStage,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
+impl<R: Real> Backward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = Located::new();
@@ -427,7 +406,7 @@ impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
                 for i in 0..n {
                     let v: [R; 4] = located.corners(i).map(|c| {
                         let entry = &table[c as usize];
-                        (0..F).map(|f| entry[f].value() * dy[i][f]).sum()
+                        (0..F).map(|f| entry[f] * dy[i][f]).sum()
                     });
                     // With respect to a fraction: the corner that it adds to, minus the one before.
                     let by = [0, 1, 2].map(|d| {
@@ -482,10 +461,6 @@ impl Stage for PermutohedralStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        Some(Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

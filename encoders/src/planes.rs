@@ -14,12 +14,9 @@ use crate::levels::{
     Asked, BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, kernel_of_levels, start, stretch,
 };
 use conefield_core::error::{Result, ensure};
-use conefield_core::half::Stored;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{
-    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -189,12 +186,12 @@ fn products<R: Real>(a: [R; 2], b: [R; 2]) -> [R; 4] {
 
 /// `Σ weights·plane` at the corners.
 #[inline(always)]
-fn on_plane<R: Real, P: Stored<R>, const F: usize>(plane: &[[P; F]], at: &Place<R>, weights: [R; 4]) -> [R; F] {
+fn on_plane<R: Real, const F: usize>(plane: &[[R; F]], at: &Place<R>, weights: [R; 4]) -> [R; F] {
     let mut sum = [R::ZERO; F];
     for c in 0..4 {
         let entry = &plane[at.corners[c]];
         for f in 0..F {
-            sum[f] += weights[c] * entry[f].value();
+            sum[f] += weights[c] * entry[f];
         }
     }
     sum
@@ -202,24 +199,24 @@ fn on_plane<R: Real, P: Stored<R>, const F: usize>(plane: &[[P; F]], at: &Place<
 
 /// `Σ weights·line` at both nodes.
 #[inline(always)]
-fn on_line<R: Real, P: Stored<R>, const F: usize>(line: &[[P; F]], at: &Place<R>, weights: [R; 2]) -> [R; F] {
+fn on_line<R: Real, const F: usize>(line: &[[R; F]], at: &Place<R>, weights: [R; 2]) -> [R; F] {
     let mut sum = [R::ZERO; F];
     let [near, far] = [&line[at.node], &line[at.node + 1]];
     for f in 0..F {
-        sum[f] = weights[0] * near[f].value() + weights[1] * far[f].value();
+        sum[f] = weights[0] * near[f] + weights[1] * far[f];
     }
     sum
 }
 
-struct Forward<'a, R, P> {
+struct Forward<'a, R> {
     stage: &'a PlanesStage,
     levels: Range<usize>,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
+impl<R: Real> Forward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut cells = Cells::new();
@@ -255,16 +252,16 @@ impl<R: Real, P: Stored<R>> Forward<'_, R, P> {
     }
 }
 
-struct Backward<'a, R, P> {
+struct Backward<'a, R> {
     stage: &'a PlanesStage,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real, P: Stored<R>> Backward<'_, R, P> {
+impl<R: Real> Backward<'_, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut cells = Cells::new();
@@ -383,10 +380,6 @@ impl Stage for PlanesStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        Some(Halves::of(self))
     }
 
     /// A plane and its line per worker.

@@ -5,12 +5,9 @@
 
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::half::Stored;
 use conefield_core::settings::FieldSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{
-    Field, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
+use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
 use conefield_core::wgsl::{Fragment, TRILINEAR};
 use schemars::JsonSchema;
@@ -107,14 +104,14 @@ impl VoxelGridStage {
     }
 }
 
-struct Forward<'a, R, P> {
+struct Forward<'a, R> {
     stage: &'a VoxelGridStage,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real, P: Stored<R>> Op for Forward<'_, R, P> {
+impl<R: Real> Op for Forward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -134,16 +131,16 @@ impl<R: Real, P: Stored<R>> Op for Forward<'_, R, P> {
     }
 }
 
-struct Backward<'a, R, P> {
+struct Backward<'a, R> {
     stage: &'a VoxelGridStage,
-    params: &'a [P],
+    params: &'a [R],
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
+impl<R: Real> Op for Backward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -179,7 +176,7 @@ impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
             }
             if let Some(dx) = &mut self.dx {
                 for i in 0..n {
-                    let corners = offsets.map(|o| table[located.base(i) + o][0].value());
+                    let corners = offsets.map(|o| table[located.base(i) + o][0]);
                     for (d, v) in located.slopes(i, corners).into_iter().enumerate() {
                         dx.channel(d)[at + i] = v * slope[i];
                     }
@@ -189,14 +186,14 @@ impl<R: Real, P: Stored<R>> Op for Backward<'_, R, P> {
     }
 }
 
-impl<R: Real, P: Stored<R>> Kernel<R, P> for VoxelGridStage {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+impl<R: Real> Kernel<R> for VoxelGridStage {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
         run(Forward { stage: self, params, x, y });
     }
 
     fn backward(
         &self,
-        params: &[P],
+        params: &[R],
         x: Tile<'_, R>,
         _: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -235,10 +232,6 @@ impl Stage for VoxelGridStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        Some(Halves::of(self))
     }
 
     fn partition(&self) -> Vec<Range<usize>> {

@@ -31,8 +31,8 @@ impl EncoderSpec for Waves {
 
 impl Waves {
     /// The angle of wave `c`, whose parameters are its direction and its phase.
-    fn angle<R: Real>(params: &[impl Stored<R>], x: &[R], c: usize) -> R {
-        let [a, b, d, phase] = [0, 1, 2, 3].map(|k| params[4 * c + k].value());
+    fn angle<R: Real>(params: &[R], x: &[R], c: usize) -> R {
+        let [a, b, d, phase] = [0, 1, 2, 3].map(|k| params[4 * c + k]);
         a * x[0] + b * x[1] + d * x[2] + phase
     }
 }
@@ -52,18 +52,18 @@ impl RowMap for Waves {
         }
     }
 
-    fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]) {
+    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]) {
         for (c, y) in y.iter_mut().enumerate() {
             *y = Self::angle(params, x, c).sin_cos().0;
         }
     }
 
-    fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
+    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
         for (c, &dy) in dy.iter().enumerate() {
             let slope = dy * Self::angle(params, x, c).sin_cos().1;
             for k in 0..3 {
                 grads.add(4 * c + k, slope * x[k]);
-                dx[k] += slope * params[4 * c + k].value();
+                dx[k] += slope * params[4 * c + k];
             }
             grads.add(4 * c + 3, slope);
         }

@@ -33,9 +33,9 @@ struct Sum {
 }
 
 impl Sum {
-    fn sum<R: Real>(&self, params: &[impl Stored<R>], x: &[R]) -> R {
-        let weighted: R = x.iter().zip(params).map(|(&x, w)| w.value() * x).sum();
-        weighted + params[self.width].value()
+    fn sum<R: Real>(&self, params: &[R], x: &[R]) -> R {
+        let weighted: R = x.iter().zip(params).map(|(&x, &w)| w * x).sum();
+        weighted + params[self.width]
     }
 }
 
@@ -56,16 +56,16 @@ impl RowMap for Sum {
         params[self.width] = self.bias;
     }
 
-    fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]) {
+    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]) {
         y[0] = self.sum(params, x).softplus();
     }
 
-    fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
+    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
         let slope = R::of(1.0 / (1.0 + (-self.sum(params, x).f64()).exp()));
         let d = dy[0] * slope;
         for c in 0..self.width {
             grads.add(c, d * x[c]);
-            dx[c] += d * params[c].value();
+            dx[c] += d * params[c];
         }
         grads.add(self.width, d);
     }

@@ -71,22 +71,22 @@ impl RowMap for Settings {
         params.fill(0.0);
     }
 
-    fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]) {
+    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]) {
         let at = [0, 1, 2].map(|k| x[k].f64());
-        for (i, height) in params.iter().enumerate() {
+        for (i, &height) in params.iter().enumerate() {
             let way = self.way(i, at);
-            y[0] += height.value() * R::of(self.blob(dot(way, way)));
+            y[0] += height * R::of(self.blob(dot(way, way)));
         }
     }
 
-    fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
+    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
         let at = [0, 1, 2].map(|k| x[k].f64());
-        for (i, height) in params.iter().enumerate() {
+        for (i, &height) in params.iter().enumerate() {
             let way = self.way(i, at);
             let d = dy[0] * R::of(self.blob(dot(way, way)));
             grads.add(i, d);
             for k in 0..3 {
-                dx[k] += d * height.value() * R::of(self.sharpness() * way[k]);
+                dx[k] += d * height * R::of(self.sharpness() * way[k]);
             }
         }
     }

@@ -20,8 +20,8 @@ mod export;
 mod shims;
 
 pub use conefield_core::{
-    Error, Result, arena, basis, by_row, data_term, error, geometry, half, loss, prelude, prior, random, regularizer,
-    scan, settings, simd, space, stage, stage_type, wgsl,
+    Error, Result, arena, basis, by_row, data_term, error, geometry, loss, prelude, prior, random, regularizer, scan,
+    settings, simd, space, stage, stage_type, wgsl,
 };
 pub use conefield_plugin_abi as abi;
 pub use export::Plugin;

@@ -2,7 +2,6 @@
 
 use conefield_conformance::{Options, check_encoder, check_field, check_normalizer};
 use conefield_core::by_row::{ByRow, RowMap, Sums};
-use conefield_core::half::Stored;
 use conefield_core::simd::Real;
 use conefield_core::stage::{Encoder, Field, GradKind, Grads, Kernel, Normalizer, Stage, Tile, TileMut};
 
@@ -31,17 +30,17 @@ impl RowMap for Products {
         params.fill(0.5 + (seed % 3) as f32);
     }
 
-    fn forward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], y: &mut [R]) {
+    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]) {
         for (c, y) in y.iter_mut().enumerate() {
             let [a, b] = self.pair(c);
-            *y += params[c].value() * x[a].sin_cos().0 * x[b] + params[self.output].value();
+            *y += params[c] * x[a].sin_cos().0 * x[b] + params[self.output];
         }
     }
 
-    fn backward<R: Real>(&self, params: &[impl Stored<R>], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
+    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
         for (c, &dy) in dy.iter().enumerate() {
             let [a, b] = self.pair(c);
-            let (w, (sin, cos)) = (params[c].value(), x[a].sin_cos());
+            let (w, (sin, cos)) = (params[c], x[a].sin_cos());
             grads.add(c, dy * sin * x[b]);
             grads.add(self.output, dy);
             dx[a] += dy * w * cos * x[b];

@@ -4,12 +4,11 @@
 //! `R³·F`.
 
 use conefield_plugin::error::{Result, ensure};
-use conefield_plugin::half::Stored;
 use conefield_plugin::random::{mix, unit};
 use conefield_plugin::settings::EncoderSpec;
 use conefield_plugin::simd::Real;
 use conefield_plugin::stage::{
-    Encoder, GradKind, Grads, Halves, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+    Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -128,7 +127,7 @@ impl Factor {
         [(at(0, 0), wa[0] * wb[0]), (at(0, 1), wa[0] * wb[1]), (at(1, 0), wa[1] * wb[0]), (at(1, 1), wa[1] * wb[1])]
     }
 
-    fn forward<R: Real, P: Stored<R>>(&self, params: &[P], x: Tile<'_, R>, y: &mut TileMut<'_, R>) {
+    fn forward<R: Real>(&self, params: &[R], x: Tile<'_, R>, y: &mut TileMut<'_, R>) {
         let (plane, line) = params.split_at(self.plane_len());
         for i in 0..x.rows {
             let [a, b, c] = self.row(&x, i);
@@ -139,15 +138,15 @@ impl Factor {
         }
     }
 
-    fn of_line<R: Real, P: Stored<R>>(&self, line: &[P], node: usize, w: [R; 2], k: usize) -> R {
+    fn of_line<R: Real>(&self, line: &[R], node: usize, w: [R; 2], k: usize) -> R {
         let at = node * self.features + k;
-        w[0] * line[at].value() + w[1] * line[at + self.features].value()
+        w[0] * line[at] + w[1] * line[at + self.features]
     }
 
     /// `start` is the first parameter.
-    fn backward<R: Real, P: Stored<R>>(
+    fn backward<R: Real>(
         &self,
-        (start, params): (usize, &[P]),
+        (start, params): (usize, &[R]),
         x: &Tile<'_, R>,
         dy: &Tile<'_, R>,
         grads: &mut Grads<'_, R>,
@@ -187,8 +186,8 @@ impl Factor {
     }
 }
 
-fn of_plane<R: Real, P: Stored<R>>(plane: &[P], corners: &[(usize, R); 4], k: usize) -> R {
-    corners.iter().map(|&(at, w)| w * plane[at + k].value()).sum()
+fn of_plane<R: Real>(plane: &[R], corners: &[(usize, R); 4], k: usize) -> R {
+    corners.iter().map(|&(at, w)| w * plane[at + k]).sum()
 }
 
 /// The stage that [`Triplane`] builds.
@@ -218,9 +217,9 @@ impl TriplaneStage {
     }
 }
 
-// One source for single precision, for double precision (checks), and for half-precision parameters.
-impl<R: Real, P: Stored<R>> Kernel<R, P> for TriplaneStage {
-    fn forward(&self, params: &[P], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
+// One source for single precision and for double precision (checks).
+impl<R: Real> Kernel<R> for TriplaneStage {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
         for (factor, range) in self.factors.iter().zip(&self.ranges) {
             factor.forward(&params[range.clone()], x, &mut y);
         }
@@ -230,13 +229,13 @@ impl<R: Real, P: Stored<R>> Kernel<R, P> for TriplaneStage {
         self.factors.len()
     }
 
-    fn forward_pass(&self, pass: usize, params: &[P], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
+    fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
         self.factors[pass].forward(&params[self.ranges[pass].clone()], x, &mut y);
     }
 
     fn backward(
         &self,
-        params: &[P],
+        params: &[R],
         x: Tile<'_, R>,
         _: TileMut<'_, R>,
         dy: Tile<'_, R>,
@@ -296,10 +295,6 @@ impl Stage for TriplaneStage {
 
     fn reference(&self) -> Option<&dyn Kernel<f64>> {
         Some(self)
-    }
-
-    fn halves(&self) -> Option<Halves<'_>> {
-        Some(Halves::of(self))
     }
 
     /// A plane and its line per worker.
