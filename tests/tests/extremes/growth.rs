@@ -173,7 +173,7 @@ pub fn check() {
     );
     let mut faults = vec![];
     let mut row = |cells: [String; 5]| text += &format!("| {} |\n", cells.map(|c| page::escaped(&c)).join(" | "));
-    for (name, inputs, e, limit) in stages().into_iter() {
+    for (name, inputs, e, limit) in stages() {
         if !e.finite || e.outputs > limit {
             faults.push(format!("{name} of {inputs}: {:.1e}, limit {limit:.1e}, finite {}", e.outputs, e.finite));
         }
