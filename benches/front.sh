@@ -2,7 +2,7 @@
 # Measures the front that `reconstruct --budget` chooses from, and writes it:
 #   bash benches/front.sh DATA_FOLDER OUT_FOLDER [FRONT]
 # DATA_FOLDER holds volumes/*.nii.gz. Every candidate below reconstructs each of five scans (50 noisy views) to its own end, as
-# a whole command. FRONT (specs/tradeoff/front.toml) gets those that no other one beats in seconds and in PSNR on all scans.
+# a whole command. FRONT (conefield/specs/tradeoff/front.toml) gets those that no other one beats in seconds and in PSNR on all scans.
 # What is in OUT_FOLDER is not run again. Nothing else may run on the machine.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -10,7 +10,7 @@ source benches/common.sh
 data=$1
 out=$2
 front=${3:-specs/tradeoff/front.toml}
-cargo build --release --quiet -p conefield
+cargo build --release --quiet -p conefield-cli
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
 volumes="engine_256 head_256 teapot_256 chest_128 abdomen_128"

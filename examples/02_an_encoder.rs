@@ -94,7 +94,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let limits = Limits { steps: Some(200), ..Limits::default() };
     let solution = plan.run(&Job { limits, ..Job::new(&scan, &backend) }, &mut Silent)?;
     let volume = solution.result.volume(&backend)?;
-    let psnr = conefield_metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;
+    let psnr = conefield_evaluation::metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;
     println!("{} steps in {:.1} s: {psnr:.2} dB", solution.steps, solution.train_s);
     Ok(())
 }

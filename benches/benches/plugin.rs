@@ -12,7 +12,7 @@ use conefield_core::spec::stage;
 use conefield_core::stage::Encoder;
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
-use conefield_normalizers::layer_norm::LayerNorm;
+use conefield_fields::normalizers::layer_norm::LayerNorm;
 use conefield_plugins::{Place, Plugins};
 use conefield_projectors::ray_march::{RayMarch, Sampling};
 use conefield_solvers::losses::L1;

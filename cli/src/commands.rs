@@ -103,7 +103,7 @@ pub struct General {
     #[arg(long, global = true, value_name = "N", help_heading = "General options", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
     /// Memory limit, such as 8GiB [default: available memory]. A command that needs more is refused.
-    #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = crate::parse::bytes)]
+    #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = conefield::parse::bytes)]
     pub memory: Option<u64>,
     /// Load this plugin, or every plugin in this folder; repeatable.
     #[arg(long = "plugin", global = true, value_name = "PATH", help_heading = "General options")]
@@ -139,14 +139,14 @@ impl General {
 #[derive(Debug, Clone, Args, Serialize, Deserialize)]
 pub struct EndOptions {
     /// Stop training after this time, such as 600s or 10m, without the time before and after training.
-    #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
+    #[arg(long, value_name = "TIME", value_parser = conefield::parse::seconds)]
     pub seconds: Option<f64>,
     /// Stop training after this many steps.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
     /// Stop training after this time at the latest. Unlike --seconds, it neither replaces the spec's own limits nor
     /// stretches a learning-rate schedule.
-    #[arg(long, value_name = "TIME", value_parser = crate::parse::seconds)]
+    #[arg(long, value_name = "TIME", value_parser = conefield::parse::seconds)]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub at_most: Option<f64>,
 }

@@ -1,16 +1,4 @@
-//! conefield for Rust programs, and the `conefield` command.
-//!
-//! [`Reconstruct`] turns a scan into a volume, [`io`] reads and writes both, and [`simulate`] makes scans of known
-//! volumes. The other modules contain their building blocks.
-//!
-//! ```no_run
-//! # fn main() -> conefield::Result<()> {
-//! let scan = conefield::io::read_scan("scan")?;
-//! let result = conefield::Reconstruct::with("smooth-tv").run(scan)?;
-//! conefield::io::write_volume("volume.nii.gz", &result.volume)?;
-//! # Ok(())
-//! # }
-//! ```
+//! The `conefield` command: arguments, progress, and the files it owns.
 
 mod board;
 mod boundary;
@@ -26,15 +14,9 @@ mod run_folder;
 mod segmenter;
 mod signals;
 
-pub use conefield_core::{Error, Result, geometry, scan, spec};
-pub use conefield_io as io;
-pub use conefield_metrics as metrics;
-pub use conefield_projectors::simulate;
-pub use conefield_run::reconstruct::{Reconstruct, Reconstructed};
-pub use conefield_run::specs;
-use conefield_run::{backend, files, memory, method, parse, plugins};
-
 use clap::Parser;
+use conefield::{memory, plugins};
+use conefield_core::Error;
 use std::ffi::OsString;
 use std::process::ExitCode;
 

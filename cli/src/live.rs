@@ -1,10 +1,10 @@
 //! `live.png`: the middle slices of a field during training.
 
-use crate::files;
+use conefield::files;
 use conefield_core::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Part;
-use conefield_report::MiddleSlices;
+use conefield_evaluation::report::MiddleSlices;
 use ndarray::Array3;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};

@@ -7,5 +7,5 @@ use peak_alloc::PeakAlloc;
 static HEAP: PeakAlloc = PeakAlloc;
 
 fn main() -> std::process::ExitCode {
-    conefield::main(|| HEAP.current_usage() as u64)
+    conefield_cli::main(|| HEAP.current_usage() as u64)
 }

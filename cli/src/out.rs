@@ -1,8 +1,8 @@
 //! Results on standard output, readable or as JSON.
 
+pub use conefield::tradeoff::json::to_json;
 use conefield_core::{Error, Result};
-pub use conefield_report::text::{bytes, duration, number, table};
-pub use conefield_tradeoff::json::to_json;
+pub use conefield_evaluation::report::text::{bytes, duration, number, table};
 use serde::Serialize;
 use std::fmt::Write as _;
 use std::io::{ErrorKind, Write};

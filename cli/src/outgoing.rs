@@ -7,7 +7,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Volume};
 use conefield_core::{Error, Result};
-use conefield_report::MiddleSlices;
+use conefield_evaluation::report::MiddleSlices;
 use ndarray::{Array3, ArrayViewMut3};
 use std::path::Path;
 use std::time::Instant;

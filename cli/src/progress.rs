@@ -2,7 +2,8 @@
 
 use crate::board::Board;
 use crate::live::Live;
-use crate::{files, signals};
+use crate::signals;
+use conefield::files;
 use conefield_core::Result;
 use conefield_core::checkpoint::Checkpoint;
 use conefield_core::geometry::VoxelGrid;

@@ -2,12 +2,12 @@
 //! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last
 //! and only for a finished run, `record.json`.
 
+use conefield::tradeoff::json::{LONGEST, read_json};
+use conefield::tradeoff::trial::ScanRecord;
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::{Error, Result};
 use conefield_io::{Contents, Lease, Progressed};
-use conefield_tradeoff::json::{LONGEST, read_json};
-use conefield_tradeoff::trial::ScanRecord;
 use serde::Deserialize;
 use serde_json::Value;
 use std::fs::{self, File};

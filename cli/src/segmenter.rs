@@ -69,7 +69,7 @@ impl Segmenter {
         let (found, expected) =
             (format!("{:?}", labels.data.shape()), format!("{:?}, the volume's", volume.data.shape()));
         ensure(labels.data.shape() == volume.data.shape(), &place, "shape", found, expected).map_err(read)?;
-        conefield_metrics::label_map(&place, labels.data.view()).map_err(read)
+        conefield_evaluation::metrics::label_map(&place, labels.data.view()).map_err(read)
     }
 
     /// Runs the process to its end; returns its status and the end of its standard error.

@@ -51,7 +51,7 @@ impl ProjectorSpec for Counted {
 fn built(args: &[&str]) -> [usize; 3] {
     BUILT.iter().for_each(|n| n.store(0, Ordering::Relaxed));
     let args = std::iter::once("conefield").chain(args.iter().copied()).map(Into::into);
-    assert_eq!(conefield::run(args, None), 0);
+    assert_eq!(conefield_cli::run(args, None), 0);
     BUILT.each_ref().map(|n| n.load(Ordering::Relaxed))
 }
 

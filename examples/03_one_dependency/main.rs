@@ -1,7 +1,7 @@
 //! A standalone program that reads a scan from disk and writes a volume: `conefield` is its only dependency.
 
 use conefield::simulate::{Protocol, phantom};
-use conefield::{Reconstruct, Result, io};
+use conefield::{Reconstruct, Result, io, read_scan};
 
 fn main() -> Result<()> {
     let folder = std::env::temp_dir().join(format!("conefield-example-{}", std::process::id()));
@@ -12,7 +12,7 @@ fn main() -> Result<()> {
     let protocol = Protocol::r2(&truth.grid).with_detector([64, 64]).with_views(40);
     io::write_scan(folder.join("scan"), &conefield::simulate::simulate(&truth, &protocol)?, Some(&truth))?;
 
-    let scan = io::read_scan(folder.join("scan"))?;
+    let scan = read_scan(folder.join("scan"))?;
     let result = Reconstruct::with("sirt").steps(20).reference(truth).run(scan)?;
     io::write_volume(folder.join("volume.nii.gz"), &result.volume)?;
 

@@ -1,8 +1,14 @@
-//! Attenuation fields: MLP, line transformer, voxel grid, and voxels with line integrals of their own.
+//! All of a neural field but its encoder.
+//!
+//! - [`mlp`], [`line_transformer`], [`voxel_grid`], [`voxels_joseph`]: attenuation fields; the last one has line
+//!   integrals of its own.
+//! - [`normalizers`]: between encoder and field; [`initializers`]: of the parameters.
 
+pub mod initializers;
 pub mod line_transformer;
 mod linear;
 pub mod mlp;
+pub mod normalizers;
 #[cfg(test)]
 mod testing;
 pub mod voxel_grid;

@@ -1,11 +1,12 @@
 //! The network of SAX-NeRF (Cai et al., CVPR 2024): maps features `[n, F]` of the samples of a ray to attenuation
-//! `[n, 1]` by F → W → blocks of [line attention](conefield_normalizers::line_attention) → (F + W) → W → 1. An
+//! `[n, 1]` by F → W → blocks of [line attention](crate::normalizers::line_attention) → (F + W) → W → 1. An
 //! activation follows each linear map and the last block. The columns of the skip layer are the F features, then the W
 //! channels of the last block.
 //!
 //! `line-attention` alone is a normalizer, which can also precede other fields.
 
 use crate::linear::Linear;
+use crate::normalizers::line_attention::{LineAttention, LineAttentionStage};
 use conefield_core::activation::{Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
 use conefield_core::error::{Result, ensure};
@@ -13,7 +14,6 @@ use conefield_core::random::{mix, uniform};
 use conefield_core::settings::FieldSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
 use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use conefield_normalizers::line_attention::{LineAttention, LineAttentionStage};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;

@@ -100,7 +100,7 @@ mod tests {
                 refuse_file(&at(name)).unwrap_err(),
                 crate::read_volume(at(name)).unwrap_err(),
                 crate::read_scan(at(name)).unwrap_err(),
-                crate::read_scanner(at(name), &crate::ImportOptions::default()).unwrap_err(),
+                crate::read_scanner(at(name), None, None).unwrap_err(),
                 crate::scan_size(at(name)).unwrap_err(),
                 crate::read_scan(dir.path()).unwrap_err(),
                 crate::read_volume(dir.path()).unwrap_err(),

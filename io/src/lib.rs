@@ -6,8 +6,7 @@
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.
 //! - Projections from scanners: [`read_scanner`] (a description in TOML; TIFF, NumPy, HDF5, RTK's XML geometry; Nikon's
-//!   description).
-//! - Part of a scan, with its geometry: [`Selection`].
+//!   description), as [`Stored`]: line integrals or counts.
 //! - Sizes, before memory is allocated: [`scan_size`], [`scanner_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`]
 //!   (safetensors).
@@ -24,7 +23,6 @@
 mod affine;
 mod atomic;
 mod checkpoint;
-mod counts;
 mod dicom;
 mod events;
 mod file_order;
@@ -51,7 +49,6 @@ mod rtk_folder;
 mod scan;
 mod scan_folder;
 mod scanner;
-mod selection;
 mod size;
 mod stack;
 mod table;
@@ -67,7 +64,6 @@ mod testing;
 
 pub use atomic::{discard_unfinished, is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
-pub use counts::{Correction, CountsReport, OpenBeam, line_integrals};
 pub use events::EventFile;
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
 pub use lease::{Contents, FolderLock, Lease, Progressed, SharedLease, is_aside, try_alone};
@@ -77,8 +73,7 @@ pub use rtk::{read_rtk_geometry, write_rtk_geometry};
 pub use rtk_folder::write_rtk;
 pub use scan::{DataSet, read_data_set, read_scan, read_truth};
 pub use scan_folder::write_scan;
-pub use scanner::{I0, ImportOptions, Imported, read_scanner};
-pub use selection::{Lines, Selection, ViewChoice};
+pub use scanner::{Conversion, Counts, I0, OpenBeam, Stored, read_scanner};
 pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};
 pub use text::parse_toml;
 pub use volume::{check_shape, is_volume, packed_bytes, read_volume, write_volume, write_voxels};

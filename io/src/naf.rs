@@ -403,8 +403,9 @@ fn total(angles: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::read_scan;
     use crate::testing::{data, scan};
-    use crate::{read_r2, read_scan, read_truth};
+    use crate::{read_r2, read_truth};
     use std::fs;
     use std::path::PathBuf;
 

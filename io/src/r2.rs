@@ -351,8 +351,9 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::read_truth;
+    use crate::testing::read_scan;
     use crate::testing::{data, scan};
-    use crate::{read_scan, read_truth};
     use std::fs;
 
     fn near(a: &Geometry, b: &Geometry) {

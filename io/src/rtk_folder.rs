@@ -96,8 +96,9 @@ impl Voxels for Image<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::read_volume;
+    use crate::testing::read_scan;
     use crate::testing::scan;
-    use crate::{read_scan, read_volume};
 
     #[test]
     fn a_scan_comes_back_and_rtk_finds_its_image_straight() {

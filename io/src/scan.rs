@@ -1,7 +1,7 @@
 //! Entry points for scans: they recognize the format of a folder or file.
 
 use crate::text::format_of;
-use crate::{ImportOptions, foreign, naf, pickle, r2, scan_folder, scanner};
+use crate::{Stored, foreign, naf, pickle, r2, scan_folder, scanner};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -11,9 +11,9 @@ pub(crate) const SCANNER: &str = "scanner.toml";
 
 /// Everything a file or folder holds of one scan.
 #[derive(Debug, Clone)]
-pub struct DataSet {
+pub struct DataSet<S = Scan> {
     /// The views to reconstruct from.
-    pub train: Scan,
+    pub train: S,
     /// Views held out for testing.
     pub test: Option<Scan>,
     /// The volume from which the scan was simulated, in `1/unit` of the scan.
@@ -36,24 +36,26 @@ pub(crate) enum ScanFile {
 /// training views), NAF's pickle of any name (the training views), or a scanner's files through their description
 /// (`scanner.toml` or Nikon's `.xtekct`, see [`read_scanner`](crate::read_scanner)). For folders, the path may also
 /// name the description file.
-pub fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
-    match find(path.as_ref())? {
+pub fn read_scan(path: impl AsRef<Path>) -> Result<Stored> {
+    let scan = match find(path.as_ref())? {
         ScanFile::Own(file) => scan_folder::read(&file),
         ScanFile::R2(folder) => r2::read_train(&folder).map(|r| r.train),
         ScanFile::Naf(file) => naf::read_train(&file),
-        ScanFile::Scanner(file) => scanner::read_scanner(&file, &ImportOptions::default()).map(|i| i.scan),
-    }
+        ScanFile::Scanner(file) => return scanner::read_scanner(&file, None, None),
+    };
+    scan.map(Stored::Scan)
 }
 
 /// Reads everything in the scan's file or folder: training views, test views and volume.
-pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet> {
-    match find(path.as_ref())? {
-        ScanFile::R2(folder) => r2::read_r2(&folder),
-        ScanFile::Naf(file) => naf::read_naf(&file),
+pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet<Stored>> {
+    let DataSet { train, test, volume } = match find(path.as_ref())? {
+        ScanFile::R2(folder) => r2::read_r2(&folder)?,
+        ScanFile::Naf(file) => naf::read_naf(&file)?,
         ScanFile::Own(_) | ScanFile::Scanner(_) => {
-            Ok(DataSet { train: read_scan(&path)?, test: None, volume: read_truth(&path)? })
+            return Ok(DataSet { train: read_scan(&path)?, test: None, volume: read_truth(&path)? });
         }
-    }
+    };
+    Ok(DataSet { train: Stored::Scan(train), test, volume })
 }
 
 /// Reads the volume from which a scan was simulated, if it has one. Values are in `1/unit` of the scan.

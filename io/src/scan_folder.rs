@@ -261,8 +261,9 @@ fn plain_dates(value: serde_json::Value) -> serde_json::Value {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::read_truth;
+    use crate::testing::read_scan;
     use crate::testing::scan;
-    use crate::{read_scan, read_truth};
     use ndarray::Array3;
     use std::fs;
     use std::path::PathBuf;

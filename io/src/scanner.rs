@@ -51,10 +51,8 @@ mod xtekct;
 
 pub(crate) use xtekct::is_xtekct;
 
-use crate::counts::{Correction, CountsReport, OpenBeam, line_integrals};
 use crate::hdf5::ScanPart;
 use crate::rtk::read_rtk_geometry;
-use crate::selection::{Mean, Selection};
 use crate::stack::{self, Names, StackAxis, StackLayout};
 use crate::table::{self, Numbers};
 use crate::text::{self, described};
@@ -64,10 +62,9 @@ use conefield_core::geometry::{Geometry, Radians, View, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
-use conefield_corrections::{Applied, Corrections};
-use ndarray::{Array3, Axis};
+use ndarray::{Array2, Array3, Axis};
 use serde::{Deserialize, Serialize};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::Path;
 
 pub(crate) const FORMAT: &str = "conefield-scanner";
@@ -87,30 +84,63 @@ pub enum I0 {
     Air,
 }
 
-/// Options that override the description, corrections, and the part of the scan to keep.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct ImportOptions {
-    /// Replaces the file's `i0` and flat field.
-    pub i0: Option<I0>,
-    /// Replaces the file's `floor`.
-    pub floor: Option<f64>,
-    /// Corrections, applied after the conversion of counts and before the selection.
-    pub corrections: Corrections,
-    /// The part of the scan to keep. Counts are converted first, so that bad pixels use all their neighbours and air is
-    /// found at the border of the whole detector. Larger pixels then hold the mean light, as they would have measured
-    /// it; if the files hold line integrals, their mean.
-    pub selection: Selection,
+/// Source of the open-beam counts. All are as the detector reports them, dark value included.
+#[derive(Debug, Clone, PartialEq)]
+pub enum OpenBeam {
+    /// A flat field, `[row, column]`.
+    Flat(Array2<f32>),
+    /// One number for every pixel and view.
+    Number(f64),
+    /// Estimated per view from its border: the 85th percentile of the medians of 16 border segments. At least three of
+    /// them must show air.
+    Air,
 }
 
-/// The result of [`read_scanner`].
+/// Settings of the conversion from counts to line integrals.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Conversion {
+    /// The open beam.
+    pub open: OpenBeam,
+    /// Counts without a beam, `[row, column]`; 0 if `None`.
+    pub dark: Option<Array2<f32>>,
+    /// Counts above dark at or below this floor are raised to it, in the unit of the counts. `None`: 1, or 1/10000 of
+    /// the open beam if that is less (counts scaled to 0 to 1).
+    pub floor: Option<f64>,
+}
+
+/// What a detector counted, with the settings that turn it into line integrals.
 #[derive(Debug, Clone)]
-pub struct Imported {
-    /// The scan, in mm.
-    pub scan: Scan,
-    /// Statistics of the conversion from counts; `None` if the files hold line integrals.
-    pub counts: Option<CountsReport>,
-    /// The corrections applied.
-    pub corrections: Vec<Applied>,
+pub struct Counts {
+    /// The counts, `[view, row, column]`.
+    pub values: Array3<f32>,
+    /// The settings.
+    pub conversion: Conversion,
+    place: String,
+    geometry: Geometry,
+    provenance: Value,
+}
+
+impl Counts {
+    /// The file that errors name.
+    pub fn place(&self) -> &str {
+        &self.place
+    }
+
+    /// The scan of the `line_integrals` into which the counts were converted. `report` becomes `counts` of its provenance.
+    pub fn scan(self, line_integrals: Array3<f32>, report: Value) -> Result<Scan> {
+        let mut provenance = self.provenance;
+        provenance["counts"] = report;
+        straightened(&self.place, self.geometry, line_integrals, provenance)
+    }
+}
+
+/// A scan as it is stored.
+#[derive(Debug, Clone)]
+pub enum Stored {
+    /// Line integrals.
+    Scan(Scan),
+    /// Counts of a detector, not yet converted.
+    Counts(Counts),
 }
 
 #[derive(Deserialize)]
@@ -273,10 +303,10 @@ struct ValuesTable {
 
 /// Reads the scan described by `path`, a TOML (or JSON) file or Nikon's `.xtekct`; the module's source lists the keys.
 ///
-/// Files are relative to the description's folder and stay in it. [`line_integrals`](crate::line_integrals) converts
-/// counts; this requires a flat field, `i0` or `options.i0`. The geometry is checked against the shape of the
-/// projections before counts are converted.
-pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<Imported> {
+/// Files are relative to the description's folder and stay in it. Counts require a flat field, `i0` of the description or
+/// `i0`, which replaces both; `floor` replaces the description's. The geometry is checked against the shape of the
+/// projections.
+pub fn read_scanner(path: impl AsRef<Path>, i0: Option<I0>, floor: Option<f64>) -> Result<Stored> {
     let path = path.as_ref();
     let place = path.display().to_string();
     let mut d = Description::read(path)?;
@@ -284,7 +314,7 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     let folder = scan_folder::folder_of(path);
     d.volume.validate(&place)?;
     let layout = layout(&place, &d.layout)?;
-    let i0 = i0(&place, &d, options)?;
+    let i0 = open_beam(&place, &d, i0, floor)?;
     let read = |field: &str, part, names: &Names| stack::read_field(folder, &place, field, part, names, layout);
     let values = stack::read(folder, &place, "files.projections", ScanPart::Projections, &d.files.projections, layout)?;
     let (count, rows, columns) = values.dim();
@@ -295,41 +325,32 @@ pub fn read_scanner(path: impl AsRef<Path>, options: &ImportOptions) -> Result<I
     let views = views(folder, &place, &d, count)?;
     let geometry = Geometry { detector: [rows, columns], views, volume: d.volume };
     geometry.validate(&place)?;
-    let (projections, counts) = if d.values.kind == ValueKind::LineIntegrals {
-        (values, None)
-    } else {
-        let open = match i0 {
-            Some(I0::Number(n)) => OpenBeam::Number(n),
-            Some(I0::Air) => OpenBeam::Air,
-            None => {
-                let expected = "files.flat, values.i0 or --i0; or values.kind = \"line-integrals\" if they are";
-                let lacks = || Error::invalid(&place, "files.flat", "nothing to compare counts with", expected);
-                OpenBeam::Flat(read("files.flat", ScanPart::Flat, d.files.flat.as_ref().ok_or_else(lacks)?)?)
-            }
-        };
-        let dark = d.files.dark.as_ref().map(|n| read("files.dark", ScanPart::Dark, n)).transpose()?;
-        let open = match (open, &dark, d.values.flat_includes_dark) {
-            // The formula subtracts the dark field again. It also reports fields of different shapes.
-            (OpenBeam::Flat(flat), Some(dark), Some(false)) if flat.dim() == dark.dim() => OpenBeam::Flat(flat + dark),
-            (open, ..) => open,
-        };
-        let correction = Correction { open, dark, floor: options.floor.or(d.values.floor) };
-        let (a, report) = line_integrals(values, &correction, &place)?;
-        (a, Some(report))
-    };
-    let (geometry, projections) = straightened(&place, geometry, projections)?;
     let provenance = json!({
         "format": "scanner",
         "file": path.file_name().map(|n| n.to_string_lossy()),
         "projections": d.files.projections,
-        "counts": counts,
+        "counts": null,
     });
-    let scan = Scan { geometry, projections, unit: Unit::default(), provenance };
-    scan.validate(&place)?;
-    let (scan, corrections) = options.corrections.apply(scan, &place)?;
-    let mean = if counts.is_some() { Mean::Light } else { Mean::LineIntegrals };
-    let scan = options.selection.take(scan, mean)?;
-    Ok(Imported { scan, counts, corrections })
+    if d.values.kind == ValueKind::LineIntegrals {
+        return straightened(&place, geometry, values, provenance).map(Stored::Scan);
+    }
+    let open = match i0 {
+        Some(I0::Number(n)) => OpenBeam::Number(n),
+        Some(I0::Air) => OpenBeam::Air,
+        None => {
+            let expected = "files.flat, values.i0 or --i0; or values.kind = \"line-integrals\" if they are";
+            let lacks = || Error::invalid(&place, "files.flat", "nothing to compare counts with", expected);
+            OpenBeam::Flat(read("files.flat", ScanPart::Flat, d.files.flat.as_ref().ok_or_else(lacks)?)?)
+        }
+    };
+    let dark = d.files.dark.as_ref().map(|n| read("files.dark", ScanPart::Dark, n)).transpose()?;
+    let open = match (open, &dark, d.values.flat_includes_dark) {
+        // The conversion subtracts the dark field again. It also reports fields of different shapes.
+        (OpenBeam::Flat(flat), Some(dark), Some(false)) if flat.dim() == dark.dim() => OpenBeam::Flat(flat + dark),
+        (open, ..) => open,
+    };
+    let conversion = Conversion { open, dark, floor: floor.or(d.values.floor) };
+    Ok(Stored::Counts(Counts { values, conversion, place, geometry, provenance }))
 }
 
 /// The size of the scan that `path` describes. Reordering the values and converting counts take copies.
@@ -348,10 +369,10 @@ pub(crate) fn size(path: &Path) -> Result<ScanSize> {
     })
 }
 
-/// Reverses rows or columns if that turns the views into conefield's own circles, on which rows run down and columns to
+/// The scan of these views. Reverses rows or columns if that turns the views into conefield's own circles, on which rows run down and columns to
 /// the right, as the source sees them: code that supports only circles then accepts the scan. RTK's rows run up, Nikon's
 /// columns to the left.
-fn straightened(place: &str, mut geometry: Geometry, mut projections: Array3<f32>) -> Result<(Geometry, Array3<f32>)> {
+fn straightened(place: &str, mut geometry: Geometry, mut projections: Array3<f32>, provenance: Value) -> Result<Scan> {
     let turned = |rows: bool, columns: bool| -> Vec<View> {
         let along = |axis: [f64; 3], reverse: bool| if reverse { axis.map(|x| 0.0 - x) } else { axis };
         geometry.views.iter().map(|w| View { u: along(w.u, columns), v: along(w.v, rows), ..*w }).collect()
@@ -370,7 +391,9 @@ fn straightened(place: &str, mut geometry: Geometry, mut projections: Array3<f32
         projections = memory::in_order(place, "files.projections", projections)?;
         break;
     }
-    Ok((geometry, projections))
+    let scan = Scan { geometry, projections, unit: Unit::default(), provenance };
+    scan.validate(place)?;
+    Ok(scan)
 }
 
 fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
@@ -381,7 +404,7 @@ fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
 }
 
 /// The single open-beam value, or `None` if there is a flat field. Refuses contradictions.
-fn i0(place: &str, d: &Description, options: &ImportOptions) -> Result<Option<I0>> {
+fn open_beam(place: &str, d: &Description, i0: Option<I0>, floor: Option<f64>) -> Result<Option<I0>> {
     let said = match &d.values.i0 {
         None => None,
         Some(I0Text::Number(n)) => Some(I0::Number(*n)),
@@ -397,7 +420,7 @@ fn i0(place: &str, d: &Description, options: &ImportOptions) -> Result<Option<I0
         return Err(Error::invalid(place, "values.flat_includes_dark", found, "both files, or no such value"));
     }
     if d.values.kind == ValueKind::LineIntegrals {
-        let field = match (flat, d.files.dark.is_some(), said.or(options.i0), options.floor.or(d.values.floor)) {
+        let field = match (flat, d.files.dark.is_some(), said.or(i0), floor.or(d.values.floor)) {
             (true, ..) => "files.flat",
             (_, true, ..) => "files.dark",
             (_, _, Some(_), _) => "values.i0",
@@ -410,10 +433,10 @@ fn i0(place: &str, d: &Description, options: &ImportOptions) -> Result<Option<I0
     if flat && said.is_some() {
         return Err(Error::invalid(place, "values.i0", "i0 beside files.flat", "one of them"));
     }
-    if flat && options.i0.is_some() {
+    if flat && i0.is_some() {
         tracing::info!("{place}: --i0 replaces files.flat, which is not read");
     }
-    Ok(options.i0.or(said))
+    Ok(i0.or(said))
 }
 
 fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Vec<View>> {

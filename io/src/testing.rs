@@ -1,10 +1,11 @@
 //! Helpers shared by the tests of several modules.
 
-use crate::{is_volume, read_volume, volume_voxels, write_volume};
+use crate::{I0, OpenBeam, Stored, is_volume, read_volume, volume_voxels, write_volume};
+use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
 use ndarray::Array3;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// A file of the shared data, or `None` with a note that the test is skipped.
 pub(crate) fn data(name: &str) -> Option<PathBuf> {
@@ -17,6 +18,34 @@ pub(crate) fn data(name: &str) -> Option<PathBuf> {
     }
     eprintln!("skipped: {} is not there; CONEFIELD_DATA names the folder of the shared data", path.display());
     None
+}
+
+/// The scan `path`; counts are converted by the bare formula.
+pub(crate) fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
+    crate::read_scan(path).and_then(line_integrals)
+}
+
+/// The same for a scanner's description.
+pub(crate) fn read_scanner(path: impl AsRef<Path>, i0: Option<I0>) -> Result<Scan> {
+    crate::read_scanner(path, i0, None).and_then(line_integrals)
+}
+
+fn line_integrals(stored: Stored) -> Result<Scan> {
+    let mut counts = match stored {
+        Stored::Scan(scan) => return Ok(scan),
+        Stored::Counts(counts) => counts,
+    };
+    let mut a = std::mem::take(&mut counts.values);
+    a.indexed_iter_mut().for_each(|((_, row, column), x)| {
+        let dark = counts.conversion.dark.as_ref().map_or(0.0, |d| d[[row, column]]);
+        let open = match &counts.conversion.open {
+            OpenBeam::Flat(flat) => flat[[row, column]],
+            OpenBeam::Number(n) => *n as f32,
+            OpenBeam::Air => panic!("no test needs it"),
+        };
+        *x = ((open - dark) / (*x - dark).max(1.0)).ln();
+    });
+    counts.scan(a, serde_json::Value::Null)
 }
 
 /// Writes `data` to a file called `name` and reads it: values, grid and affine are the same bits, with the volume

@@ -1,9 +1,9 @@
 //! Arguments passed from Python as JSON, parsed like those of the command line.
 
 use crate::errors::raised;
+use conefield::backend::BackendChoice;
+use conefield::parse::{self, HoldOut};
 use conefield_core::{Error, Result};
-use conefield_run::backend::BackendChoice;
-use conefield_run::parse::{self, HoldOut};
 use pyo3::prelude::*;
 use serde::de::DeserializeOwned;
 
@@ -37,5 +37,5 @@ pub fn seconds(name: &str, text: Option<&String>) -> Result<Option<f64>> {
 /// Indices of the held-out views, of `n`.
 pub fn held_out(text: Option<&String>, n: usize) -> Result<Vec<usize>> {
     let choice: Option<HoldOut> = optional("hold_out", text, parse::hold_out)?;
-    conefield_run::input::held_out(choice.as_ref(), n, "arguments", "hold_out")
+    conefield::input::held_out(choice.as_ref(), n, "arguments", "hold_out")
 }

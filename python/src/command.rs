@@ -8,5 +8,5 @@ use std::ffi::OsString;
 /// start another such process.
 #[pyfunction]
 pub fn command(py: Python<'_>, words: Vec<OsString>, program: Vec<OsString>) -> u8 {
-    py.detach(|| conefield::run(words, Some(program)))
+    py.detach(|| conefield_cli::run(words, Some(program)))
 }

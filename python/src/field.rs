@@ -3,11 +3,11 @@
 use crate::arguments;
 use crate::volume::made;
 use crate::work::without_lock;
+use conefield::files;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result, allowance};
-use conefield_run::files;
 use ndarray::{Array3, s};
 use pyo3::prelude::*;
 use std::collections::BTreeMap;

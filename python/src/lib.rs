@@ -53,8 +53,8 @@ mod _native {
 
     #[pymodule_init]
     fn init(m: &Bound<'_, PyModule>) -> PyResult<()> {
-        conefield_run::memory::count(|| crate::HEAP.current_usage() as u64);
-        conefield_run::memory::set_budget(None);
+        conefield::memory::count(|| crate::HEAP.current_usage() as u64);
+        conefield::memory::set_budget(None);
         m.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

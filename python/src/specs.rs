@@ -3,9 +3,9 @@
 use crate::arguments;
 use crate::arrays::plain;
 use crate::errors::OrRaise;
+use conefield::specs;
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
-use conefield_run::specs;
 use pyo3::prelude::*;
 use serde::Deserialize;
 use serde_json::{Map, Value};

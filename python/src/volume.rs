@@ -44,9 +44,9 @@ pub fn made<'py>(py: Python<'py>, volume: Volume) -> PyResult<Bound<'py, PyAny>>
 #[pyfunction]
 pub fn read_volume(py: Python<'_>, name: String) -> PyResult<Bound<'_, PyAny>> {
     let volume = without_lock(py, |_| {
-        let voxels = conefield_run::files::voxels(&name)?;
-        conefield_run::memory::Memory::of_volumes(&[voxels]).check(|_| vec![])?;
-        conefield_run::files::volume(&name)
+        let voxels = conefield::files::voxels(&name)?;
+        conefield::memory::Memory::of_volumes(&[voxels]).check(|_| vec![])?;
+        conefield::files::volume(&name)
     })?;
     made(py, volume)
 }

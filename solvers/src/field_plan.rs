@@ -29,7 +29,7 @@ use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::{Scene, SceneSettings};
 use conefield_core::settings::{Initializer, InitializerSpec, LossSpec, PriorSpec};
 use conefield_core::trained::{FieldVoxels, Placement, TrainedField};
-use conefield_initializers::random::Random;
+use conefield_fields::initializers::random::Random;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;

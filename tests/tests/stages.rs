@@ -27,8 +27,6 @@ use std::sync::Arc;
 // Stage types register themselves where their crate is linked.
 use conefield_encoders as _;
 use conefield_fields as _;
-use conefield_initializers as _;
-use conefield_normalizers as _;
 use conefield_projectors as _;
 use conefield_solvers as _;
 

@@ -2,7 +2,7 @@
 //! `curves [--steps | --drift] OUT.png TITLE NAME=RUN_FOLDER...`. Runs of one name have one colour.
 
 use conefield_benches::{metrics, quality};
-use conefield_report::{CurveOptions, curves_png_with};
+use conefield_evaluation::report::{CurveOptions, curves_png_with};
 use serde_json::Value;
 use std::error::Error;
 

@@ -1,8 +1,8 @@
 //! Draws quality against the number of views and writes a table, from comparisons of `views.sh`:
 //! `views OUT_FOLDER TITLE VIEWS=COMPARISON_FOLDER...`. Writes psnr.png, ssim.png and views.md.
 
+use conefield_evaluation::report::curves_png;
 use conefield_io::write_text_atomic;
-use conefield_report::curves_png;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::error::Error;

@@ -2,10 +2,10 @@
 
 use crate::out;
 use clap::Args;
+use conefield::tradeoff::speed::pass_s;
 use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::{Adapter, adapters};
 use conefield_core::{Result, simd};
-use conefield_tradeoff::speed::pass_s;
 use serde_json::json;
 
 /// List the backends of this machine: CPU instructions and speed, GPU adapters.

@@ -3,13 +3,14 @@
 use super::corrections::{CorrectionOptions, corrected_size, log_applied};
 use super::selection::SelectionOptions;
 use crate::boundary::{Inputs, refuse_existing};
-use crate::memory::Memory;
-use crate::parse::{self, Values};
-use crate::{files, out};
+use crate::out;
 use clap::{Args, ValueEnum};
+use conefield::files;
+use conefield::memory::Memory;
+use conefield::parse::{self, Values};
 use conefield_core::{Error, Result};
-use conefield_diagnosis::survey;
 use conefield_io::DataSet;
+use conefield_scans::diagnosis::survey;
 use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
@@ -78,7 +79,7 @@ impl ConvertArgs {
         } else {
             let size = corrected_size(conefield_io::scan_size(&self.input)?, &corrections);
             Memory::of_data_set(&size).check(|_| vec![])?;
-            let DataSet { train, test, volume } = conefield_io::read_data_set(&self.input)?;
+            let DataSet { train, test, volume } = conefield_scans::read_data_set(&self.input)?;
             let place = self.input.display().to_string();
             let (train, applied) = corrections.apply(train, &place)?;
             log_applied(&self.input, &applied);

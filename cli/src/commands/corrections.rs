@@ -2,8 +2,8 @@
 
 use clap::Args;
 use conefield_core::Result;
-use conefield_corrections::{Applied, Corrections};
 use conefield_io::ScanSize;
+use conefield_scans::corrections::{Applied, Corrections};
 use std::path::Path;
 
 /// Corrections of a scan.

@@ -2,17 +2,18 @@
 
 use crate::boundary::refuse_existing;
 use crate::progress::Progress;
-use crate::{memory, method, out, parse, signals, specs};
+use crate::{out, signals};
 use clap::Args;
+use conefield::score::{SCORES, cells_of, score};
+use conefield::{memory, method, parse, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::method::{Job, Limits};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
+use conefield_evaluation::metrics::Scores;
+use conefield_evaluation::report::{MiddleSlices, Table};
 use conefield_io::ScanSize;
-use conefield_metrics::Scores;
 use conefield_projectors::simulate::{DetectorNoise, Protocol, phantom, simulate};
-use conefield_report::{MiddleSlices, Table};
-use conefield_run::score::{SCORES, cells_of, score};
 use serde::Serialize;
 use serde_json::json;
 use std::path::PathBuf;
@@ -101,7 +102,7 @@ impl DemoArgs {
         let results: Vec<_> = captions.iter().map(|c| &c[..]).zip(&slices).collect();
         let picture = folder.join("compare.png");
         let truth = MiddleSlices::of(&truth);
-        conefield_report::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
+        conefield_evaluation::report::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
         if self.json {
             return out::json(&json!({ "folder": folder, "picture": picture, "results": entries }));
         }

@@ -1,15 +1,16 @@
 //! `conefield evaluate`
 
 use crate::boundary::{self, Inputs};
-use crate::memory::Memory;
 use crate::segmenter::Segmenter;
-use crate::{files, out, parse, signals};
+use crate::{out, signals};
 use clap::Args;
+use conefield::memory::Memory;
+use conefield::score::{peak, same_shape, score};
+use conefield::{files, parse};
 use conefield_core::Result;
 use conefield_core::scan::Volume;
-use conefield_metrics::{Dice, Scores, dice, label_map};
-use conefield_report::MiddleSlices;
-use conefield_run::score::{peak, same_shape, score};
+use conefield_evaluation::metrics::{Dice, Scores, dice, label_map};
+use conefield_evaluation::report::MiddleSlices;
 use serde::Serialize;
 use std::path::PathBuf;
 

@@ -1,11 +1,12 @@
 //! `conefield explain`
 
-use crate::backend::{self, BackendChoice};
-use crate::memory::{self, Memory};
-use crate::{files, method, out, specs};
+use crate::out;
 use clap::Args;
+use conefield::backend::{self, BackendChoice};
+use conefield::explain::Explanation;
+use conefield::memory::{self, Memory};
+use conefield::{files, method, specs};
 use conefield_core::Result;
-use conefield_run::explain::Explanation;
 use std::path::PathBuf;
 
 /// Show what a spec builds: stages, widths, parameters, memory, work.

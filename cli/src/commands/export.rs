@@ -2,8 +2,9 @@
 
 use super::trained::Trained;
 use crate::boundary::{Inputs, refuse_existing};
-use crate::{memory, out, outgoing, signals};
+use crate::{out, outgoing, signals};
 use clap::Args;
+use conefield::memory;
 use conefield_core::Result;
 use conefield_core::trained::FieldVoxels;
 use conefield_io::{PACKED_BYTES, SLAB_BYTES};

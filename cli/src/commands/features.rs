@@ -5,13 +5,13 @@ use crate::boundary::{self, Inputs, refuse_existing};
 use crate::out;
 use crate::pca::Pca;
 use clap::{Args, ValueEnum};
+use conefield::tradeoff::statistics::pearson;
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::host;
 use conefield_core::parts::Part;
 use conefield_core::trained::TrainedField;
-use conefield_report::MiddleSlices;
-use conefield_tradeoff::statistics::pearson;
+use conefield_evaluation::report::MiddleSlices;
 use ndarray::Array3;
 use serde_json::json;
 use std::path::PathBuf;
@@ -94,7 +94,7 @@ impl FeaturesArgs {
         colours.resize_with(DRAWN, || slices(&vec![0.0; n], f32::NAN));
         let scale = (scene.attenuation * unit_mm) as f32;
         attenuation.iter_mut().for_each(|x| *x *= scale);
-        conefield_report::features_png(
+        conefield_evaluation::report::features_png(
             &self.output,
             &slices(&attenuation, 0.0),
             [&colours[0], &colours[1], &colours[2]],

@@ -7,12 +7,14 @@ use super::{
     selection::SelectionOptions,
 };
 use crate::boundary::{Inputs, refuse_existing};
-use crate::memory::Memory;
-use crate::{out, parse};
+use crate::out;
 use clap::Args;
+use conefield::memory::Memory;
+use conefield::parse;
 use conefield_core::Result;
-use conefield_diagnosis::{Survey, survey};
-use conefield_io::{I0, ImportOptions, Imported};
+use conefield_io::I0;
+use conefield_scans::diagnosis::{Survey, survey};
+use conefield_scans::{ImportOptions, Imported};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
@@ -60,7 +62,7 @@ impl ImportArgs {
         Memory::of_views(&size).check(|_| vec![])?;
         let selection = self.selection.selection();
         let options = ImportOptions { i0: self.i0, floor: self.floor, corrections, selection };
-        let imported = conefield_io::read_scanner(&self.scanner, &options)?;
+        let imported = conefield_scans::import(&self.scanner, &options)?;
         log_applied(&self.scanner, &imported.corrections);
         conefield_io::write_scan(&self.output, &imported.scan, None)?;
         let survey = survey(&imported.scan);

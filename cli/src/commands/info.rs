@@ -2,17 +2,18 @@
 
 use super::calibrate;
 use crate::boundary::{self, Inputs};
-use crate::memory::Memory;
+use crate::out;
 use crate::run_folder::{self, RunOnDisk};
-use crate::{files, out};
 use clap::Args;
+use conefield::files;
+use conefield::memory::Memory;
 use conefield_backend_cpu::Cpu;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
-use conefield_diagnosis::{Survey, setup, survey};
-use conefield_report::MiddleSlices;
-use conefield_report::survey_png;
+use conefield_evaluation::report::MiddleSlices;
+use conefield_evaluation::report::survey_png;
+use conefield_scans::diagnosis::{Survey, setup, survey};
 use ndarray::ArrayView3;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -181,7 +182,7 @@ pub fn facts(s: &Scan, survey: &Survey) -> Value {
 
 fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
     Memory::of_data_set(&conefield_io::scan_size(path)?).check(|_| vec![])?;
-    let data = conefield_io::read_data_set(path)?;
+    let data = conefield_scans::read_data_set(path)?;
     let s = &data.train;
     s.validate(&path.display().to_string())?;
     let survey = survey(s);

@@ -1,16 +1,17 @@
 //! `conefield pretrain`
 
 use super::EndOptions;
-use crate::backend::{self, BackendChoice};
 use crate::boundary::{self, Inputs, refuse_existing};
-use crate::parse::{self, Values};
 use crate::progress::Progress;
-use crate::{files, method, out, signals, specs};
+use crate::{out, signals};
 use clap::Args;
+use conefield::backend::{self, BackendChoice};
+use conefield::parse::{self, Values};
+use conefield::pretraining;
+use conefield::{files, method, specs};
 use conefield_core::Result;
 use conefield_core::method::PretrainJob;
 use conefield_core::scan::Volume;
-use conefield_run::pretraining;
 use serde_json::json;
 use std::path::PathBuf;
 

@@ -1,14 +1,15 @@
 //! `conefield project`
 
 use crate::boundary::{Inputs, refuse_existing};
-use crate::memory::{self, Memory};
-use crate::parse::HoldOut;
-use crate::{files, out, parse, signals};
+use crate::{out, signals};
 use clap::Args;
+use conefield::memory::{self, Memory};
+use conefield::parse::HoldOut;
+use conefield::projection::{self, Residual};
+use conefield::{files, parse};
 use conefield_core::error::ensure;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
-use conefield_run::projection::{self, Residual};
 use ndarray::Array3;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -103,7 +104,7 @@ impl ProjectArgs {
     /// The scan with the requested views.
     fn chosen(&self, scan: Scan) -> Result<Scan> {
         let n = scan.geometry.views.len();
-        match conefield_run::input::held_out(self.views.as_ref(), n, "command line", "--views")? {
+        match conefield::input::held_out(self.views.as_ref(), n, "command line", "--views")? {
             all if all.is_empty() || all.len() == n => Ok(scan),
             some => {
                 if let Some(v) = some.iter().find(|v| **v >= n) {

@@ -1,12 +1,12 @@
 //! Options of a reconstruction besides scan and spec, shared by all methods of a comparison.
 
 use super::EndOptions;
-use crate::backend::{self, BackendChoice};
-use crate::parse::{self, HoldOut};
 use clap::Args;
+use conefield::backend::{self, BackendChoice};
+use conefield::parse::{self, HoldOut};
+use conefield::{input, score};
 use conefield_core::Result;
 use conefield_core::scan::{Scan, Volume};
-use conefield_run::{input, score};
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 

@@ -1,14 +1,14 @@
 //! The record of a run.
 
 use super::{EndOptions, evaluate};
-use crate::memory::Memory;
 use crate::out;
-use crate::plugins::Used;
+use conefield::machine::Machine;
+use conefield::memory::Memory;
+use conefield::plugins::Used;
+use conefield::tradeoff::schedule::Schedule;
+use conefield::tradeoff::trial::ScanRecord;
 use conefield_core::backend::Explain;
-use conefield_metrics::Scores;
-use conefield_run::machine::Machine;
-use conefield_tradeoff::schedule::Schedule;
-use conefield_tradeoff::trial::ScanRecord;
+use conefield_evaluation::metrics::Scores;
 use serde::Serialize;
 use std::path::Path;
 

@@ -4,14 +4,14 @@ mod runs;
 mod scans;
 
 use crate::boundary::{self, Inputs, refuse_existing};
-use crate::memory::Memory;
 use crate::out;
-use crate::parse::{self, HoldOut};
 use crate::run_folder::RunOnDisk;
 use clap::Args;
+use conefield::memory::Memory;
+use conefield::parse::{self, HoldOut};
+use conefield::projection;
 use conefield_core::Result;
-use conefield_report::page::{Page, PageVolume, coarser, png_url};
-use conefield_run::projection;
+use conefield_evaluation::report::page::{Page, PageVolume, coarser, png_url};
 use scans::{Group, Options};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};

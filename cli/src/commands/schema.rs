@@ -1,7 +1,8 @@
 //! `conefield schema`
 
-use crate::{out, specs};
+use crate::out;
 use clap::Args;
+use conefield::specs;
 use conefield_core::registry::{Kind, Origin, stage_types};
 use conefield_core::{Result, spec::schema};
 
@@ -20,7 +21,7 @@ impl SchemaArgs {
     pub fn run(self) -> Result<()> {
         match (self.tables, self.study) {
             (true, _) => out::say(&tables()?),
-            (_, true) => out::json(&conefield_study::study::schema()),
+            (_, true) => out::json(&conefield::study::definition::schema()),
             _ => out::json(&schema::spec()),
         }
     }

@@ -1,7 +1,7 @@
 //! The options that select part of a scan.
 
 use clap::Args;
-use conefield_io::{Lines, Selection, ViewChoice};
+use conefield_scans::{Lines, Selection, ViewChoice};
 
 /// The part of a scan to take, in this order: views, turned and flipped images, a piece of the detector, larger pixels.
 #[derive(Debug, Clone, Args)]

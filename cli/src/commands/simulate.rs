@@ -1,13 +1,14 @@
 //! `conefield simulate`
 
 use crate::boundary::{Inputs, refuse_existing};
-use crate::memory::Memory;
-use crate::parse::{self, AnglesOption, Values};
-use crate::{files, out};
+use crate::out;
 use clap::Args;
+use conefield::files;
+use conefield::memory::Memory;
+use conefield::parse::{self, AnglesOption, Values};
+use conefield::simulation::{self, Changes};
 use conefield_core::Result;
 use conefield_projectors::simulate::DetectorNoise;
-use conefield_run::simulation::{self, Changes};
 use serde_json::json;
 use std::path::PathBuf;
 use tracing::warn;

@@ -1,23 +1,19 @@
 //! `conefield tradeoff`
 
-#[cfg(test)]
-mod tests;
-
 use super::protocol::RunProtocol;
 use super::trial::{self, Trial};
 use super::{EndOptions, General, backends::simd_level};
-use crate::backend::{self, BackendChoice};
 use crate::boundary::Inputs;
-use crate::method::Known;
-use crate::parse::{self, HoldOut};
 use crate::{out, signals};
 use clap::Args;
+use conefield::backend::{self, BackendChoice};
+use conefield::parse::{self, HoldOut};
+use conefield::tradeoff::levers::{self, Candidate, Levers};
+use conefield::tradeoff::report::TradeoffReport;
+use conefield::tradeoff::search::{CONTENTS, Due, Earlier, Search};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use conefield_io::Lease;
-use conefield_tradeoff::levers::{self, Candidate, Levers};
-use conefield_tradeoff::report::TradeoffReport;
-use conefield_tradeoff::search::{CONTENTS, Due, Earlier, Search};
 use std::path::{Path, PathBuf};
 
 /// Search for the best methods under time budgets.
@@ -90,8 +86,8 @@ impl TradeoffArgs {
         // Errors in the input are reported before anything is created.
         let Some(output) = &self.output else { return Err(Error::invalid("tradeoff", "-o", "nothing", "a folder")) };
         let levers = match &self.levers {
-            Some(path) => Levers::read(path, &Known)?,
-            None => Levers::shipped(&Known)?,
+            Some(path) => Levers::read(path)?,
+            None => Levers::shipped()?,
         };
         let levers = levers.only(&self.bases)?;
         let search = self.search(levers.candidates(self.candidates.into(), self.seed)?, general)?;
@@ -113,7 +109,7 @@ impl TradeoffArgs {
         }
         let rungs = search.climb(output, &mut over, &mut |due| self.trial(&search, due, general))?;
         let report = TradeoffReport::new(search, rungs, over)?;
-        report.write(output, &Known)?;
+        report.write(output)?;
         lease.complete()?;
         if self.json { out::json(&report) } else { out::say(&report.text(output)) }
     }

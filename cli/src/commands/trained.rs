@@ -1,9 +1,9 @@
 //! Shared parts of commands on the field of a finished run.
 
-use crate::backend::{self, BackendChoice};
-use crate::files;
-use crate::memory::Memory;
 use clap::Args;
+use conefield::backend::{self, BackendChoice};
+use conefield::files;
+use conefield::memory::Memory;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};

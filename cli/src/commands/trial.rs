@@ -3,11 +3,12 @@
 use super::General;
 use super::protocol::{RunProtocol, word};
 use super::reconstruct::FAILED;
-use crate::memory::Run;
-use crate::{files, program, signals};
+use crate::{program, signals};
+use conefield::files;
+use conefield::memory::Run;
+use conefield::tradeoff::trial::TrialInput;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
-use conefield_tradeoff::trial::TrialInput;
 use std::io::Read;
 use std::path::Path;
 use std::process::{ExitStatus, Stdio};

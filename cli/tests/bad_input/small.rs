@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 /// A shipped spec of a field.
-const NAF: &str = include_str!("../../../specs/naf.toml");
+const NAF: &str = include_str!("../../../conefield/specs/naf.toml");
 
 /// Weights of one tensor whose notes name a network of 137 GB.
 fn huge_network(masks: &'static str) -> impl Fn(&Path) + Sync + Send {

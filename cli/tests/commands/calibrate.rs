@@ -3,8 +3,8 @@
 use crate::common::{conefield, done, json, refused, text};
 use conefield_core::geometry::{norm, sub};
 use conefield_core::orbit::CircularOrbit;
+use conefield_evaluation::report::Pixels;
 use conefield_projectors::simulate::{Ellipsoid, scan_ellipsoids};
-use conefield_report::Pixels;
 use serde_json::Value;
 use std::fs;
 use std::path::Path;
@@ -18,7 +18,7 @@ fn scanned(folder: &Path) {
 
 /// The same scan in `folder`, described with its detector shifted along u.
 fn shifted(scan: &Path, folder: &Path, pixels: f64) {
-    let mut scan = conefield_io::read_scan(scan).unwrap();
+    let mut scan = conefield_scans::read_scan(scan).unwrap();
     let mut orbit = CircularOrbit::fit(&scan.geometry.views).unwrap();
     orbit.offset[1] += pixels * orbit.pixel[1];
     scan.geometry.views = orbit.views();
@@ -72,8 +72,8 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
 
     // The input scan is unchanged, and the new one has the estimated geometry.
     assert_eq!(fs::read(at("wrong/scan.toml")).unwrap(), before);
-    let corrected = conefield_io::read_scan(at("out")).unwrap();
-    let right = conefield_io::read_scan(at("right")).unwrap();
+    let corrected = conefield_scans::read_scan(at("out")).unwrap();
+    let right = conefield_scans::read_scan(at("right")).unwrap();
     assert_eq!(corrected.projections, right.projections);
     // The first source is on the axis x, so u is along y.
     let moved = corrected.geometry.views[0].detector[1] - right.geometry.views[0].detector[1];
@@ -102,7 +102,7 @@ fn shifts_of_single_views_are_corrected_and_steady_views_are_unchanged() {
     let dir = tempdir().unwrap();
     let at = |n: &str| dir.path().join(n);
     scanned(&at("right"));
-    let mut scan = conefield_io::read_scan(at("right")).unwrap();
+    let mut scan = conefield_scans::read_scan(at("right")).unwrap();
     for (i, view) in scan.geometry.views.iter_mut().enumerate() {
         let [along_v, along_u] = [[1.0, -0.5], [-1.0, 0.0], [0.0, 1.5], [0.0, -1.0]][i % 4];
         view.detector = std::array::from_fn(|k| view.detector[k] + along_v * view.v[k] + along_u * view.u[k]);
@@ -116,11 +116,11 @@ fn shifts_of_single_views_are_corrected_and_steady_views_are_unchanged() {
     assert_eq!(found["jitter"]["verdict"], "corrected", "{found}");
     let [before, after] = [0, 1].map(|i| number(&found["jitter"]["held_out"][i]));
     assert!(after < 0.8 * before, "{found}");
-    let provenance = conefield_io::read_scan(at("corrected")).unwrap().provenance;
+    let provenance = conefield_scans::read_scan(at("corrected")).unwrap().provenance;
     assert!(number(&provenance["jitter"]["rms_pixels"]["u"]) > 0.5, "{provenance}");
 
     assert_eq!(calibrate("right", "same")["jitter"]["verdict"], "kept");
-    let [same, right] = ["same", "right"].map(|n| conefield_io::read_scan(at(n)).unwrap().geometry);
+    let [same, right] = ["same", "right"].map(|n| conefield_scans::read_scan(at(n)).unwrap().geometry);
     for (a, b) in same.views.iter().zip(&right.views) {
         assert!(norm(sub(a.detector, b.detector)) < 1e-9 * norm(b.detector), "{a:?} {b:?}");
     }
@@ -132,7 +132,7 @@ fn a_wrong_direction_of_rotation_is_reported() {
     let dir = tempdir().unwrap();
     let at = |n: &str| dir.path().join(n);
     scanned(&at("right"));
-    let mut scan = conefield_io::read_scan(at("right")).unwrap();
+    let mut scan = conefield_scans::read_scan(at("right")).unwrap();
     let mut orbit = CircularOrbit::fit(&scan.geometry.views).unwrap();
     orbit.angles.iter_mut().for_each(|a| *a = -*a);
     scan.geometry.views = orbit.views();
@@ -153,7 +153,7 @@ fn undetermined_parameters_are_unchanged() {
     let dir = tempdir().unwrap();
     let at = |n: &str| dir.path().join(n);
     scanned(&at("right"));
-    let geometry = conefield_io::read_scan(at("right")).unwrap().geometry;
+    let geometry = conefield_scans::read_scan(at("right")).unwrap().geometry;
     let ball = Ellipsoid {
         center: [0.0; 3],
         axes: [0.2 * geometry.volume.size()[0]; 3],

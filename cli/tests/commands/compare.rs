@@ -1,7 +1,7 @@
 //! `compare`: one table in three forms, one picture, and runs that can be used alone.
 
 use crate::common::{conefield, done, json, refused, text};
-use conefield_report::Pixels;
+use conefield_evaluation::report::Pixels;
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -31,7 +31,7 @@ fn both_commands_mend_alike_and_keep_what_they_did() {
     let part = ["--rows", "5:11", "--columns", "8:16"];
     let found = json(&[&["import", &scanner, "-o", &here, "--json"], &asked[..], &part].concat());
     done(&[&["convert", &whole, &there], &asked[..], &part].concat());
-    let [here, there] = [&here, &there].map(|p| conefield_io::read_scan(p).unwrap());
+    let [here, there] = [&here, &there].map(|p| conefield_scans::read_scan(p).unwrap());
     assert_eq!(here.projections, there.projections);
     assert!(here.projections.iter().all(|a| (a - 2f32.ln()).abs() < 1e-3), "{}", here.projections);
     for (list, name) in [(&found["corrections"], "printed"), (&there.provenance["corrections"], "kept")] {

@@ -1,7 +1,7 @@
 //! Further analyses: drift, features as colours, label maps, an end by held-out views, live slices.
 
 use crate::common::{done, json, refused, text};
-use conefield_report::Pixels;
+use conefield_evaluation::report::Pixels;
 use ndarray::Array3;
 use serde_json::Value;
 use std::fs;

@@ -104,7 +104,7 @@ fn scanner_files(dir: &Path) {
     let [n, size] = ["24", "32x32"];
     done(&["simulate", "phantom:head:32", "-o", &simulated, "--protocol", "r2", "--views", n, "--detector", size]);
     fs::create_dir(dir.join("views")).unwrap();
-    let simulated = conefield_io::read_scan(simulated).unwrap();
+    let simulated = conefield_scans::read_scan(simulated).unwrap();
     for (i, view) in simulated.projections.outer_iter().enumerate() {
         let counts: Vec<u16> = view.iter().map(|a| DARK + (OPEN * (-a).exp()) as u16).collect();
         tiff(&dir.join("views").join(format!("view{i}.tif")), 32, &counts);

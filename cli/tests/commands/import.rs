@@ -98,7 +98,7 @@ fn files_of_other_programs_come_in_whole() {
     fs::write(at("a.csv"), format!("\u{feff}angle;view\r\n{angles}")).unwrap();
     let found = json(&["import", &text(&at("s.toml")), "-o", &text(&at("scan")), "--json"]);
     assert_eq!(found["views"], 24);
-    let scan = conefield_io::read_scan(at("scan")).unwrap();
+    let scan = conefield_scans::read_scan(at("scan")).unwrap();
     let last = f64::from(scan.projections[[23, 1, 2]]);
     assert!((last - (20000f64 / 9143.0).ln()).abs() < 1e-5, "{last}");
 }

@@ -67,7 +67,7 @@ fn the_estimate_is_near_the_measured_peak() {
 fn the_estimate_is_near_the_peak_with_a_surround() {
     let dir = tempfile::tempdir().unwrap();
     let path = scan(dir.path(), 8, 64);
-    let mut cut = conefield_io::read_scan(&path).unwrap();
+    let mut cut = conefield_scans::read_scan(&path).unwrap();
     // Without noise there would be no prior, whose dual is a large part of the memory.
     cut.projections.iter_mut().enumerate().for_each(|(i, p)| *p = 1.5 + 1e-3 * f32::from((i * 7919 % 101) as u8));
     std::fs::remove_dir_all(&path).unwrap();

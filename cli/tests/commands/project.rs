@@ -2,7 +2,8 @@
 
 use crate::common::{done, json, refused, text};
 use conefield_core::geometry::View;
-use conefield_io::{read_scan, read_volume, write_volume};
+use conefield_io::{read_volume, write_volume};
+use conefield_scans::read_scan;
 use std::fs;
 use std::path::Path;
 use tempfile::tempdir;

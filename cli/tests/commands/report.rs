@@ -3,8 +3,8 @@
 use crate::common::{done, json, refused, text};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use conefield_evaluation::report::Pixels;
 use conefield_io::{read_volume, write_volume};
-use conefield_report::Pixels;
 use ndarray::Array3;
 use serde_json::Value;
 use std::fs;
@@ -283,7 +283,7 @@ fn a_browser_tells_the_value_at_a_voxel() {
     done(&["report", &run, "-o", &text(&out)]);
     let result = read_volume(format!("{run}/volume.nii.gz")).unwrap();
     let truth = read_volume(format!("{scan}/truth.nii.gz")).unwrap();
-    let grid = conefield_io::read_scan(&scan).unwrap().geometry.volume;
+    let grid = conefield_scans::read_scan(&scan).unwrap().geometry.volume;
     for voxel in [[5, 14, 9], [12, 12, 20]] {
         let mm = grid.voxel(voxel).map(|x| x.to_string()).join(",");
         let address = format!("file://{}#show=0&minus=1&at={mm}", out.display());

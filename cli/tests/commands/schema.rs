@@ -6,14 +6,14 @@ use serde_json::Value;
 #[test]
 fn the_files_in_specs_are_current() {
     for (file, line) in [("spec.schema.json", &["schema"][..]), ("study.schema.json", &["schema", "--study"])] {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../specs/schema").join(file);
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../conefield/specs/schema").join(file);
         let command = line.join(" ");
         if std::env::var_os("CONEFIELD_BLESS").is_some() {
             std::fs::write(&path, done(line)).unwrap();
         }
         assert!(
             std::fs::read_to_string(&path).unwrap_or_default() == done(line),
-            "write it anew: cargo run --release -p conefield -- {command} > specs/schema/{file}"
+            "write it anew: cargo run --release -p conefield-cli -- {command} > conefield/specs/schema/{file}"
         );
     }
 }

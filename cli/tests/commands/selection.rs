@@ -24,13 +24,13 @@ fn import_and_convert_take_the_same_part() {
     described(dir.path());
     let (scanner, whole) = (text(&at("s.toml")), text(&at("whole")));
     done(&["import", &scanner, "-o", &whole]);
-    let all = conefield_io::read_scan(&whole).unwrap();
+    let all = conefield_scans::read_scan(&whole).unwrap();
 
     let part = ["--views", "0-11:3", "--rows", "1:9", "--columns", "-14:"];
     for (name, command) in [("imported", vec!["import", &scanner, "-o"]), ("converted", vec!["convert", &whole])] {
         let out = text(&at(name));
         done(&[&command[..], &[&out], &part].concat());
-        let found = conefield_io::read_scan(&out).unwrap();
+        let found = conefield_scans::read_scan(&out).unwrap();
         assert_eq!(found.projections, all.projections.slice(s![0..12;3, 1..9, 2..16]), "{name}");
         let (a, b) = (&found.geometry, &all.geometry);
         assert_eq!((a.detector, a.views.len(), a.volume), ([8, 14], 4, b.volume));
@@ -48,7 +48,7 @@ fn import_and_convert_take_the_same_part() {
     let (light, mean) = (text(&at("light")), text(&at("mean")));
     done(&["import", &scanner, "-o", &light, "--bin", "2"]);
     done(&["convert", &whole, &mean, "--bin", "2"]);
-    let (light, mean) = (conefield_io::read_scan(&light).unwrap(), conefield_io::read_scan(&mean).unwrap());
+    let (light, mean) = (conefield_scans::read_scan(&light).unwrap(), conefield_scans::read_scan(&mean).unwrap());
     assert_eq!((light.geometry.detector, mean.geometry.detector), ([5, 8], [5, 8]));
     let block = all.projections.slice(s![3, 4..6, 6..8]);
     let want = -(block.iter().map(|a| (-a).exp()).sum::<f32>() / 4.0).ln();
@@ -59,7 +59,7 @@ fn import_and_convert_take_the_same_part() {
     let (half, flips) = (text(&at("half")), text(&at("flips")));
     done(&["convert", &whole, &half, "--turns", "2"]);
     done(&["import", &scanner, "-o", &flips, "--flip-rows", "--flip-columns"]);
-    let (half, flips) = (conefield_io::read_scan(&half).unwrap(), conefield_io::read_scan(&flips).unwrap());
+    let (half, flips) = (conefield_scans::read_scan(&half).unwrap(), conefield_scans::read_scan(&flips).unwrap());
     assert_eq!(half.projections, flips.projections);
     assert_eq!(half.projections, all.projections.slice(s![.., ..;-1, ..;-1]));
 
@@ -87,7 +87,7 @@ fn angles_and_vectors_come_from_files() {
     let at = |n: &str| dir.path().join(n);
     described(dir.path());
     done(&["import", &text(&at("s.toml")), "-o", &text(&at("whole"))]);
-    let want = conefield_io::read_scan(at("whole")).unwrap();
+    let want = conefield_scans::read_scan(at("whole")).unwrap();
     let angles: Vec<f64> = (0..12).map(|i| 30.0 * f64::from(i)).collect();
     let lines: String = angles.iter().map(|a| format!("{a}\n")).collect();
     fs::write(at("angles.txt"), &lines).unwrap();
@@ -115,7 +115,7 @@ fn angles_and_vectors_come_from_files() {
     ] {
         fs::write(at("f.toml"), &toml).unwrap();
         done(&["import", &text(&at("f.toml")), "-o", &text(&at("out")), "--force"]);
-        let found = conefield_io::read_scan(at("out")).unwrap();
+        let found = conefield_scans::read_scan(at("out")).unwrap();
         for (a, b) in found.geometry.views.iter().zip(&want.geometry.views) {
             for (x, y) in [(a.source, b.source), (a.detector, b.detector), (a.u, b.u), (a.v, b.v)] {
                 assert!((0..3).all(|k| (x[k] - y[k]).abs() < 1e-9), "{toml}: {a:?} {b:?}");
@@ -139,7 +139,7 @@ fn angles_and_vectors_come_from_files() {
     fs::write(at("f.toml"), SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { u = 0.5, normal = -2.0 }"))
         .unwrap();
     done(&["import", &text(&at("f.toml")), "-o", &text(&at("out")), "--force"]);
-    let found = conefield_io::read_scan(at("out")).unwrap();
+    let found = conefield_scans::read_scan(at("out")).unwrap();
     let angles = [0.5f64, 0.0, -2.0].map(|a| conefield_core::geometry::Radians(a.to_radians()));
     for (a, b) in found.geometry.views.iter().zip(&want.geometry.views) {
         let b = b.tilted(angles);

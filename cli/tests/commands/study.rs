@@ -1,7 +1,7 @@
 //! `study`: methods on scans with several seeds, interrupted, shared and repeated.
 
 use crate::common::{conefield, done, json, refused, text};
-use conefield_report::Pixels;
+use conefield_evaluation::report::Pixels;
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -302,7 +302,7 @@ fn a_script_for_slurm_names_every_share() {
 
 #[test]
 fn shipped_studies_are_studies() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../specs/studies");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../conefield/specs/studies");
     let dir = tempdir().unwrap();
     let mut count = 0;
     for entry in fs::read_dir(folder).unwrap() {

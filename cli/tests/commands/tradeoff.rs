@@ -1,7 +1,7 @@
 //! `tradeoff`: halving, a front without dominated points, specs that run, and `--resume` without repetition.
 
 use crate::common::{conefield, done, json, refused, text};
-use conefield_report::Pixels;
+use conefield_evaluation::report::Pixels;
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};

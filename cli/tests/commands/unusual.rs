@@ -3,8 +3,9 @@
 use crate::common::{conefield, done, json, refused, text};
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::scan::Volume;
-use conefield_io::{read_data_set, read_scan, read_volume, write_r2, write_scan, write_volume};
-use conefield_report::Pixels;
+use conefield_evaluation::report::Pixels;
+use conefield_io::{read_volume, write_r2, write_scan, write_volume};
+use conefield_scans::{read_data_set, read_scan};
 use ndarray::Array3;
 use serde_json::{Value, json};
 use std::fs;

@@ -16,8 +16,6 @@ use std::path::{Path, PathBuf};
 // Stage types register themselves when their crate is linked.
 use conefield_encoders as _;
 use conefield_fields as _;
-use conefield_initializers as _;
-use conefield_normalizers as _;
 use conefield_projectors as _;
 use conefield_solvers as _;
 use conefield_solvers::losses::L2;
@@ -94,7 +92,7 @@ fn as_built_in() {
     let run = text(&place.dir.path().join("run"));
     done(&place.reconstruct(&run, "60", &[]));
 
-    let scan = conefield_io::read_scan(&place.scan).unwrap();
+    let scan = conefield_scans::read_scan(&place.scan).unwrap();
     let spec = conefield_core::spec::load::parse(SPEC, "plugins.toml", &[], &[]).unwrap().spec;
     let (backend, limits) = (Cpu::new(), Limits { steps: Some(60), ..Limits::default() });
     let job = Job { seed: 7, limits, ..Job::new(&scan, &backend) };
@@ -131,7 +129,7 @@ fn a_regularizer_as_built_in() {
     done(&args(&whole));
     let read = |run: &str| conefield_io::read_volume(Path::new(run).join("volume.nii.gz")).unwrap().data;
 
-    let scan = conefield_io::read_scan(&scan).unwrap();
+    let scan = conefield_scans::read_scan(&scan).unwrap();
     let spec = conefield_core::spec::load::parse(SPEC, "huber.toml", &[], &[]).unwrap().spec;
     let (backend, limits) = (Cpu::new(), Limits { steps: Some(10), ..Limits::default() });
     let job = Job { limits, ..Job::new(&scan, &backend) };

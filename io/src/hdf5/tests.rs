@@ -1,9 +1,10 @@
 //! Files written by h5py (`tests/fixtures/make_formats.py`), intact and damaged.
 
 use crate::scan_size;
-use crate::scanner::{ImportOptions, Imported, read_scanner};
+use crate::testing::read_scanner;
 use conefield_core::Result;
 use conefield_core::geometry::{Millimetres, Radians, View};
+use conefield_core::scan::Scan;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -17,7 +18,7 @@ fn fixture(name: &str) -> PathBuf {
 
 /// Imports a description with `files`, then `rest`, from a folder with all fixtures, the first one passed through
 /// `change`.
-fn import(files: &str, rest: &str, change: impl Fn(&mut Vec<u8>)) -> Result<Imported> {
+fn import(files: &str, rest: &str, change: impl Fn(&mut Vec<u8>)) -> Result<Scan> {
     let dir = tempfile::tempdir().unwrap();
     for name in FIXTURES {
         let mut bytes = fs::read(fixture(name)).unwrap();
@@ -31,8 +32,8 @@ fn import(files: &str, rest: &str, change: impl Fn(&mut Vec<u8>)) -> Result<Impo
     let path = dir.path().join("s.toml");
     fs::write(&path, format!("{head}[files]\n{files}\n{rest}\n{volume}")).unwrap();
     let size = scan_size(&path);
-    let imported = read_scanner(&path, &ImportOptions::default())?;
-    assert_eq!(size?.pixels, imported.scan.projections.len() as u64);
+    let imported = read_scanner(&path, None)?;
+    assert_eq!(size?.pixels, imported.projections.len() as u64);
     Ok(imported)
 }
 
@@ -48,7 +49,7 @@ fn refused(files: &str, rest: &str, change: impl Fn(&mut Vec<u8>), words: &[&str
 #[test]
 fn layouts_give_projections_fields_and_angles() {
     let angles = |name: &str| format!("{CIRCLE}angles_deg = \"{name}\"\n");
-    let exchange = import(&files("dxchange.h5"), &angles("dxchange.h5"), |_| {}).unwrap().scan;
+    let exchange = import(&files("dxchange.h5"), &angles("dxchange.h5"), |_| {}).unwrap();
     for (v, r, c) in [(0, 0, 0), (1, 2, 3), (2, 3, 4)] {
         let i = (20 * v + 5 * r + c) as f64;
         let [dark, flat] = [100.0 + i % 20.0 % 7.0, 20010.0 + i % 20.0];
@@ -57,17 +58,17 @@ fn layouts_give_projections_fields_and_angles() {
     }
     let turned = &exchange.geometry.views[1].source;
     assert!((turned[0] + 250.0).abs() < 1e-9, "{turned:?}");
-    let tomo = import(&files("nxtomo.nxs"), &angles("nxtomo.nxs"), |_| {}).unwrap().scan;
+    let tomo = import(&files("nxtomo.nxs"), &angles("nxtomo.nxs"), |_| {}).unwrap();
     assert_eq!(tomo.projections, exchange.projections);
     assert!((tomo.geometry.views[2].source[1] - exchange.geometry.views[2].source[1]).abs() < 1e-9);
     // A group and data sets by name.
     let named = "projections = \"nxtomo.nxs:/entry\"\nflat = \"dxchange.h5:exchange/data_white\"\ndark = \"dxchange.h5:/exchange\"";
-    let named = import(named, &angles("dxchange.h5:/exchange/theta"), |_| {}).unwrap().scan;
+    let named = import(named, &angles("dxchange.h5:/exchange/theta"), |_| {}).unwrap();
     assert_eq!(named.projections, exchange.projections);
     // The description gives the axes of a data set.
     let swapped =
         format!("{CIRCLE}range_deg = 360\n[layout]\naxes = [\"view\", \"column\", \"row\"]\n[values]\ni0 = 20000\n");
-    let swapped = import("projections = \"dxchange.h5:/exchange/data\"", &swapped, |_| {}).unwrap().scan;
+    let swapped = import("projections = \"dxchange.h5:/exchange/data\"", &swapped, |_| {}).unwrap();
     assert_eq!(swapped.projections.dim(), (3, 5, 4));
 }
 
@@ -75,8 +76,7 @@ fn layouts_give_projections_fields_and_angles() {
 fn the_geometry_of_cil_is_that_of_its_conversion_to_vectors() {
     let scan =
         import("projections = \"cil.nxs\"", "[cil]\nfile = \"cil.nxs\"\n[values]\nkind = \"line-integrals\"\n", |_| {})
-            .unwrap()
-            .scan;
+            .unwrap();
     assert!((scan.projections[[2, 3, 4]] - 1.4723).abs() < 1e-6);
     let mm = Millimetres;
     for (view, angle) in scan.geometry.views.iter().zip([0.0, 120.0, 240.0]) {
@@ -153,7 +153,7 @@ fn a_filter_that_is_not_read_is_named_with_the_way_out() {
              [values]\ni0 = 20000\n[volume]\nshape = [4, 3, 2]\nspacing = [0.5, 0.75, 2.0]\n"
         );
         fs::write(dir.path().join("s.toml"), text).unwrap();
-        let e = read_scanner(dir.path().join("s.toml"), &ImportOptions::default()).unwrap_err().to_string();
+        let e = read_scanner(dir.path().join("s.toml"), None).unwrap_err().to_string();
         let words = ["a.h5", &format!("packed by {name} (filter id {id})"), "h5repack -f NONE"];
         assert!(words.iter().all(|w| e.contains(w)), "{e}");
     }

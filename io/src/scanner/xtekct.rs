@@ -311,8 +311,8 @@ const KNOWN: &[&str] = &[
 
 #[cfg(test)]
 mod tests {
-    use super::super::{ImportOptions, read_scanner};
     use super::*;
+    use crate::testing::{read_scan, read_scanner};
     use conefield_core::geometry::{Millimetres, Radians};
     use conefield_core::orbit::CircularOrbit;
     use std::fs;
@@ -337,7 +337,7 @@ mod tests {
     #[test]
     fn a_description_of_nikons_becomes_a_scan() {
         let (_dir, path) = written(TEXT);
-        let scan = crate::read_scan(&path).unwrap();
+        let scan = read_scan(&path).unwrap();
         assert_eq!(scan.projections.dim(), (3, 4, 5));
         assert!((scan.projections[[1, 0, 0]] - 2.5f32.ln()).abs() < 1e-6);
         assert_eq!((scan.geometry.volume.shape, scan.geometry.volume.spacing), ([4, 4, 3], [0.5, 0.5, 0.75]));
@@ -362,7 +362,7 @@ mod tests {
         // Default voxel sizes are the pixel sizes at the axis.
         let without: String = TEXT.lines().filter(|l| !l.starts_with("Voxel")).flat_map(|l| [l, "\n"]).collect();
         let (_dir, path) = written(&without);
-        let grid = crate::read_scan(&path).unwrap().geometry.volume;
+        let grid = read_scan(&path).unwrap().geometry.volume;
         assert_eq!((grid.shape, grid.spacing), ([5, 5, 4], [1.25, 1.25, 0.9375]));
     }
 
@@ -371,7 +371,7 @@ mod tests {
         let text = TEXT.replace("=1.6", "=0").replace(from, to);
         let (dir, path) = written(&text);
         files.iter().for_each(|(name, bytes)| fs::write(dir.path().join(name), bytes).unwrap());
-        crate::read_scan(&path).map(|s| s.geometry.views)
+        read_scan(&path).map(|s| s.geometry.views)
     }
 
     #[test]
@@ -426,7 +426,7 @@ mod tests {
             fs::rename(dir.path().join(from), dir.path().join(to)).unwrap();
         }
         fs::write(&path, TEXT.replace("InputFolderName=", "InputFolderName=.\\Raw")).unwrap();
-        let scan = crate::read_scan(&path).unwrap();
+        let scan = read_scan(&path).unwrap();
         assert_eq!(scan.projections.dim(), (3, 4, 5));
         assert!((scan.projections[[1, 0, 0]] - 2.5f32.ln()).abs() < 1e-6);
     }
@@ -449,7 +449,7 @@ mod tests {
         ] {
             assert!(TEXT.contains(from), "{from}");
             let (_dir, path) = written(&TEXT.replace(from, to));
-            let e = read_scanner(&path, &ImportOptions::default()).unwrap_err().to_string();
+            let e = read_scanner(&path, None).unwrap_err().to_string();
             assert!(e.contains("bone") && words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
         }
     }

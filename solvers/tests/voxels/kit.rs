@@ -14,7 +14,6 @@ use conefield_projectors::simulate::Ellipsoid;
 // Stage types register themselves when their crate is linked.
 use conefield_encoders as _;
 use conefield_fields as _;
-use conefield_initializers as _;
 
 /// A view of a circular orbit; lengths in mm, `pixel` and `offset` along v and u.
 pub fn view(angle: f64, distances: [f64; 2], pixel: [f64; 2], offset: [f64; 2]) -> View {

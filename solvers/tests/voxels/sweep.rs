@@ -6,8 +6,8 @@ use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Radians, Vec3, View, VoxelGrid};
 use conefield_core::method::Solution;
 use conefield_core::scan::Scan;
-use conefield_diagnosis::{WarningKind, survey};
 use conefield_projectors::simulate::{Ellipsoid, scan_ellipsoids};
+use conefield_scans::diagnosis::{WarningKind, survey};
 
 const RADIUS: f64 = 100.0;
 const MAGNIFICATION: f64 = 1.5;

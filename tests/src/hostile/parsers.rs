@@ -8,10 +8,7 @@ use conefield_core::spec::load;
 use std::path::Path;
 
 // Specs are checked against the stages that are linked.
-use {
-    conefield_encoders as _, conefield_fields as _, conefield_initializers as _, conefield_normalizers as _,
-    conefield_projectors as _, conefield_solvers as _,
-};
+use {conefield_encoders as _, conefield_fields as _, conefield_projectors as _, conefield_solvers as _};
 
 /// A reader and an input that it takes.
 pub struct Parser {
@@ -95,14 +92,14 @@ fn volume(path: &Path) -> Result<()> {
 fn scan(path: &Path) -> Result<()> {
     let _ = conefield_io::scan_size(path);
     let truth = conefield_io::read_truth(path);
-    let scan = conefield_io::read_scan(path)?;
-    conefield_diagnosis::check_line_integrals(scan.projections.view());
+    let scan = conefield_scans::read_scan(path)?;
+    conefield_scans::diagnosis::check_line_integrals(scan.projections.view());
     truth.map(drop)
 }
 
 fn scanner(folder: &Path) -> Result<()> {
     let _ = conefield_io::scan_size(folder.join("scanner.toml"));
-    conefield_io::read_scanner(folder.join("scanner.toml"), &Default::default()).map(drop)
+    conefield_scans::import(folder.join("scanner.toml"), &Default::default()).map(drop)
 }
 
 fn spec(path: &Path) -> Result<()> {

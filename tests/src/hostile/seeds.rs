@@ -331,13 +331,14 @@ pub fn checkpoint(dir: &Path) {
 
 /// `spec.toml`: the shipped `ni-naf`.
 pub fn spec_toml(dir: &Path) {
-    let naf = include_str!("../../../specs/naf.toml");
+    let naf = include_str!("../../../conefield/specs/naf.toml");
     put(&dir.join("spec.toml"), naf.as_bytes());
 }
 
 /// `spec.json`: the same.
 pub fn spec_json(dir: &Path) {
-    let value: serde_json::Value = toml::from_str(include_str!("../../../specs/naf.toml")).expect("a shipped spec");
+    let value: serde_json::Value =
+        toml::from_str(include_str!("../../../conefield/specs/naf.toml")).expect("a shipped spec");
     put(&dir.join("spec.json"), value.to_string().as_bytes());
 }
 

@@ -16,8 +16,6 @@ use serde_json::{Value, json};
 // Stage types register themselves where their crate is linked.
 use conefield_encoders as _;
 use conefield_fields as _;
-use conefield_initializers as _;
-use conefield_normalizers as _;
 use conefield_solvers as _;
 
 /// A ball in air with a box inside, 16³ voxels of 10 mm, in 1/mm.

@@ -13,7 +13,7 @@ use conefield_core::scene::Scene;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Kernel, Stage, Tile, TileMut};
-use conefield_report::{CurveOptions, curves_png_with};
+use conefield_evaluation::report::{CurveOptions, curves_png_with};
 use conefield_solvers::losses::L2;
 use serde_json::{Value, json};
 use std::ops::Range;

@@ -5,8 +5,9 @@ use crate::common::{scan, solve, truth, volume};
 use conefield_core::arena::Weights;
 use conefield_core::error::Result;
 use conefield_core::scan::{Scan, Volume};
-use conefield_io::{Correction, OpenBeam, line_integrals};
+use conefield_io::{Conversion, OpenBeam};
 use conefield_projectors::simulate::{Protocol, simulate};
+use conefield_scans::counts::line_integrals;
 use ndarray::Array3;
 use serde_json::{Value, json};
 
@@ -200,7 +201,7 @@ pub fn photons() -> Vec<Case> {
     let counts = |lit: usize| {
         // The first `lit` of 16 columns count; behind the rest nothing arrives.
         let counts = Array3::from_shape_fn((4, 16, 16), |(.., c)| if c < lit { 900.0 } else { 0.0 });
-        let correction = Correction { open: OpenBeam::Number(1000.0), dark: None, floor: None };
+        let correction = Conversion { open: OpenBeam::Number(1000.0), dark: None, floor: None };
         line_integrals(counts, &correction, "counts")
     };
     all.push(Case::right("counts of 0 in 7 of 16 columns", "clamped to the floor, finite", move || {

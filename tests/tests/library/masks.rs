@@ -7,7 +7,6 @@ use serde_json::{Value, json};
 
 use conefield_encoders as _;
 use conefield_fields as _;
-use conefield_normalizers as _;
 
 struct Nothing;
 impl Projector for Nothing {

@@ -9,7 +9,7 @@ use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
-use conefield_normalizers::layer_norm::LayerNorm;
+use conefield_fields::normalizers::layer_norm::LayerNorm;
 use conefield_projectors::ray_march::{RayMarch, Sampling};
 use conefield_projectors::simulate::{Protocol, phantom, simulate};
 use conefield_projectors::voxel::Joseph;

@@ -1,7 +1,8 @@
 //! `conefield plugins check`
 
-use crate::{out, parse, plugins, program};
+use crate::{out, program};
 use clap::Args;
+use conefield::{parse, plugins};
 use conefield_backend_wgpu::{Shared, Wgpu};
 use conefield_conformance::{
     Options, Outcome, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,

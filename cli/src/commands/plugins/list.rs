@@ -1,7 +1,8 @@
 //! `conefield plugins list`
 
-use crate::{out, plugins};
+use crate::out;
 use clap::Args;
+use conefield::plugins;
 use conefield_core::Result;
 use conefield_plugins::search::{PATH_VARIABLE, user_folder};
 use conefield_plugins::{Found, Place};

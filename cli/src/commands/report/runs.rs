@@ -1,14 +1,14 @@
 //! The runs in a report.
 
 use crate::run_folder::RunOnDisk;
-use crate::{method, specs};
+use conefield::explain::Explanation;
+use conefield::tradeoff::json::read_json;
+use conefield::{method, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::error::ensure;
-use conefield_report::page::{Notice, Page, PageRun};
-use conefield_report::text::stem;
-use conefield_run::explain::Explanation;
-use conefield_tradeoff::json::read_json;
+use conefield_evaluation::report::page::{Notice, Page, PageRun};
+use conefield_evaluation::report::text::stem;
 use serde::Deserialize;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};

@@ -2,20 +2,20 @@
 
 use crate::commands::info::facts;
 use crate::commands::info::lines;
-use crate::memory::Memory;
-use crate::parse::HoldOut;
 use crate::run_folder::RunOnDisk;
+use conefield::memory::Memory;
+use conefield::parse::HoldOut;
+use conefield::tradeoff::trial::ScanRecord;
+use conefield::{input, projection};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::voxel::VoxelProjector;
 use conefield_core::{Error, Result};
-use conefield_diagnosis::survey;
-use conefield_report::page::{
+use conefield_evaluation::report::page::{
     MeasuredView, Notice, Page, PageScan, PageVolume, PredictedView, PredictedViews, Scale, geometry_url, picture_url,
     spread,
 };
-use conefield_run::{input, projection};
-use conefield_tradeoff::trial::ScanRecord;
+use conefield_scans::diagnosis::survey;
 use ndarray::{Array3, Axis};
 use std::path::{Path, PathBuf};
 
@@ -173,7 +173,7 @@ impl Group {
 
 /// The scan, if it is the one used by `run`.
 fn read(path: &Path, run: &RunOnDisk, options: &Options, page: &mut Page) -> Result<Option<Scan>> {
-    let scan = conefield_io::read_scan(path)?;
+    let scan = conefield_scans::read_scan(path)?;
     let place = path.display().to_string();
     scan.validate(&place)?;
     if run.is_of(&ScanRecord::of(path, &scan)?) {

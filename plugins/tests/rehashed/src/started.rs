@@ -1,8 +1,8 @@
 //! The built-in initializers `mci` and `volume` as plugin types: one gets weights read by the host, the other a known
 //! volume.
 
-use conefield_initializers::mci::Mci;
-use conefield_initializers::volume::FromVolume;
+use conefield_fields::initializers::mci::Mci;
+use conefield_fields::initializers::volume::FromVolume;
 use conefield_plugin::arena::Weights;
 use conefield_plugin::error::Result;
 use conefield_plugin::settings::{Initializer, InitializerSpec};

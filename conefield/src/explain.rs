@@ -1,0 +1,158 @@
+//! Explains a spec: stages, widths, parameters, memory, operations.
+
+use crate::memory::{self, Memory};
+use crate::plugins;
+use conefield_core::Result;
+use conefield_core::method::{Findings, Line, Outline, Plan};
+use conefield_core::scan::Scan;
+use conefield_core::spec::load::Loaded;
+use conefield_evaluation::report::text::{bytes, number, table};
+use serde::Serialize;
+
+/// The explanation of a spec.
+#[derive(Debug, Serialize)]
+pub struct Explanation {
+    spec: String,
+    source: String,
+    description: String,
+    #[serde(flatten)]
+    outline: Outline,
+    parameters: usize,
+    model_bytes: usize,
+    /// The plugins whose stages the spec uses.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    plugins: Vec<plugins::Used>,
+    scan: Option<ForScan>,
+}
+
+/// The part that depends on the scan.
+#[derive(Debug, Serialize)]
+struct ForScan {
+    views: usize,
+    detector: [usize; 2],
+    volume: [usize; 3],
+    #[serde(flatten)]
+    findings: Findings,
+    memory: Memory,
+}
+
+impl Explanation {
+    /// Explains a spec and its plan; with a scan, also its requirements in such a `run`.
+    pub fn new(loaded: &Loaded, plan: &dyn Plan, scan: Option<(&Scan, memory::Run)>) -> Result<Self> {
+        let for_scan = |(scan, run): (&Scan, memory::Run)| {
+            let g = &scan.geometry;
+            Ok(ForScan {
+                views: g.views.len(),
+                detector: g.detector,
+                volume: g.volume.shape,
+                findings: plan.inspect(scan).map_err(|e| loaded.locate(e))?,
+                memory: run.memory(plan),
+            })
+        };
+        let scan = scan.map(for_scan).transpose()?;
+        let outline = plan.outline();
+        let parameters = outline.parameters();
+        Ok(Self {
+            spec: loaded.spec.name.clone(),
+            source: loaded.source.clone(),
+            description: loaded.spec.description.clone(),
+            outline,
+            parameters,
+            model_bytes: 16 * parameters,
+            plugins: plugins::used(&loaded.tree),
+            scan,
+        })
+    }
+
+    /// Text for people.
+    pub fn text(&self) -> String {
+        text(self)
+    }
+}
+
+fn text(r: &Explanation) -> String {
+    let mut lines = vec![];
+    let shipped = r.source.strip_prefix(&r.spec) == Some(" (shipped)");
+    lines.push(if shipped || r.spec.is_empty() { r.source.clone() } else { format!("{} ({})", r.spec, r.source) });
+    if !r.description.is_empty() {
+        lines.push(r.description.clone());
+    }
+    lines.push(String::new());
+    outlined(&r.outline, &mut lines);
+    for plugin in &r.plugins {
+        lines.push(format!("\nplugin: {}", plugin.line()));
+    }
+    if r.parameters > 0 {
+        lines.push(String::new());
+        lines.push(format!(
+            "memory for the model: {} (parameters {p}, gradients {p}, moments {})",
+            bytes(r.model_bytes as u64),
+            bytes(8 * r.parameters as u64),
+            p = bytes(4 * r.parameters as u64),
+        ));
+    }
+    if let Some(s) = &r.scan {
+        if r.parameters == 0 {
+            lines.push(String::new());
+        }
+        let ([rows, columns], [x, y, z]) = (s.detector, s.volume);
+        let samples = s.findings.samples.map_or(String::new(), |n| format!(", {n} samples on the middle ray"));
+        let views = s.views;
+        lines.push(format!("this scan: {views} views of {rows} x {columns}, volume {x} x {y} x {z}{samples}"));
+        lines.extend(s.findings.lines.iter().map(|line| format!("  {line}")));
+        lines.push(format!("memory for this scan: {}", s.memory.line()));
+    }
+    lines.join("\n")
+}
+
+/// The parts of a method; for a chain, the parts of each of its methods.
+fn outlined(o: &Outline, lines: &mut Vec<String>) {
+    if !o.stages.is_empty() {
+        lines.push(stages(o));
+        lines.push(String::new());
+    }
+    let row = |l: &Line| vec![l.stage.clone(), l.kind.clone(), l.what.clone()];
+    let rest: Vec<Vec<String>> = o.beside.iter().chain([&o.method]).map(row).collect();
+    lines.push(table(&rest, &[]));
+    if let Some(backend) = &o.compiled {
+        lines.push(format!("\nbackend: {}", backend.backend));
+        lines.extend(backend.notes.iter().map(|n| format!("  {n}")));
+    }
+    for link in &o.links {
+        lines.push(String::new());
+        outlined(link, lines);
+    }
+}
+
+/// A field's stages as a table.
+fn stages(o: &Outline) -> String {
+    let heads = ["stage", "type", "in -> out", "parameters", "bytes", "MACs/sample", "gradient", "what"];
+    let mut rows = vec![heads.map(str::to_owned).to_vec()];
+    for s in &o.stages {
+        let gradient = format!("{:?}", s.gradient).to_lowercase();
+        rows.push(vec![
+            s.stage.clone(),
+            s.kind.clone(),
+            format!("{} -> {}", s.input, s.output),
+            number(s.parameters as u64),
+            bytes(s.parameter_bytes as u64),
+            number(s.macs_per_sample as u64),
+            gradient,
+            format!(
+                "{}{}{}",
+                s.what,
+                if s.left_out { " (no work)" } else { "" },
+                if s.wgsl { "" } else { " (CPU only: it has no WGSL)" }
+            ),
+        ]);
+    }
+    rows.push(vec![
+        "total".into(),
+        String::new(),
+        String::new(),
+        number(o.stages.iter().map(|s| s.parameters).sum::<usize>() as u64),
+        bytes(o.stages.iter().map(|s| s.parameter_bytes).sum::<usize>() as u64),
+        number(o.stages.iter().map(|s| s.macs_per_sample).sum::<usize>() as u64),
+    ]);
+    table(&rows, &[3, 4, 5])
+}

@@ -1,0 +1,98 @@
+//! Inputs of a run: the scan, held-out views, the reference volume.
+
+use crate::parse::HoldOut;
+use crate::tradeoff::calibrate::Bench;
+use crate::tradeoff::schedule::Schedule;
+use crate::{files, score};
+use conefield_core::backend::Backend;
+use conefield_core::error::ensure;
+use conefield_core::method::{Job, Limits};
+use conefield_core::scan::{Scan, Volume};
+use conefield_core::{Error, Result};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Inputs of a run.
+pub struct Input {
+    /// The training views.
+    pub scan: Arc<Scan>,
+    /// The held-out views.
+    pub aside: Option<Scan>,
+    /// Indices of the held-out views.
+    pub held: Vec<usize>,
+    /// The reference volume, if known.
+    pub reference: Option<Volume>,
+    /// The data range of scores.
+    pub peak: f64,
+}
+
+impl Input {
+    /// Splits `whole` into training views and the held-out views `held`. The default of `peak` comes from the
+    /// reference.
+    pub fn new(whole: Arc<Scan>, held: Vec<usize>, reference: Option<Volume>, peak: Option<f64>) -> Result<Self> {
+        let peak = reference.as_ref().map_or(peak.unwrap_or(1.0), |r| score::peak(peak, r));
+        let (scan, aside) = if held.is_empty() {
+            (whole, None)
+        } else {
+            let (scan, aside) = whole.split(&held)?;
+            (Arc::new(scan), Some(aside))
+        };
+        Ok(Self { scan, aside, held, reference, peak })
+    }
+
+    /// The inputs for measuring a budget.
+    pub fn bench<'a>(&'a self, backend: &'a dyn Backend, seed: u64, cancelled: &'a dyn Fn() -> bool) -> Bench<'a> {
+        let reference = self.reference.as_ref();
+        Bench { scan: &self.scan, reference, peak: self.peak, backend, seed, volumes: &files::volume, cancelled }
+    }
+
+    /// The job of a method, with the limits of `schedule` in addition to `limits`.
+    pub fn job<'a>(
+        &'a self,
+        backend: &'a dyn Backend,
+        seed: u64,
+        limits: Limits,
+        schedule: Option<&Schedule>,
+    ) -> Job<'a> {
+        let (deadline, then) = (schedule.map(|s| s.deadline), schedule.and_then(|s| s.then));
+        Job {
+            held_out: self.aside.as_ref(),
+            reference: self.reference.as_ref(),
+            peak: self.peak,
+            seed,
+            limits: Limits { deadline, then, steps: limits.steps.or(schedule.and_then(|s| s.passes)), ..limits },
+            volumes: &files::volume,
+            ..Job::new(&self.scan, backend)
+        }
+    }
+}
+
+/// The reference volume, with the shape of the scan's volume: the file `path`, or for "truth" the volume of the scan at
+/// `scan_path`.
+pub fn reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> {
+    let volume = if path == Path::new("truth") && !path.exists() {
+        let place = scan_path.display().to_string();
+        conefield_io::read_truth(scan_path)?
+            .ok_or_else(|| Error::invalid(place, "--reference truth", "a scan without a truth", "a volume file"))?
+    } else {
+        conefield_io::read_volume(path)?
+    };
+    check_reference(&path.display().to_string(), &volume, scan)?;
+    Ok(volume)
+}
+
+/// Refuses a reference whose shape differs from the scan's volume; errors name `place`.
+pub fn check_reference(place: &str, volume: &Volume, scan: &Scan) -> Result<()> {
+    let want = scan.geometry.volume.shape;
+    let expected = format!("{want:?}, the shape of the scan's volume");
+    ensure(volume.data.shape() == want, place, "shape", format!("{:?}", volume.data.shape()), expected)
+}
+
+/// Indices of the held-out views out of `n`. Refuses an empty choice; errors name `place` and `field`.
+pub fn held_out(choice: Option<&HoldOut>, n: usize, place: &str, field: &str) -> Result<Vec<usize>> {
+    let Some(choice) = choice else { return Ok(vec![]) };
+    let held = choice.views(n);
+    let found = format!("{choice}, which selects none of {n} views");
+    ensure(!held.is_empty(), place, field, found, "at least one view")?;
+    Ok(held)
+}

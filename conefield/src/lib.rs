@@ -1,0 +1,58 @@
+//! Reconstruction of CT volumes from few cone-beam X-ray views.
+//!
+//! [`read_scan`] reads a scan, [`Reconstruct`] turns it into a volume, [`io`] writes both, and [`simulate`] makes scans
+//! of known volumes.
+//!
+//! ```no_run
+//! # fn main() -> conefield::Result<()> {
+//! let scan = conefield::read_scan("scan")?;
+//! let result = conefield::Reconstruct::with("smooth-tv").run(scan)?;
+//! conefield::io::write_volume("volume.nii.gz", &result.volume)?;
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! The command and the Python package stand on the other modules:
+//!
+//! - [`specs`]: the shipped specs by name; [`method`]: a spec, built, with its memory.
+//! - [`files`]: volumes, scans and weights by file name; [`plugins`]: libraries with stages; [`parse`]: parsers of
+//!   values.
+//! - [`backend`]: backends; [`memory`]: a run's memory and the available memory; [`machine`]: the current machine.
+//! - [`input`]: inputs of a run; [`choose`]: choice of the method, also for a time budget.
+//! - [`explain`]: explanation of a spec; [`score`]: comparison of a volume with its reference.
+//! - [`simulation`], [`pretraining`], [`projection`]: the work of the commands of these names.
+//! - `study`: many runs under one protocol; [`tradeoff`]: time, memory and accuracy of methods.
+//!
+//! The feature `wgpu` adds GPUs; the feature `plots` adds pictures, plots and pages, and the studies and searches that
+//! draw them.
+
+pub mod backend;
+pub mod choose;
+pub mod explain;
+pub mod files;
+pub mod input;
+pub mod machine;
+pub mod memory;
+pub mod method;
+pub mod parse;
+pub mod plugins;
+pub mod pretraining;
+pub mod projection;
+pub mod reconstruct;
+pub mod score;
+pub mod shipped;
+pub mod simulation;
+pub mod specs;
+#[cfg(feature = "plots")]
+pub mod study;
+pub mod tradeoff;
+
+pub use conefield_core::{Error, Result, geometry, scan, spec};
+pub use conefield_evaluation::metrics;
+pub use conefield_io as io;
+pub use conefield_projectors::simulate;
+pub use conefield_scans::read_scan;
+pub use reconstruct::{Reconstruct, Reconstructed};
+
+// Stage types register themselves when their crate is linked.
+use {conefield_encoders as _, conefield_fields as _, conefield_projectors as _, conefield_solvers as _};

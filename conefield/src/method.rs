@@ -1,0 +1,176 @@
+//! A spec with its plan and memory estimate.
+
+use crate::files;
+use crate::memory::{self, Memory};
+use conefield_core::Result;
+use conefield_core::backend::Backend;
+use conefield_core::method::{Context, Plan};
+use conefield_core::spec::load::Loaded;
+use serde_json::Value;
+use std::path::Path;
+
+/// A spec, built, with its memory estimate.
+pub struct Planned {
+    /// The spec.
+    pub loaded: Loaded,
+    /// The plan.
+    pub plan: Box<dyn Plan>,
+    /// The memory estimate.
+    pub memory: Memory,
+}
+
+/// Builds a spec for `backend`: every stage once. Errors name the line of the spec.
+pub fn plan(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<dyn Plan>> {
+    let context = Context { weights: &|path| files::read_weights(path), ..Context::new(backend) };
+    loaded.spec.method.plan(&context).map_err(|e| loaded.locate(e))
+}
+
+/// Builds a spec without reading the weights named in it.
+pub fn plan_without_files(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<dyn Plan>> {
+    loaded.spec.method.plan(&Context::without_weights(backend)).map_err(|e| loaded.locate(e))
+}
+
+/// Reads a spec with overriding settings.
+pub type Read<'a> = &'a dyn Fn(&[String]) -> Result<Loaded>;
+
+/// Reads and builds a spec, and refuses one that does not fit into memory. `run` gives the other memory of the run;
+/// `start` is the start file, weights or a volume.
+pub fn planned(
+    read: Read<'_>,
+    sets: &[String],
+    start: Option<&Path>,
+    backend: &dyn Backend,
+    run: &memory::Run,
+) -> Result<Planned> {
+    let mut sets = sets.to_vec();
+    if let Some(path) = start {
+        if conefield_io::is_volume(path) {
+            Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
+        }
+        sets.push(init(&read(&sets)?.tree, path));
+    }
+    let loaded = read(&sets)?;
+    let plan = plan(&loaded, backend)?;
+    let tables = smaller_tables(&loaded);
+    let smaller = tables.iter().filter_map(|(bits, set)| {
+        let loaded = read(&[&sets[..], std::slice::from_ref(set)].concat()).ok()?;
+        Some((*bits, plan_without_files(&loaded, backend).ok()?))
+    });
+    let memory = run.memory(plan.as_ref());
+    memory.check(|available| run.smaller(plan.as_ref(), available, smaller))?;
+    Ok(Planned { loaded, plan, memory })
+}
+
+/// Settings that reduce the tables of a hash grid, from the largest below the current size.
+fn smaller_tables(loaded: &Loaded) -> Vec<(u32, String)> {
+    let paths = ["encoder", "methods.0.encoder"];
+    let found = paths.into_iter().find_map(|path| {
+        let pointer = format!("/{}/log2_table_size", path.replace('.', "/"));
+        Some((path, loaded.tree.pointer(&pointer)?.as_u64()?))
+    });
+    let Some((path, bits)) = found else { return vec![] };
+    (10..bits as u32).rev().map(|bits| (bits, format!("{path}.log2_table_size={bits}"))).collect()
+}
+
+/// The setting that makes the method `tree` start from the file `path`, weights or a volume. In a chain, it applies to
+/// the first method.
+pub fn init(tree: &Value, path: &Path) -> String {
+    if let Some(first) = tree["methods"].get(0) {
+        return format!("methods.0.{}", init(first, path));
+    }
+    let file = toml::Value::String(path.display().to_string());
+    match conefield_io::is_volume(path) {
+        false => format!("initializer={{ type = \"mci\", weights = {file} }}"),
+        true if tree.get("initializer").is_some() => format!("initializer={{ type = \"volume\", path = {file} }}"),
+        true => format!("start={file}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::specs;
+    use crate::tradeoff::calibrate::{Bench, calibrate};
+    use crate::tradeoff::front::{Front, Unknowns};
+    use crate::tradeoff::schedule::Budget;
+    use crate::tradeoff::speed::pass_s;
+    use conefield_backend_cpu::Cpu;
+    use conefield_core::scan::{Scan, Volume};
+    use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
+    use std::time::Instant;
+
+    #[test]
+    fn the_shipped_front_loads_and_its_specs_build() {
+        let front = Front::shipped().unwrap();
+        for point in &front.points {
+            let loaded = specs::read(&point.spec, &point.sets).unwrap();
+            let plan = plan(&loaded, &Cpu::new()).unwrap();
+            assert_eq!(Unknowns::of(plan.as_ref()), point.kind, "{}", point.name);
+            assert!(point.accuracy().is_finite() && !point.scores(&front).contains("NaN"));
+        }
+    }
+
+    #[test]
+    fn every_kind_of_solver_is_measured() {
+        let (truth, backend) = (phantom_of(PhantomKind::Head, 24), Cpu::new());
+        let scan = scan_of(&truth);
+        let bench = bench(&scan, &truth, &backend);
+        for spec in ["fast", "fdk", "sart", "cgls", "fista-tv", "asd-pocs"] {
+            let loaded = specs::read(spec, &[]).unwrap();
+            let mut plan = plan(&loaded, &backend).unwrap();
+            let costs = calibrate(&bench, plan.as_mut(), 0.05).unwrap();
+            let all = [costs.step_s, costs.export_s, costs.picture_s, costs.score_s];
+            assert!(all.iter().all(|s| *s > 0.0 && s.is_finite()) && costs.prepare_s >= 0.0, "{spec}: {costs:?}");
+        }
+    }
+
+    fn scan_of(truth: &Volume) -> Scan {
+        simulate(truth, &Protocol::r2(&truth.grid).with_detector([24, 24]).with_views(12)).unwrap()
+    }
+
+    fn bench<'a>(scan: &'a Scan, truth: &'a Volume, backend: &'a Cpu) -> Bench<'a> {
+        Bench {
+            scan,
+            reference: Some(truth),
+            peak: 1.0,
+            backend,
+            seed: 0,
+            volumes: &files::volume,
+            cancelled: &|| false,
+        }
+    }
+
+    /// A front that was measured on a scan of the same size, with a chain of 10 s and FDK.
+    #[test]
+    fn a_front_of_a_faster_machine_promises_less_here() {
+        let (truth, backend) = (phantom_of(PhantomKind::Head, 24), Cpu::new());
+        let scan = scan_of(&truth);
+        let here = pass_s(&backend, &|| false).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        for (faster, wanted) in [(0.05, "long"), (4.0, "short")] {
+            let point = |name: &str, spec: &str, steps: u32, train_s: f64, psnr: u32| {
+                format!(
+                    "[[points]]\nname = \"{name}\"\nkind = \"voxels\"\nspec = \"{spec}\"\nbudget_s = 20.0\n[[points.runs]]\n\
+                     steps = {steps}\ntrain_s = {train_s}\ntotal_s = {train_s}\nbeside_s = 0.01\npsnr = {psnr}\n"
+                )
+            };
+            let text = format!(
+                "made = \"test\"\npass_s = {}\n[[scans]]\nname = \"a\"\nviews = 12\ndetector = [24, 24]\nvolume = [24, 24, 24]\n{}{}",
+                here / faster,
+                point("long", "smooth-tv", 27, 10.0, 30),
+                point("short", "fdk", 1, 0.01, 20),
+            );
+            let file = dir.path().join("front.toml");
+            std::fs::write(&file, text).unwrap();
+            let front = Front::read(&file).unwrap();
+            let build = |spec: &str, sets: &[String]| {
+                let loaded = specs::read(spec, sets)?;
+                let plan = plan(&loaded, &backend)?;
+                Ok(Planned { loaded, plan, memory: Memory::default() })
+            };
+            let budget = Budget { begin: Instant::now(), seconds: 8.0, spent: 0.0 };
+            let (_, schedule) = budget.choose(&bench(&scan, &truth, &backend), &front, build).unwrap();
+            assert_eq!(schedule.point.as_deref(), Some(wanted), "{schedule:?}");
+        }
+    }
+}

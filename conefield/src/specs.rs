@@ -1,0 +1,106 @@
+//! Specs by name.
+
+use crate::plugins;
+pub use crate::shipped::{FAST_WEIGHTS, SHIPPED};
+use conefield_core::method::Plan;
+use conefield_core::registry;
+use conefield_core::spec::load::{Draft, Loaded, to_toml};
+use conefield_core::{Error, Result};
+use std::collections::BTreeMap;
+
+/// All names of specs: built-in ones, and methods that need no settings.
+pub fn names() -> Vec<&'static str> {
+    let mut names: Vec<&str> = SHIPPED.iter().map(|s| s.name).collect();
+    let methods = registry::names(registry::Kind::Method).into_iter();
+    let alone: Vec<&str> = methods.filter(|t| !names.contains(t) && read(t, &[]).is_ok()).collect();
+    names.extend(alone);
+    names
+}
+
+/// The part of a help text about specs.
+pub fn help() -> String {
+    format!("A shipped spec ({}) or a file", names().join(", "))
+}
+
+/// Reads a built-in spec by name, or a file, with overriding settings `sets`.
+pub fn read(what: &str, sets: &[String]) -> Result<Loaded> {
+    let draft = Draft::find(what, sets, SHIPPED)?;
+    plugins::of_spec(&draft)?;
+    draft.finish()
+}
+
+/// Parses a spec in TOML or JSON with overriding settings `sets`; errors name `source`.
+pub fn parse(text: &str, source: &str, sets: &[String]) -> Result<Loaded> {
+    let draft = Draft::of(text, source, sets, SHIPPED)?;
+    plugins::of_spec(&draft)?;
+    draft.finish()
+}
+
+/// Parses a spec from a saved file; errors name `source`.
+pub fn reread(text: &str, source: &str) -> Result<Loaded> {
+    let draft = Draft::of(text, source, &[], &[])?;
+    plugins::of_spec(&draft)?;
+    draft.finish()
+}
+
+/// Notes on the origin of weights.
+pub fn notes(loaded: &Loaded, seed: u64) -> Result<BTreeMap<String, String>> {
+    let mut notes = BTreeMap::from([
+        ("conefield".into(), env!("CARGO_PKG_VERSION").into()),
+        ("seed".into(), seed.to_string()),
+        ("spec".into(), to_toml(&loaded.spec)?),
+    ]);
+    notes.extend(plugins::identity(&plugins::used(&loaded.tree)));
+    Ok(notes)
+}
+
+/// Refuses a setting that needs held-out views if `held` is empty.
+pub fn check_held_out(loaded: &Loaded, plan: &dyn Plan, held: &[usize]) -> Result<()> {
+    match plan.needs_held_out() {
+        Some(setting) if held.is_empty() => {
+            let expected = "held-out views, such as --hold-out every:10";
+            Err(loaded.locate(Error::invalid("spec", setting, "no held-out views", expected)))
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::method;
+    use conefield_backend_cpu::Cpu;
+
+    #[test]
+    fn every_shipped_spec_builds() {
+        for s in SHIPPED {
+            let loaded = read(s.name, &[]).unwrap();
+            assert_eq!(loaded.spec.name, s.name);
+            assert!(!loaded.spec.description.is_empty());
+            let outline = method::plan(&loaded, &Cpu::new()).unwrap().outline();
+            assert!(!outline.method.kind.is_empty(), "{}", s.name);
+        }
+    }
+
+    /// A chain cannot contain a chain, so `smooth-gaussians` repeats the methods of `smooth-tv`.
+    #[test]
+    fn smooth_gaussians_starts_with_the_methods_of_smooth_tv() {
+        let methods = |name| {
+            let spec = serde_json::to_value(&read(name, &[]).unwrap().spec).unwrap();
+            spec["methods"].as_array().unwrap().clone()
+        };
+        let [tv, all] = ["smooth-tv", "smooth-gaussians"].map(methods);
+        assert_eq!((tv.len(), all.len()), (3, 4));
+        assert_eq!(tv, all[..3]);
+    }
+
+    #[test]
+    fn a_method_is_named_by_its_type_alone() {
+        for name in ["sart", "cgls", "asd-pocs", "fista"] {
+            let loaded = read(name, &[]).unwrap();
+            assert_eq!((&loaded.spec.name[..], &loaded.source[..]), (name, &*format!("{name} (shipped)")));
+            method::plan(&loaded, &Cpu::new()).unwrap();
+        }
+        assert!(read("neural-field", &[]).err().unwrap().to_string().contains("encoder"));
+    }
+}

@@ -1,0 +1,129 @@
+//! A whole run in a search or a comparison: its inputs and its figures.
+
+use crate::tradeoff::json::{read_json, to_json};
+use conefield_core::Result;
+use conefield_core::scan::{Scan, Volume};
+use conefield_evaluation::report::MiddleSlices;
+use conefield_evaluation::report::text::stem;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::path::Path;
+
+/// Identifies a scan.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct ScanRecord {
+    /// Path from which it was read.
+    pub path: String,
+    /// Number of views.
+    pub views: usize,
+    /// Rows and columns of the detector.
+    pub detector: [usize; 2],
+    /// Shape of the volume.
+    pub volume: [usize; 3],
+    /// Checksum of all line integrals.
+    pub projections_fnv1a64: String,
+    /// Checksum of geometry and unit.
+    pub geometry_fnv1a64: String,
+}
+
+impl ScanRecord {
+    /// The record of the whole scan read from `path`.
+    pub fn of(path: &Path, scan: &Scan) -> Result<Self> {
+        let placed = to_json(&(&scan.geometry, &scan.unit))?;
+        Ok(Self {
+            path: path.display().to_string(),
+            views: scan.geometry.views.len(),
+            detector: scan.geometry.detector,
+            volume: scan.geometry.volume.shape,
+            projections_fnv1a64: checksum(scan.projections.iter().flat_map(|x| x.to_le_bytes())),
+            geometry_fnv1a64: checksum(placed.into_bytes().into_iter()),
+        })
+    }
+
+    /// The name of its file or folder.
+    pub fn name(&self) -> String {
+        stem(&self.path)
+    }
+
+    /// Text for people.
+    pub fn line(&self) -> String {
+        let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
+        format!("{}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
+    }
+}
+
+/// FNV-1a hash, to recognize a scan.
+fn checksum(bytes: impl Iterator<Item = u8>) -> String {
+    let hash = bytes.fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
+    format!("{hash:016x}")
+}
+
+/// What is known about the input after it has been read.
+pub struct TrialInput {
+    /// The whole scan.
+    pub scan: ScanRecord,
+    /// Indices of the held-out views.
+    pub held: Vec<usize>,
+    /// The middle slices of the reference volume.
+    pub reference: Option<MiddleSlices>,
+    /// The data range of the scores.
+    pub peak: f64,
+}
+
+impl TrialInput {
+    /// The facts about the scan read from `path`; keeps little of it. Refuses held-out views that leave no training
+    /// views.
+    pub fn of(path: &Path, scan: Scan, reference: Option<&Volume>, peak: f64, held: Vec<usize>) -> Result<Self> {
+        let record = ScanRecord::of(path, &scan)?;
+        if !held.is_empty() {
+            scan.split(&held)?;
+        }
+        Ok(Self { scan: record, held, reference: reference.map(MiddleSlices::of), peak })
+    }
+}
+
+/// The figures in a run's `record.json`, by the same names.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Figures {
+    /// Steps or passes.
+    pub steps: u64,
+    /// Time for all steps in seconds.
+    pub train_s: f64,
+    /// Time for writing weights and voxels in seconds.
+    pub export_s: f64,
+    /// Time of the whole run in seconds.
+    pub total_s: f64,
+    /// Peak memory.
+    pub peak_bytes: Option<u64>,
+    /// Number of threads.
+    pub threads: usize,
+    /// Number of parameters of a field.
+    pub parameters: usize,
+    /// Samples evaluated in training.
+    pub samples: u64,
+    /// For solvers that use samples.
+    pub samples_per_s: Option<f64>,
+    /// The last loss.
+    pub loss: Option<f64>,
+    /// Error of held-out views, relative to the largest line integral.
+    pub held_out: Option<f64>,
+    /// Scores as recorded, with the reasons for missing ones.
+    pub scores: Option<Value>,
+}
+
+impl Figures {
+    /// The figures of the finished run in `folder`.
+    pub fn of_run(folder: &Path) -> Result<Self> {
+        read_json(&folder.join("record.json"))
+    }
+
+    /// PSNR in dB; infinite, which JSON cannot represent, if the result equals the reference.
+    pub fn psnr(&self) -> Option<f64> {
+        self.scores.as_ref().map(|s| s["psnr"].as_f64().unwrap_or(f64::INFINITY))
+    }
+
+    /// A score, if defined.
+    pub fn score(&self, name: &str) -> Option<f64> {
+        self.scores.as_ref().and_then(|s| s[name].as_f64())
+    }
+}

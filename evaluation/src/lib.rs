@@ -1,0 +1,7 @@
+//! Evaluation of results: scores, and pictures and pages of them.
+//!
+//! - [`metrics`]: scores of a volume against its reference.
+//! - [`report`]: numbers in words and tables; plots, pictures and pages.
+
+pub mod metrics;
+pub mod report;
