@@ -47,10 +47,9 @@ fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
     }
 }
 
-/// Reads and validates a scan, and logs warnings about problems for a reconstruction.
+/// Reads a scan and logs warnings about problems for a reconstruction.
 pub fn scan(path: &Path) -> Result<Scan> {
     let scan = conefield_scans::read_scan(path)?;
-    scan.validate(&path.display().to_string())?;
     warn_of(path, &survey(&scan));
     Ok(scan)
 }

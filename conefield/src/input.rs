@@ -9,6 +9,8 @@ use conefield_core::error::ensure;
 use conefield_core::method::{Job, Limits};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
+use conefield_io::{DataSet, Parts};
+use conefield_scans::diagnosis::survey;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -67,18 +69,42 @@ impl Input {
     }
 }
 
-/// The reference volume, with the shape of the scan's volume: the file `path`, or for "truth" the volume of the scan at
-/// `scan_path`.
+/// The scan at `path` and the reference volume, if one is asked for: a file, or the scan's own volume for "truth". Logs
+/// warnings about problems for a reconstruction. Refuses a reference with another shape than the scan's volume.
+pub fn read(path: &Path, reference: Option<&Path>) -> Result<(Scan, Option<Volume>)> {
+    let own = reference.is_some_and(is_truth);
+    let DataSet { train: scan, volume, .. } =
+        conefield_scans::read_data_set(path, Parts { tests: false, volume: own })?;
+    files::warn_of(path, &survey(&scan));
+    let volume = match reference {
+        None => None,
+        Some(_) if own => Some(volume.ok_or_else(|| no_truth(path))?),
+        Some(file) => Some(conefield_io::read_volume(file)?),
+    };
+    if let (Some(volume), Some(file)) = (&volume, reference) {
+        check_reference(&file.display().to_string(), volume, &scan)?;
+    }
+    Ok((scan, volume))
+}
+
+/// The reference volume of a `scan` that was read from `scan_path`: the file `path`, or for "truth" the scan's volume.
 pub fn reference(path: &Path, scan_path: &Path, scan: &Scan) -> Result<Volume> {
-    let volume = if path == Path::new("truth") && !path.exists() {
-        let place = scan_path.display().to_string();
-        conefield_io::read_truth(scan_path)?
-            .ok_or_else(|| Error::invalid(place, "--reference truth", "a scan without a truth", "a volume file"))?
+    let volume = if is_truth(path) {
+        conefield_io::read_truth(scan_path)?.ok_or_else(|| no_truth(scan_path))?
     } else {
         conefield_io::read_volume(path)?
     };
     check_reference(&path.display().to_string(), &volume, scan)?;
     Ok(volume)
+}
+
+/// Whether `path` asks for the scan's own volume.
+fn is_truth(path: &Path) -> bool {
+    path == Path::new("truth") && !path.exists()
+}
+
+fn no_truth(scan: &Path) -> Error {
+    Error::invalid(scan.display().to_string(), "--reference truth", "a scan without a truth", "a volume file")
 }
 
 /// Refuses a reference whose shape differs from the scan's volume; errors name `place`.

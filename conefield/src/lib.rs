@@ -18,7 +18,7 @@
 //! - [`files`]: volumes, scans and weights by file name; [`plugins`]: libraries with stages; [`parse`]: parsers of
 //!   values.
 //! - [`backend`]: backends; [`memory`]: a run's memory and the available memory; [`machine`]: the current machine.
-//! - [`input`]: inputs of a run; [`choose`]: choice of the method, also for a time budget.
+//! - [`session`]: every run, from its inputs ([`input`]) to its [`record`].
 //! - [`explain`]: explanation of a spec; [`score`]: comparison of a volume with its reference.
 //! - [`simulation`], [`pretraining`], [`projection`]: the work of the commands of these names.
 //! - `study`: many runs under one protocol; [`tradeoff`]: time, memory and accuracy of methods.
@@ -27,7 +27,6 @@
 //! draw them.
 
 pub mod backend;
-pub mod choose;
 pub mod explain;
 pub mod files;
 pub mod input;
@@ -39,7 +38,9 @@ pub mod plugins;
 pub mod pretraining;
 pub mod projection;
 pub mod reconstruct;
+pub mod record;
 pub mod score;
+pub mod session;
 pub mod shipped;
 pub mod simulation;
 pub mod specs;

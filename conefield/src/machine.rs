@@ -1,5 +1,6 @@
 //! The machine of a run.
 
+use conefield_core::simd;
 use conefield_evaluation::report::text::bytes;
 use serde::{Deserialize, Serialize};
 use sysinfo::{CpuRefreshKind, MemoryRefreshKind, RefreshKind, System};
@@ -35,6 +36,12 @@ impl Machine {
     pub fn line(&self) -> String {
         format!("{}, {} cores, {}, {}", self.cpu, self.cores, bytes(self.memory_bytes), self.system)
     }
+}
+
+/// The instruction set that kernels use on this machine.
+pub fn simd_level() -> String {
+    let debug = format!("{:?}", simd::level());
+    debug.split(['(', ' ', '{']).next().unwrap_or_default().to_owned()
 }
 
 #[cfg(test)]

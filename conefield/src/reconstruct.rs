@@ -1,16 +1,14 @@
 //! Reconstruction from Rust: a scan, the name of a spec, a volume.
 
-use crate::choose::{Wish, choose};
 use crate::input::{Input, check_reference};
-use crate::method::{self, Planned};
-use crate::tradeoff::front::Front;
-use crate::tradeoff::schedule::Budget;
-use crate::{memory, score, specs};
+use crate::method::Read;
+use crate::session::{self, InMemory, Request, Session};
+use crate::{memory, specs};
 use conefield_backend_cpu::Cpu;
-use conefield_core::method::{Limits, Observer, Reconstruction, Silent};
+use conefield_core::Result;
+use conefield_core::method::{Limits, Observer, Silent, Solution};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::trained::TrainedField;
-use conefield_core::{Error, Result};
 use conefield_evaluation::metrics::Scores;
 use std::sync::Arc;
 use std::time::Instant;
@@ -18,10 +16,10 @@ use std::time::Instant;
 /// A reconstruction on the CPU as in `conefield reconstruct`, in memory.
 ///
 /// ```no_run
-/// # fn main() -> conefield_core::Result<()> {
-/// let scan = conefield_scans::read_scan("scan")?;
-/// let result = crate::reconstruct::Reconstruct::with("smooth-tv").run(scan)?;
-/// conefield_io::write_volume("volume.nii.gz", &result.volume)?;
+/// # fn main() -> conefield::Result<()> {
+/// let scan = conefield::read_scan("scan")?;
+/// let result = conefield::Reconstruct::with("smooth-tv").run(scan)?;
+/// conefield::io::write_volume("volume.nii.gz", &result.volume)?;
 /// # Ok(())
 /// # }
 /// ```
@@ -110,45 +108,21 @@ impl Reconstruct {
         let Self { spec, sets, limits, budget, held_out, reference, seed } = self;
         let (scan, backend) = (scan.into(), Cpu::new());
         scan.validate("scan")?;
-        if budget.is_some() && limits != Limits::default() {
-            let expected = "a budget, or steps and seconds";
-            return Err(Error::invalid("reconstruct", "budget", "another end of training", expected));
-        }
         if let Some(reference) = &reference {
             check_reference("reference", reference, &scan)?;
         }
         let (split, scored) = (!held_out.is_empty(), reference.is_some());
         let run = memory::Run { split, reference: scored, ..memory::Run::on_scan(&scan) };
-        let build = |spec: &str, own: &[String]| {
-            method::planned(&|s| specs::read(spec, s), &[own, &sets].concat(), None, &backend, &run)
-        };
-        let wish = match &spec {
-            Some(spec) => Wish::Method(build(spec, &[])?),
-            None => Wish::OneOf(Front::shipped()?),
-        };
-        let input = Input::new(scan, held_out, reference, None)?;
-        let bench = input.bench(&backend, seed, &|| false);
-        let budget = budget.map(|seconds| Budget { begin, seconds, spent: 0.0 });
-        let (Planned { loaded, mut plan, .. }, schedule) = choose(wish, &bench, budget, &input.held, build)?;
-        let job = input.job(&backend, seed, limits, schedule.as_ref());
-        let solution = plan.run(&job, observer).map_err(|e| loaded.locate(e))?;
-        let mut volume = solution.result.volume(&backend)?;
-        let reference = input.reference.as_ref();
-        volume.affine = volume.affine.or(reference.and_then(|r| r.affine));
-        let scores = reference.map(|r| score::score("the volume", &volume, r, input.peak)).transpose()?;
-        let field = match solution.result {
-            Reconstruction::Volume(_) => None,
-            Reconstruction::Field(field) => Some(field),
-            Reconstruction::Refined { field, .. } => Some(*field),
-        };
-        Ok(Reconstructed {
-            volume,
-            field,
-            spec: loaded.spec.name.clone(),
-            steps: solution.steps,
-            train_s: solution.train_s,
-            scores,
-        })
+        let read = spec.as_ref().map(|spec| |sets: &[String]| specs::read(spec, sets));
+        let spec = read.as_ref().map(|read| read as Read<'_>);
+        let request = Request { spec, sets, limits, budget, seed, ..Request::default() };
+        let session = Session::open(request, &backend, run, begin)?;
+        let mut run = session.plan(Input::new(scan, held_out, reference, None)?, 0.0, &|| false)?;
+        let mut solved = run.solve(None, None, observer)?;
+        let InMemory { volume, written } = run.in_memory(&mut solved, |result, backend| result.volume(backend))?;
+        let Solution { result, steps, train_s, .. } = solved.solution;
+        let spec = run.method.loaded.spec.name.clone();
+        Ok(Reconstructed { volume, field: session::field(result), spec, steps, train_s, scores: written.scores })
     }
 }
 

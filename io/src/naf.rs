@@ -99,7 +99,7 @@ pub(crate) fn read_truth(path: &Path) -> Result<Option<Volume>> {
     Ok(data.map(|data| Volume { data, grid: file.grid, affine: None }))
 }
 
-fn read(path: &Path, with_test: bool) -> Result<DataSet> {
+pub(crate) fn read(path: &Path, with_test: bool) -> Result<DataSet> {
     let place = path.display().to_string();
     let bytes = read_bytes(path)?;
     let pickle = Pickle::parse(&place, &bytes)?;

@@ -46,13 +46,29 @@ pub fn read_scan(path: impl AsRef<Path>) -> Result<Stored> {
     scan.map(Stored::Scan)
 }
 
-/// Reads everything in the scan's file or folder: training views, test views and volume.
-pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet<Stored>> {
+/// What to read beside the training views.
+#[derive(Debug, Clone, Copy)]
+pub struct Parts {
+    /// The test views.
+    pub tests: bool,
+    /// The volume.
+    pub volume: bool,
+}
+
+impl Parts {
+    /// Everything.
+    pub const ALL: Self = Self { tests: true, volume: true };
+}
+
+/// Reads a scan and the `parts` that its file or folder holds. Some formats give the volume unasked.
+pub fn read_data_set(path: impl AsRef<Path>, parts: Parts) -> Result<DataSet<Stored>> {
     let DataSet { train, test, volume } = match find(path.as_ref())? {
-        ScanFile::R2(folder) => r2::read_r2(&folder)?,
-        ScanFile::Naf(file) => naf::read_naf(&file)?,
-        ScanFile::Own(_) | ScanFile::Scanner(_) => {
-            return Ok(DataSet { train: read_scan(&path)?, test: None, volume: read_truth(&path)? });
+        ScanFile::R2(folder) if parts.tests => r2::read_r2(&folder)?,
+        ScanFile::R2(folder) => r2::read_train(&folder)?,
+        ScanFile::Naf(file) if parts.tests || parts.volume => naf::read(&file, parts.tests)?,
+        _ => {
+            let volume = if parts.volume { read_truth(&path)? } else { None };
+            return Ok(DataSet { train: read_scan(&path)?, test: None, volume });
         }
     };
     Ok(DataSet { train: Stored::Scan(train), test, volume })

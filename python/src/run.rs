@@ -7,17 +7,15 @@ use crate::scan::Scan;
 use crate::specs::SpecArgument;
 use crate::volume::{made, taken, taken_if};
 use crate::work::{Callback, Progress, Watch, without_lock};
-use conefield::choose::{Wish, choose};
 use conefield::explain::Explanation;
 use conefield::input::{self, Input};
 use conefield::memory::{self, Memory};
-use conefield::method::{self, Planned};
-use conefield::tradeoff::front::Front;
-use conefield::tradeoff::schedule::{Budget, Schedule};
+use conefield::method::{self, Planned, Read};
+use conefield::session::{self, InMemory, Request, Run, Session};
 use conefield::{files, pretraining, score, specs};
 use conefield_core::backend::Backend;
 use conefield_core::error::ensure;
-use conefield_core::method::{Job, Limits, PretrainJob, Reconstruction};
+use conefield_core::method::{Limits, PretrainJob};
 use conefield_core::scan::{self, Volume};
 use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
@@ -64,29 +62,17 @@ struct Wanted {
     truth: bool,
 }
 
-/// Everything decided before a run starts.
-struct Settled {
-    input: Input,
-    method: Planned,
-    schedule: Option<Schedule>,
-    limits: Limits,
-}
-
 impl Wanted {
-    /// Refuses inconsistent options, plans the run, and within a budget measures the machine and chooses.
-    fn settle(
+    /// Plans the run; within a budget this measures the machine and chooses.
+    fn planned<'a>(
         &self,
         scan: Arc<scan::Scan>,
         reference: Option<Volume>,
         start: Option<&Volume>,
-        backend: &dyn Backend,
+        backend: &'a dyn Backend,
         watch: &Watch,
-    ) -> Result<Settled> {
-        let begin = Instant::now();
-        let limits = self.ends.limits()?;
-        let budget = arguments::seconds("budget", self.budget.as_ref())?;
-        let both = budget.is_some() && limits != Limits::default();
-        ensure(!both, "arguments", "budget", "another end of training", "budget, or steps, seconds and at_most")?;
+        begin: Instant,
+    ) -> Result<Run<'a>> {
         ensure(
             self.peak.is_none_or(|p| p > 0.0 && p.is_finite()),
             "arguments",
@@ -98,35 +84,28 @@ impl Wanted {
         if let Some(reference) = &reference {
             input::check_reference("reference", reference, &scan)?;
         }
-        let run =
+        let memory =
             memory::Run { split: !held.is_empty(), reference: reference.is_some(), ..memory::Run::on_scan(&scan) };
-        let (sets, init) = (self.spec.sets()?, self.init.as_deref());
-        let wish = match (self.spec.is_given(), budget) {
-            (true, _) => Wish::Method(method::planned(&|s| self.spec.read(s), &sets, init, backend, &run)?),
-            (false, Some(_)) => Wish::OneOf(Front::shipped()?),
-            (false, None) => {
-                return Err(Error::invalid("arguments", "spec", "nothing", "a spec, or a budget to choose one by"));
-            }
+        let read = |sets: &[String]| self.spec.read(sets);
+        let request = Request {
+            spec: self.spec.is_given().then_some(&read as Read<'_>),
+            front: None,
+            sets: self.spec.sets()?,
+            init: self.init.clone(),
+            limits: self.ends.limits()?,
+            budget: arguments::seconds("budget", self.budget.as_ref())?,
+            seed: self.seed,
         };
-        if let Wish::Method(m) = &wish {
-            specs::check_held_out(&m.loaded, m.plan.as_ref(), &held)?;
-        }
-        let input = Input::new(scan, held, reference, self.peak)?;
-        let cancelled = || watch.cancelled();
-        let bench = input.bench(backend, self.seed, &cancelled);
-        let build = |spec: &str, own: &[String]| {
-            method::planned(&|s| specs::read(spec, s), &[own, &sets].concat(), init, backend, &run)
-        };
-        let budget = budget.map(|seconds| Budget { begin, seconds, spent: 0.0 });
-        let (mut method, schedule) = choose(wish, &bench, budget, &input.held, build)?;
-        let plan = method.plan.as_mut();
+        let session = Session::open(request, backend, memory, begin)?;
+        let mut run = session.plan(Input::new(scan, held, reference, self.peak)?, 0.0, &|| watch.cancelled())?;
+        let plan = run.method.plan.as_mut();
         let starts = match plan.links() {
             [first, ..] => first.starts_from_volume(),
             [] => plan.starts_from_volume(),
         };
-        let name = format!("a volume for {}, which starts from none", method.loaded.spec.name);
+        let name = format!("a volume for {}, which starts from none", run.method.loaded.spec.name);
         ensure(start.is_none() || starts, "arguments", "init", name, "a method that starts from a volume")?;
-        Ok(Settled { input, method, schedule, limits })
+        Ok(run)
     }
 
     /// The reference of a run on `scan`.
@@ -151,10 +130,10 @@ pub fn plan<'py>(
                 Err(Error::invalid("arguments", "scan", "nothing", "a scan, which a budget is planned for"))
             }
             (Some(_), Some(scan)) => {
-                let settled = wanted.settle(scan.clone(), None, None, backend.as_ref(), watch)?;
-                let Planned { loaded, plan, .. } = &settled.method;
+                let run = wanted.planned(scan.clone(), None, None, backend.as_ref(), watch, Instant::now())?;
+                let Planned { loaded, plan, .. } = &run.method;
                 let about = Some((scan.as_ref(), memory::Run::on_scan(&scan)));
-                let schedule = serde_json::to_value(&settled.schedule).unwrap_or(Value::Null);
+                let schedule = serde_json::to_value(&run.schedule).unwrap_or(Value::Null);
                 Ok((Explanation::new(loaded, plan.as_ref(), about)?, schedule))
             }
             (None, scan) => {
@@ -200,47 +179,22 @@ pub fn reconstruct<'py>(
     let (volume, record, field) = without_lock(py, |watch| {
         let backend = arguments::backend(&wanted.backend)?.open()?;
         let reference = wanted.reference(scan, reference)?;
-        let settled = wanted.settle(scan.scan.clone(), reference, start.as_ref(), backend.as_ref(), watch)?;
-        let Settled { input, method: Planned { loaded, mut plan, memory }, schedule, limits } = settled;
-        let outline = plan.outline();
+        let mut run = wanted.planned(scan.scan.clone(), reference, start.as_ref(), backend.as_ref(), watch, begin)?;
         let mut progress = Progress::new(watch, function);
-        let job = input.job(backend.as_ref(), wanted.seed, limits, schedule.as_ref());
-        let job = Job { start: start.as_ref(), ..job };
-        let solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
+        let mut solved = run.solve(start.as_ref(), None, &mut progress)?;
         progress.finish();
-        let mut volume = collect(solution.result.voxels(backend.as_ref())?.as_mut(), &|| watch.cancelled())?;
-        let reference = input.reference.as_ref();
-        volume.affine = volume.affine.or(reference.and_then(|r| r.affine));
-        let scores = reference.map(|r| score::score("the volume", &volume, r, input.peak)).transpose()?;
-        let last = progress.records().last();
-        let best = solution.best;
-        let record = json!({
-            "version": env!("CARGO_PKG_VERSION"),
-            "spec": loaded.spec.name,
-            "spec_toml": to_toml(&loaded.spec)?,
-            "seed": wanted.seed,
-            "held_out_views": input.held,
-            "plan": schedule,
-            "backend": outline.backend(),
-            "memory": memory,
-            "steps": solution.steps,
-            "rollbacks": solution.rollbacks,
-            "train_s": solution.train_s,
-            "total_s": begin.elapsed().as_secs_f64(),
-            "samples": solution.samples,
-            "loss": last.and_then(|r| r.loss),
-            "held_out": best.map(|b| b.held_out).or(last.and_then(|r| r.held_out)),
-            "best_step": best.map(|b| b.step),
-            "peak": input.peak,
-            "scores": scores,
-            "records": progress.records(),
-        });
-        let field = match solution.result {
-            Reconstruction::Volume(_) => None,
-            Reconstruction::Field(field) => Some(field),
-            Reconstruction::Refined { field, .. } => Some(*field),
-        };
-        let notes = specs::notes(&loaded, wanted.seed)?;
+        let InMemory { volume, written, .. } = run.in_memory(&mut solved, |result, backend| {
+            collect(result.voxels(backend)?.as_mut(), &|| watch.cancelled())
+        })?;
+        let loaded = &run.method.loaded;
+        let mut record = json!(run.record(&solved, progress.records().last(), written));
+        record["spec_toml"] = to_toml(&loaded.spec)?.into();
+        record["records"] = json!(progress.records());
+        for absent in ["plan", "best_step"].into_iter().filter(|key| record.get(*key).is_none()).collect::<Vec<_>>() {
+            record[absent] = Value::Null;
+        }
+        let field = session::field(solved.solution.result);
+        let notes = specs::notes(loaded, wanted.seed)?;
         Ok((volume, record, field.map(|f| Field::new(f, notes))))
     })?;
     Ok((made(py, volume)?, plain(py, &record)?, field))

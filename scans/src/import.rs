@@ -5,7 +5,7 @@ use crate::counts::{CountsReport, line_integrals};
 use crate::selection::{Mean, Selection};
 use conefield_core::Result;
 use conefield_core::scan::Scan;
-use conefield_io::{Counts, DataSet, I0, Stored};
+use conefield_io::{Counts, DataSet, I0, Parts, Stored};
 use serde_json::json;
 use std::path::Path;
 
@@ -54,9 +54,9 @@ pub fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
     conefield_io::read_scan(path).and_then(integrals)
 }
 
-/// Reads everything in the scan's file or folder and converts counts.
-pub fn read_data_set(path: impl AsRef<Path>) -> Result<DataSet> {
-    let DataSet { train, test, volume } = conefield_io::read_data_set(path)?;
+/// Reads a scan and `parts` of its file or folder (see [`conefield_io::read_data_set`]), and converts counts.
+pub fn read_data_set(path: impl AsRef<Path>, parts: Parts) -> Result<DataSet> {
+    let DataSet { train, test, volume } = conefield_io::read_data_set(path, parts)?;
     Ok(DataSet { train: integrals(train)?, test, volume })
 }
 

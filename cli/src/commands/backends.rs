@@ -2,10 +2,11 @@
 
 use crate::out;
 use clap::Args;
+use conefield::machine::simd_level;
 use conefield::tradeoff::speed::pass_s;
 use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::{Adapter, adapters};
-use conefield_core::{Result, simd};
+use conefield_core::Result;
 use serde_json::json;
 
 /// List the backends of this machine: CPU instructions and speed, GPU adapters.
@@ -56,10 +57,4 @@ fn line(a: &Adapter) -> String {
         a.atomics,
         if a.timestamps { ", timestamps" } else { "" }
     )
-}
-
-/// The instruction set that kernels use on this machine.
-pub fn simd_level() -> String {
-    let debug = format!("{:?}", simd::level());
-    debug.split(['(', ' ', '{']).next().unwrap_or_default().to_owned()
 }

@@ -10,7 +10,7 @@ use conefield_core::backend::Backend;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::{CurveOptions, Panel, panels_png};
-use conefield_io::DataSet;
+use conefield_io::{DataSet, Parts};
 use conefield_scans::calibration::{
     Calibration, Found, Jitter, Parameter, Settings, Verdict, Watch, calibrate, directions, jitter, suspect,
 };
@@ -71,7 +71,7 @@ impl CalibrateArgs {
         let backend = self.backend.open()?;
         let size = conefield_io::scan_size(&self.scan)?;
         Memory::of_data_set(&size).check(|_| vec![])?;
-        let DataSet { train: scan, test, volume } = conefield_scans::read_data_set(&self.scan)?;
+        let DataSet { train: scan, test, volume } = conefield_scans::read_data_set(&self.scan, Parts::ALL)?;
         scan.validate(&self.scan.display().to_string())?;
         let settings =
             Settings { parameters: self.parameters.clone(), width: self.pixels.into(), curves: self.png.is_some() };

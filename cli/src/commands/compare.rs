@@ -3,11 +3,12 @@
 use super::cell::{Cell, Start};
 use super::protocol::RunProtocol;
 use super::trial;
-use super::{EndOptions, General, backends::simd_level};
+use super::{EndOptions, General};
 use crate::boundary::Inputs;
 use crate::{out, run_folder, signals};
 use clap::Args;
 use conefield::backend::BackendChoice;
+use conefield::machine::simd_level;
 use conefield::specs;
 use conefield::study::method::{FOLDER_NAME, Method};
 use conefield::study::outcome::{Columns, Outcome};

@@ -9,7 +9,7 @@ use conefield::files;
 use conefield::memory::Memory;
 use conefield::parse::{self, Values};
 use conefield_core::{Error, Result};
-use conefield_io::DataSet;
+use conefield_io::{DataSet, Parts};
 use conefield_scans::diagnosis::survey;
 use std::path::PathBuf;
 
@@ -79,7 +79,7 @@ impl ConvertArgs {
         } else {
             let size = corrected_size(conefield_io::scan_size(&self.input)?, &corrections);
             Memory::of_data_set(&size).check(|_| vec![])?;
-            let DataSet { train, test, volume } = conefield_scans::read_data_set(&self.input)?;
+            let DataSet { train, test, volume } = conefield_scans::read_data_set(&self.input, Parts::ALL)?;
             let place = self.input.display().to_string();
             let (train, applied) = corrections.apply(train, &place)?;
             log_applied(&self.input, &applied);

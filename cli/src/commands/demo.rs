@@ -4,10 +4,12 @@ use crate::boundary::refuse_existing;
 use crate::progress::Progress;
 use crate::{out, signals};
 use clap::Args;
-use conefield::score::{SCORES, cells_of, score};
-use conefield::{memory, method, parse, specs};
+use conefield::input::Input;
+use conefield::score::{SCORES, cells_of};
+use conefield::session::{InMemory, Request, Session};
+use conefield::{memory, parse, specs};
 use conefield_backend_cpu::Cpu;
-use conefield_core::method::{Job, Limits};
+use conefield_core::method::{Limits, Solution};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use conefield_evaluation::metrics::Scores;
@@ -16,7 +18,8 @@ use conefield_io::ScanSize;
 use conefield_projectors::simulate::{DetectorNoise, Protocol, phantom, simulate};
 use serde::Serialize;
 use serde_json::json;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
 use tracing::info;
 
@@ -70,7 +73,17 @@ impl DemoArgs {
     pub fn run(self) -> Result<()> {
         let folder = &self.output;
         refuse_existing(folder, self.force)?;
-        self.check_memory()?;
+        // Every method is built, and refused if it does not fit into memory, before anything is created.
+        let weights = tempfile::Builder::new().suffix(".safetensors").tempfile();
+        let weights = weights.map_err(|e| Error::io(std::env::temp_dir(), e))?;
+        std::fs::write(weights.path(), specs::FAST_WEIGHTS).map_err(|e| Error::io(weights.path(), e))?;
+        let backend = Cpu::new();
+        let without = vec!["normalizers=[]".to_owned(), "initializer.type=random".to_owned()];
+        let methods = [
+            ("smooth-tv", self.session(&backend, VOXELS, vec![], None)?),
+            ("fast (LN, MCI)", self.session(&backend, FIELD, vec![], Some(weights.path()))?),
+            ("without LN, MCI", self.session(&backend, FIELD, without, None)?),
+        ];
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         let size = usize::from(self.size);
         let truth = phantom(size);
@@ -85,20 +98,16 @@ impl DemoArgs {
         info!("simulated {} views of {size} x {size} pixels", self.views);
 
         signals::listen()?;
-        let path = folder.join("fast.safetensors");
-        conefield_io::write_atomic(&path, |w| w.write_all(specs::FAST_WEIGHTS).map_err(|e| Error::io(&path, e)))?;
-        let with = vec![method::init(&specs::read(FIELD, &[])?.tree, &path)];
-        let without = vec!["normalizers=[]".to_owned(), "initializer.type=random".to_owned()];
-        let entries = [
-            self.compete(VOXELS, (VOXELS, &[]), &scan, &truth)?,
-            self.compete("fast (LN, MCI)", (FIELD, &with), &scan, &truth)?,
-            self.compete("without LN, MCI", (FIELD, &without), &scan, &truth)?,
-        ];
+        let scan = Arc::new(scan);
+        let mut entries = vec![];
+        for (name, session) in methods {
+            entries.push(compete(name, session, scan.clone(), truth.clone())?);
+        }
         for (entry, file) in entries.iter().zip(["smooth-tv.nii.gz", "fast.nii.gz", "without.nii.gz"]) {
             conefield_io::write_volume(folder.join(file), &entry.volume)?;
         }
-        let captions = entries.each_ref().map(|e| format!("{} {:.2} dB", e.name, e.scores.psnr));
-        let slices = entries.each_ref().map(|e| MiddleSlices::of(&e.volume));
+        let captions: Vec<String> = entries.iter().map(|e| format!("{} {:.2} dB", e.name, e.scores.psnr)).collect();
+        let slices: Vec<MiddleSlices> = entries.iter().map(|e| MiddleSlices::of(&e.volume)).collect();
         let results: Vec<_> = captions.iter().map(|c| &c[..]).zip(&slices).collect();
         let picture = folder.join("compare.png");
         let truth = MiddleSlices::of(&truth);
@@ -116,39 +125,31 @@ impl DemoArgs {
         out::say(&format!("\npicture: {}\nscan and volumes are in the same folder", picture.display()))
     }
 
-    /// Refuses a demo that does not fit into memory: the scan, the volumes and the largest of the methods.
-    fn check_memory(&self) -> Result<()> {
+    /// A run of `spec`. The simulated volume and the first two results are held beside it.
+    fn session<'a>(&self, backend: &'a Cpu, spec: &str, sets: Vec<String>, init: Option<&Path>) -> Result<Session<'a>> {
         let (side, views) = (u64::from(self.size), usize::from(self.views));
         let (pixels, voxels) = (4 * side * side * u64::from(self.views), side.pow(3));
-        // The simulated volume and the first two results are held in addition to the run's memory.
         let size = ScanSize { pixels, voxels, test_pixels: 0, reading: 12 * voxels, views };
         let run = memory::Run { reference: true, ..memory::Run::on(size) };
-        [VOXELS, FIELD].iter().try_for_each(|spec| {
-            method::planned(&|sets| specs::read(spec, sets), &[], None, &Cpu::new(), &run).map(drop)
-        })
-    }
-
-    fn compete(
-        &self,
-        name: &'static str,
-        (spec, sets): (&str, &[String]),
-        scan: &Scan,
-        truth: &Volume,
-    ) -> Result<Entry> {
-        let loaded = specs::read(spec, sets)?;
-        let backend = Cpu::new();
-        let mut plan = method::plan(&loaded, &backend)?;
-        let job = Job {
-            seed: self.seed,
+        let read = |sets: &[String]| specs::read(spec, sets);
+        let request = Request {
+            spec: Some(&read),
+            sets,
+            init: init.map(Path::to_path_buf),
             // Passes over the views end by themselves, within seconds.
             limits: Limits { seconds: (spec == FIELD).then_some(self.seconds), ..Limits::default() },
-            ..Job::new(scan, &backend)
+            seed: self.seed,
+            ..Request::default()
         };
-        let solution = plan.run(&job, &mut Progress::new(name, None))?;
-        let start = Instant::now();
-        let volume = solution.result.volume(&backend)?;
-        let export_s = start.elapsed().as_secs_f64();
-        let scores = score(name, &volume, truth, 1.0)?;
-        Ok(Entry { name, steps: solution.steps, train_s: solution.train_s, export_s, scores, volume })
+        Session::open(request, backend, run, Instant::now())
     }
+}
+
+fn compete(name: &'static str, session: Session<'_>, scan: Arc<Scan>, truth: Volume) -> Result<Entry> {
+    let mut run = session.plan(Input::new(scan, vec![], Some(truth), Some(1.0))?, 0.0, &|| false)?;
+    let mut solved = run.solve(None, None, &mut Progress::new(name, None))?;
+    let InMemory { volume, written } = run.in_memory(&mut solved, |result, backend| result.volume(backend))?;
+    let Solution { steps, train_s, .. } = solved.solution;
+    let scores = written.scores.ok_or_else(|| Error::unsupported("demo", "the phantom is not scored"))?;
+    Ok(Entry { name, steps, train_s, export_s: written.export_s, scores, volume })
 }

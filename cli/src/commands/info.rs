@@ -182,7 +182,7 @@ pub fn facts(s: &Scan, survey: &Survey) -> Value {
 
 fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
     Memory::of_data_set(&conefield_io::scan_size(path)?).check(|_| vec![])?;
-    let data = conefield_scans::read_data_set(path)?;
+    let data = conefield_scans::read_data_set(path, conefield_io::Parts::ALL)?;
     let s = &data.train;
     s.validate(&path.display().to_string())?;
     let survey = survey(s);

@@ -6,9 +6,9 @@ use conefield::backend::{self, BackendChoice};
 use conefield::parse::{self, HoldOut};
 use conefield::{input, score};
 use conefield_core::Result;
-use conefield_core::scan::{Scan, Volume};
+use conefield_core::scan::Volume;
 use std::ffi::{OsStr, OsString};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// The options that `reconstruct` and `compare` share.
 #[derive(Debug, Clone, Args)]
@@ -41,12 +41,6 @@ pub struct RunProtocol {
 }
 
 impl RunProtocol {
-    /// The reference on the grid of `scan`, if there is one.
-    pub fn reference(&self, scan_path: &Path, scan: &Scan) -> Result<Option<Volume>> {
-        let Some(path) = &self.reference else { return Ok(None) };
-        input::reference(path, scan_path, scan).map(Some)
-    }
-
     /// The data range of the scores.
     pub fn peak(&self, reference: Option<&Volume>) -> f64 {
         reference.map_or(self.peak.unwrap_or(1.0), |r| score::peak(self.peak, r))

@@ -1,7 +1,7 @@
 //! `conefield reconstruct`
 
-use super::record::{RunRecord, Written, summary};
-use super::{backends::simd_level, calibrate, protocol::RunProtocol, watch};
+use super::summary::summary;
+use super::{calibrate, protocol::RunProtocol, watch};
 use crate::board::Board;
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
@@ -11,22 +11,18 @@ use crate::run_folder::RunFolder;
 use crate::{out, signals};
 use clap::error::ErrorKind;
 use clap::{Args, CommandFactory};
-use conefield::choose::{self, Wish};
-use conefield::input::Input;
-use conefield::machine::Machine;
+use conefield::input::{self, Input};
 use conefield::memory;
-use conefield::method::{self, Planned};
+use conefield::method::Read;
 use conefield::parse;
-use conefield::plugins;
-use conefield::score::score;
+use conefield::record::{RunRecord, Written};
+use conefield::session::{self, Request, Run, Session, Solved};
 use conefield::tradeoff::front::Front;
-use conefield::tradeoff::schedule::{Budget, Schedule};
 use conefield::tradeoff::trial::ScanRecord;
 use conefield::{files, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
-use conefield_core::method::{Job, Solution};
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
@@ -136,26 +132,25 @@ impl ReconstructArgs {
         self.init.as_deref().map(boundary::text).transpose()?;
         let backend = self.protocol.backend.open()?;
         // An invalid spec, and weights that cannot be read or do not fit, are reported before anything is created.
-        let wish = match (self.asked(), &self.front) {
-            (Some((spec, sets)), _) => Wish::Method(self.method(&spec, &sets, backend.as_ref())?),
-            (None, Some(path)) => Wish::OneOf(Front::read(path)?),
-            (None, None) => Wish::OneOf(Front::shipped()?),
-        };
+        let session = self.session(backend.as_ref(), begin)?;
         let inputs = Inputs::of([&self.scan]).and(&self.front).and(&self.init).and(&self.protocol.reference);
-        let inputs = match &wish {
-            Wish::Method(m) if !self.resume => inputs.and_spec(&m.loaded),
+        let inputs = match session.requested() {
+            Some(loaded) if !self.resume => inputs.and_spec(loaded),
             _ => inputs,
         };
         inputs.spare_folder(&self.output)?;
-        let input = self.input(&folder, begin)?;
-        if let Wish::Method(m) = &wish {
-            specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.work.held)?;
-        }
+        let (input, scan) = self.input(&folder)?;
 
-        let chosen = self.choose(&folder, &input, wish, backend.as_ref(), begin)?;
-        let Chosen { method: Planned { loaded, mut plan, memory }, schedule, resumed, spent } = chosen;
-        let identity = identity(&loaded, &self.protocol, &input.work.held, &input.record)?;
-        let outline = plan.outline();
+        let resumed = match session.requested() {
+            Some(loaded) if self.resume => {
+                Some(self.reopen(&folder, &identity(loaded, &self.protocol, &input.held, &scan)?)?)
+            }
+            _ => None,
+        };
+        let spent = resumed.as_ref().map_or(0.0, |(_, r)| r.standing.seconds);
+        let mut run = session.plan(input, spent, &|| signals::caught().is_some())?;
+        let loaded = &run.method.loaded;
+        let identity = identity(loaded, &self.protocol, &run.input.held, &scan)?;
         signals::listen()?;
         // The parent process has ended, and nothing of this run has been written yet.
         if signals::caught().is_some() {
@@ -164,7 +159,7 @@ impl ReconstructArgs {
         let (metrics, resume) = match resumed {
             Some((metrics, resume)) => (metrics, Some(resume)),
             None => {
-                inputs.and_spec(&loaded).spare_folder(&self.output)?;
+                inputs.and_spec(loaded).spare_folder(&self.output)?;
                 folder.begin()?;
                 conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
                 (folder.metrics()?, None)
@@ -174,58 +169,26 @@ impl ReconstructArgs {
             watch::serve(&self.output, port)?;
         }
         let mut progress = self.progress(&folder, metrics, identity)?;
-        let (seed, limits) = (self.protocol.seed, self.protocol.ends.limits());
-        let job = input.work.job(backend.as_ref(), seed, limits, schedule.as_ref());
-        let job = Job { resume: resume.as_ref(), ..job };
-        let start = Instant::now();
-        let mut solution = plan.run(&job, &mut progress).map_err(|e| loaded.locate(e))?;
-        let prepare_s = (start.elapsed().as_secs_f64() + spent - solution.train_s).max(0.0);
+        let mut solved = run.solve(None, resume.as_ref(), &mut progress)?;
         let last = progress.records().last().cloned();
         let board = progress.take_board();
         drop(progress);
 
-        let written = self.write(&folder, &input.work, &mut solution, &loaded, backend.as_ref())?;
+        let written = self.write(&folder, &run, &mut solved, backend.as_ref())?;
         if let Some(mut board) = board {
-            board.picture(solution.steps, "slices", &folder.file("slices.png"))?;
+            board.picture(solved.solution.steps, "slices", &folder.file("slices.png"))?;
         }
-        let Reading { work: Input { scan: seen, held, peak, .. }, record: scan, load_s } = input;
         let path = |p: &PathBuf| p.display().to_string();
         let record = RunRecord {
-            version: env!("CARGO_PKG_VERSION"),
-            spec: loaded.spec.name.clone(),
-            seed: self.protocol.seed,
-            scan,
-            held_out_views: held,
-            limits: self.protocol.ends.clone(),
-            budget_s: self.protocol.budget,
-            plan: schedule,
+            scan: Some(scan.clone()),
             init: self.init.as_ref().map(path),
             reference: self.protocol.reference.as_ref().map(path),
-            plugins: plugins::used(&loaded.tree),
-            backend: outline.backend(),
-            simd: simd_level(),
-            threads: rayon::current_num_threads(),
-            machine: Machine::here(),
-            memory,
-            peak_bytes: memory::peak(),
-            steps: solution.steps,
-            rollbacks: solution.rollbacks,
-            load_s,
-            prepare_s,
-            train_s: solution.train_s,
-            written,
-            total_s: begin.elapsed().as_secs_f64() + spent,
-            samples: solution.samples,
-            samples_per_s: (solution.sampling_s > 0.0).then(|| solution.samples as f64 / solution.sampling_s),
-            loss: last.as_ref().and_then(|r| r.loss),
-            held_out: solution.best.map(|b| b.held_out).or(last.as_ref().and_then(|r| r.held_out)),
-            best_step: solution.best.map(|b| b.step),
-            peak,
+            ..run.record(&solved, last.as_ref(), written)
         };
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
         folder.finish()?;
-        self.doubt(&seen, record.held_out);
-        if self.json { out::json(&record) } else { out::say(&summary(&record, &self.output)) }
+        self.doubt(&run.input.scan, record.held_out);
+        if self.json { out::json(&record) } else { out::say(&summary(&record, &scan, &self.output)) }
     }
 
     /// If held-out views are predicted badly, checks whether the geometry is the cause. The run is complete, so an
@@ -239,40 +202,36 @@ impl ReconstructArgs {
         }
     }
 
-    /// Reads all inputs.
-    fn input(&self, folder: &RunFolder, begin: Instant) -> Result<Reading> {
-        let whole = files::scan(&self.scan)?;
-        conefield_io::check_shape(folder.file("volume.nii.gz"), whole.geometry.volume.shape)?;
-        let reference = self.protocol.reference(&self.scan, &whole)?;
-        let held = self.protocol.held_out(whole.geometry.views.len())?;
-        let record = ScanRecord::of(&self.scan, &whole)?;
-        let work = Input::new(Arc::new(whole), held, reference, self.protocol.peak)?;
-        Ok(Reading { work, record, load_s: begin.elapsed().as_secs_f64() })
+    /// The requested spec, or the front within a budget.
+    fn session<'a>(&self, backend: &'a dyn Backend, begin: Instant) -> Result<Session<'a>> {
+        let asked = self.asked();
+        let read = asked.as_ref().map(|(spec, _)| |sets: &[String]| specs::read(spec, sets));
+        let request = Request {
+            spec: read.as_ref().map(|read| read as Read<'_>),
+            front: self.front.as_deref().map(Front::read).transpose()?,
+            sets: asked.as_ref().map_or_else(|| self.protocol.sets.clone(), |(_, sets)| sets.clone()),
+            // A run resumed without a spec reads the start from its own spec.
+            init: self.init.clone().filter(|_| self.spec.is_some() || !self.resume),
+            limits: self.protocol.ends.limits(),
+            budget: self.protocol.budget,
+            seed: self.protocol.seed,
+        };
+        let run = memory::Run {
+            scan: conefield_io::scan_size(&self.scan)?,
+            split: self.protocol.hold_out.is_some(),
+            reference: self.protocol.reference.is_some(),
+            resume: self.resume,
+        };
+        Session::open(request, backend, run, begin)
     }
 
-    /// Chooses the method to run: the requested one or, within a budget, one of the front.
-    fn choose(
-        &self,
-        folder: &RunFolder,
-        input: &Reading,
-        wish: Wish,
-        backend: &dyn Backend,
-        begin: Instant,
-    ) -> Result<Chosen> {
-        let protocol = &self.protocol;
-        let held = &input.work.held;
-        let resumed = match &wish {
-            Wish::Method(m) if self.resume => {
-                Some(self.reopen(folder, &identity(&m.loaded, protocol, held, &input.record)?)?)
-            }
-            _ => None,
-        };
-        let spent = resumed.as_ref().map_or(0.0, |(_, r)| r.standing.seconds);
-        let bench = input.work.bench(backend, protocol.seed, &|| signals::caught().is_some());
-        let budget = protocol.budget.map(|seconds| Budget { begin, seconds, spent });
-        let build = |spec: &str, sets: &[String]| self.method(spec, &[sets, &protocol.sets].concat(), backend);
-        let (method, schedule) = choose::choose(wish, &bench, budget, held, build)?;
-        Ok(Chosen { method, schedule, resumed, spent })
+    /// Reads all inputs.
+    fn input(&self, folder: &RunFolder) -> Result<(Input, ScanRecord)> {
+        let (whole, reference) = input::read(&self.scan, self.protocol.reference.as_deref())?;
+        conefield_io::check_shape(folder.file("volume.nii.gz"), whole.geometry.volume.shape)?;
+        let held = self.protocol.held_out(whole.geometry.views.len())?;
+        let record = ScanRecord::of(&self.scan, &whole)?;
+        Ok((Input::new(Arc::new(whole), held, reference, self.protocol.peak)?, record))
     }
 
     /// Display and recording of the run.
@@ -298,23 +257,16 @@ impl ReconstructArgs {
     }
 
     /// Writes and scores the result.
-    fn write(
-        &self,
-        folder: &RunFolder,
-        input: &Input,
-        solution: &mut Solution,
-        loaded: &Loaded,
-        backend: &dyn Backend,
-    ) -> Result<Written> {
-        let reference = input.reference.as_ref();
+    fn write(&self, folder: &RunFolder, run: &Run<'_>, solved: &mut Solved, backend: &dyn Backend) -> Result<Written> {
+        let (reference, result) = (run.input.reference.as_ref(), &mut solved.solution.result);
         let place = folder.file("volume.nii.gz");
         let start = Instant::now();
-        let field = solution.result.field();
-        let parameters = field.map_or(0, |f| f.model.pipeline.layout().len());
-        if let Some(field) = field {
-            files::write_field(folder.file("weights.safetensors"), field, specs::notes(loaded, self.protocol.seed)?)?;
+        let parameters = session::parameters(result);
+        if let Some(field) = result.field() {
+            let notes = specs::notes(&run.method.loaded, self.protocol.seed)?;
+            files::write_field(folder.file("weights.safetensors"), field, notes)?;
         }
-        let mut voxels = solution.result.voxels(backend)?;
+        let mut voxels = result.voxels(backend)?;
         let affine = reference.and_then(|r| r.affine);
         let WrittenVolume { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
         let export_s = start.elapsed().as_secs_f64();
@@ -322,8 +274,7 @@ impl ReconstructArgs {
         files::picture(folder.file("slices.png"), reference.map(MiddleSlices::of).as_ref(), &slices)?;
         let picture_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let scored = |(volume, r)| score(&place.display().to_string(), volume, r, input.peak);
-        let scores = whole.as_ref().zip(reference).map(scored).transpose()?;
+        let scores = whole.map(|v| run.scores(&place.display().to_string(), &v)).transpose()?.flatten();
         Ok(Written { parameters, export_s, picture_s, score_s: start.elapsed().as_secs_f64(), scores })
     }
 
@@ -335,19 +286,6 @@ impl ReconstructArgs {
         }
     }
 
-    /// Reads, builds and prices a spec. Refuses one that does not fit into memory.
-    fn method(&self, spec: &str, sets: &[String], backend: &dyn Backend) -> Result<Planned> {
-        let run = memory::Run {
-            scan: conefield_io::scan_size(&self.scan)?,
-            split: self.protocol.hold_out.is_some(),
-            reference: self.protocol.reference.is_some(),
-            resume: self.resume,
-        };
-        // A run resumed without a spec reads the start from its own spec.
-        let start = self.init.as_deref().filter(|_| self.spec.is_some() || !self.resume);
-        method::planned(&|sets| specs::read(spec, sets), sets, start, backend, &run)
-    }
-
     /// The file for metrics of an interrupted run, and the checkpoint to continue from.
     fn reopen(&self, folder: &RunFolder, identity: &BTreeMap<String, String>) -> Result<((PathBuf, File), Resume)> {
         let resume = files::read_checkpoint(&folder.file("checkpoint.safetensors"), identity)?;
@@ -355,24 +293,6 @@ impl ReconstructArgs {
         let metrics = folder.metrics_until(resume.standing.recorded)?;
         Ok((metrics, resume))
     }
-}
-
-/// The inputs of a run, and their entries in the record.
-struct Reading {
-    work: Input,
-    record: ScanRecord,
-    load_s: f64,
-}
-
-/// The method to run.
-struct Chosen {
-    method: Planned,
-    /// The plan of a budget.
-    schedule: Option<Schedule>,
-    /// The file for metrics of an interrupted run, and the checkpoint to continue from.
-    resumed: Option<((PathBuf, File), Resume)>,
-    /// Seconds of training before the checkpoint.
-    spent: f64,
 }
 
 /// Properties that must match to resume a run or to count it as finished.

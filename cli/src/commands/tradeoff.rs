@@ -2,11 +2,12 @@
 
 use super::protocol::RunProtocol;
 use super::trial::{self, Trial};
-use super::{EndOptions, General, backends::simd_level};
+use super::{EndOptions, General};
 use crate::boundary::Inputs;
 use crate::{out, signals};
 use clap::Args;
 use conefield::backend::{self, BackendChoice};
+use conefield::machine::simd_level;
 use conefield::parse::{self, HoldOut};
 use conefield::tradeoff::levers::{self, Candidate, Levers};
 use conefield::tradeoff::report::TradeoffReport;

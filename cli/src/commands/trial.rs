@@ -4,7 +4,7 @@ use super::General;
 use super::protocol::{RunProtocol, word};
 use super::reconstruct::FAILED;
 use crate::{program, signals};
-use conefield::files;
+use conefield::input;
 use conefield::memory::Run;
 use conefield::tradeoff::trial::TrialInput;
 use conefield_core::scan::Scan;
@@ -86,9 +86,8 @@ pub fn input_of(path: &Path, protocol: &RunProtocol, check: impl FnOnce(&Scan) -
         resume: false,
     };
     all.reading().check(|_| vec![])?;
-    let scan = files::scan(path)?;
+    let (scan, reference) = input::read(path, protocol.reference.as_deref())?;
     check(&scan)?;
-    let reference = protocol.reference(path, &scan)?;
     let held = protocol.held_out(scan.geometry.views.len())?;
     let peak = protocol.peak(reference.as_ref());
     TrialInput::of(path, scan, reference.as_ref(), peak, held)

@@ -4,7 +4,7 @@ use crate::common::{conefield, done, json, refused, text};
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::scan::Volume;
 use conefield_evaluation::report::Pixels;
-use conefield_io::{read_volume, write_r2, write_scan, write_volume};
+use conefield_io::{Parts, read_volume, write_r2, write_scan, write_volume};
 use conefield_scans::{read_data_set, read_scan};
 use ndarray::Array3;
 use serde_json::{Value, json};
@@ -144,13 +144,13 @@ fn every_format_keeps_the_geometry() {
 #[test]
 fn test_views_are_kept_or_their_loss_is_reported() {
     let b = Bench::new();
-    let whole = read_data_set(b.at("scan")).unwrap();
+    let whole = read_data_set(b.at("scan"), Parts::ALL).unwrap();
     let (train, test) = whole.train.split(&[1, 4, 5]).unwrap();
     write_r2(b.at("r2"), &train, Some(&test), whole.volume.as_ref()).unwrap();
     for (from, to, name) in [("r2", "naf", "a.pickle"), ("a.pickle", "r2", "again")] {
         done(&["convert", &b.at(from), &b.at(name), "--to", to]);
         assert_eq!(b.info(name)["test_views"], 3);
-        assert_eq!(read_data_set(b.at(name)).unwrap().test.unwrap().projections, test.projections);
+        assert_eq!(read_data_set(b.at(name), Parts::ALL).unwrap().test.unwrap().projections, test.projections);
     }
     for to in ["conefield", "rtk"] {
         let mut command = assert_cmd::Command::cargo_bin("conefield").unwrap();

@@ -1,42 +1,57 @@
 //! The record of a run.
 
-use super::{EndOptions, evaluate};
-use crate::out;
-use conefield::machine::Machine;
-use conefield::memory::Memory;
-use conefield::plugins::Used;
-use conefield::tradeoff::schedule::Schedule;
-use conefield::tradeoff::trial::ScanRecord;
+use crate::machine::Machine;
+use crate::memory::Memory;
+use crate::plugins::Used;
+use crate::tradeoff::schedule::Schedule;
+use crate::tradeoff::trial::ScanRecord;
 use conefield_core::backend::Explain;
+use conefield_core::method::Limits;
 use conefield_evaluation::metrics::Scores;
 use serde::Serialize;
-use std::path::Path;
 
 /// Everything needed to repeat a run, and its result.
 #[derive(Debug, Serialize)]
 pub struct RunRecord {
+    /// The version of conefield.
     pub version: &'static str,
+    /// The name of the spec.
     pub spec: String,
+    /// The seed of all random numbers.
     pub seed: u64,
-    pub scan: ScanRecord,
+    /// The scan, if it was read from files.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scan: Option<ScanRecord>,
+    /// Indices of the held-out views.
     pub held_out_views: Vec<usize>,
-    pub limits: EndOptions,
+    /// Ends of training.
+    pub limits: Ends,
+    /// Seconds of the budget.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub budget_s: Option<f64>,
     /// The plan of a budget.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub plan: Option<Schedule>,
+    /// Weights or volume to start from.
     pub init: Option<String>,
+    /// The reference.
     pub reference: Option<String>,
     /// The plugins whose stages the spec names.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub plugins: Vec<Used>,
+    /// The backend, and what it compiled.
     pub backend: Explain,
+    /// The instruction set.
     pub simd: String,
+    /// Number of threads.
     pub threads: usize,
+    /// The machine.
     pub machine: Machine,
+    /// The memory estimate.
     pub memory: Memory,
+    /// Bytes at the peak, measured.
     pub peak_bytes: Option<u64>,
+    /// Steps or passes.
     pub steps: u64,
     /// Number of returns to an earlier state after training diverged.
     pub rollbacks: u64,
@@ -44,21 +59,44 @@ pub struct RunRecord {
     pub load_s: f64,
     /// Seconds of solving without training: before the first step, and for metrics.
     pub prepare_s: f64,
+    /// Seconds of training.
     pub train_s: f64,
+    /// Written files and the time for them.
     #[serde(flatten)]
     pub written: Written,
     /// Seconds from the start of the command to this record. Before a --resume only training counts.
     pub total_s: f64,
+    /// Training samples.
     pub samples: u64,
     /// For methods that take samples.
     pub samples_per_s: Option<f64>,
+    /// The last loss.
     pub loss: Option<f64>,
     /// Held-out error of the result.
     pub held_out: Option<f64>,
     /// The step of the result, if held-out views selected it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub best_step: Option<u64>,
+    /// The data range of scores.
     pub peak: f64,
+}
+
+/// Ends of training; the first one reached ends it.
+#[derive(Debug, Clone, Serialize)]
+pub struct Ends {
+    /// Seconds of training.
+    pub seconds: Option<f64>,
+    /// Steps or passes.
+    pub steps: Option<u64>,
+    /// Upper bound of the seconds, which schedules ignore.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub at_most: Option<f64>,
+}
+
+impl From<&Limits> for Ends {
+    fn from(limits: &Limits) -> Self {
+        Self { seconds: limits.seconds, steps: limits.steps, at_most: limits.at_most }
+    }
 }
 
 /// Written files and the time for them.
@@ -68,45 +106,10 @@ pub struct Written {
     pub parameters: usize,
     /// Seconds to write weights and voxels.
     pub export_s: f64,
+    /// Seconds to draw the slices.
     pub picture_s: f64,
+    /// Seconds to compute the scores.
     pub score_s: f64,
+    /// Scores against the reference.
     pub scores: Option<Scores>,
-}
-
-/// Below this share a budget counts as not used up.
-const USED: f64 = 0.8;
-
-/// The record as text.
-pub fn summary(r: &RunRecord, output: &Path) -> String {
-    let [x, y, z] = r.scan.volume;
-    let speed = r.samples_per_s.map(|s| format!(" ({:.2} M samples/s)", s / 1e6)).unwrap_or_default();
-    let mut lines = vec![format!(
-        "{x} x {y} x {z} voxels from {} views: {} in {}{speed}, export {}",
-        r.scan.views - r.held_out_views.len(),
-        if r.steps == 1 { "1 step".into() } else { format!("{} steps", r.steps) },
-        out::duration(r.train_s),
-        out::duration(r.written.export_s),
-    )];
-    if let Some(budget) = r.budget_s {
-        let why = if r.total_s < USED * budget { ": the method stopped by itself" } else { "" };
-        lines.push(format!("{} in all, of a budget of {}{why}", out::duration(r.total_s), out::duration(budget)));
-    }
-    if r.rollbacks > 0 {
-        let times = if r.rollbacks == 1 { "once".into() } else { format!("{} times", r.rollbacks) };
-        lines.push(format!(
-            "training diverged and was rolled back {times}; each rollback halved the learning rate; metrics.jsonl has \
-             the steps"
-        ));
-    }
-    if let Some(h) = r.held_out {
-        let best =
-            r.best_step.map_or(String::new(), |n| format!(", the smallest: the state after step {n} is the result"));
-        let views = r.held_out_views.len();
-        lines.push(format!("held-out error  {h:.5} of the largest line integral ({views} views){best}"));
-    }
-    if let Some(s) = &r.written.scores {
-        lines.push(evaluate::lines(s));
-    }
-    lines.push(format!("results in {}", output.display()));
-    lines.join("\n")
 }

@@ -1,0 +1,248 @@
+//! The way of every run: open a scan, plan a spec or a budget, run, record.
+//!
+//! [`Session::open`] builds the requested spec and refuses what does not fit into memory, before the scan is read.
+//! [`Session::plan`] takes the inputs and, within a budget, measures this machine and chooses the method. [`Run::solve`]
+//! runs it, and [`Run::record`] describes all of it.
+
+use crate::input::Input;
+use crate::machine::{Machine, simd_level};
+use crate::memory;
+use crate::method::{self, Planned, Read};
+use crate::record::{Ends, RunRecord, Written};
+use crate::tradeoff::front::Front;
+use crate::tradeoff::schedule::{Budget, Schedule};
+use crate::{plugins, score, specs};
+use conefield_core::backend::Backend;
+use conefield_core::checkpoint::Resume;
+use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Solution};
+use conefield_core::scan::Volume;
+use conefield_core::spec::load::Loaded;
+use conefield_core::trained::TrainedField;
+use conefield_core::{Error, Result};
+use conefield_evaluation::metrics::Scores;
+use std::path::PathBuf;
+use std::time::Instant;
+use tracing::info;
+
+/// What is asked of a run, besides the scan.
+#[derive(Default)]
+pub struct Request<'a> {
+    /// Reads the requested spec with overriding settings. Without it, the budget chooses.
+    pub spec: Option<Read<'a>>,
+    /// What the budget chooses from; the shipped front if `None`.
+    pub front: Option<Front>,
+    /// Overriding settings, as for `--set`.
+    pub sets: Vec<String>,
+    /// Weights or a volume to start from.
+    pub init: Option<PathBuf>,
+    /// Ends of training.
+    pub limits: Limits,
+    /// Seconds for everything.
+    pub budget: Option<f64>,
+    /// Seed of all random numbers.
+    pub seed: u64,
+}
+
+/// The method that a request leads to.
+enum Wish {
+    /// This one.
+    Method(Planned),
+    /// The best one of this front for this many seconds.
+    OneOf(Front, f64),
+}
+
+/// A run whose scan is not read yet.
+pub struct Session<'a> {
+    /// The request without what was read from it.
+    request: Request<'static>,
+    backend: &'a dyn Backend,
+    run: memory::Run,
+    begin: Instant,
+    wish: Wish,
+}
+
+impl<'a> Session<'a> {
+    /// Builds the requested spec: its stages, and the weights that it names. `run` is the memory of the run besides the
+    /// method; `begin` is the start of the budget. Refuses contradictory ends, an invalid spec, and a method that does
+    /// not fit into memory.
+    pub fn open(mut request: Request<'_>, backend: &'a dyn Backend, run: memory::Run, begin: Instant) -> Result<Self> {
+        if request.budget.is_some() && request.limits != Limits::default() {
+            let expected = "a budget, or steps and seconds";
+            return Err(Error::invalid("run", "budget", "another end of training", expected));
+        }
+        let wish = match (request.spec, request.budget) {
+            (Some(read), _) => {
+                Wish::Method(method::planned(read, &request.sets, request.init.as_deref(), backend, &run)?)
+            }
+            (None, Some(seconds)) => Wish::OneOf(request.front.take().map_or_else(Front::shipped, Ok)?, seconds),
+            (None, None) => {
+                return Err(Error::invalid("run", "spec", "nothing", "a spec, or a budget to choose one by"));
+            }
+        };
+        let request = Request { spec: None, front: None, ..request };
+        Ok(Self { request, backend, run, begin, wish })
+    }
+
+    /// The requested spec, unless the budget chooses.
+    pub fn requested(&self) -> Option<&Loaded> {
+        match &self.wish {
+            Wish::Method(method) => Some(&method.loaded),
+            Wish::OneOf(..) => None,
+        }
+    }
+
+    /// Plans the run on `input`. Within a budget this measures the machine for a few seconds. `spent` are the seconds of
+    /// training that an interrupted run has already used.
+    pub fn plan(self, input: Input, spent: f64, cancelled: &dyn Fn() -> bool) -> Result<Run<'a>> {
+        let Self { request, backend, run, begin, wish } = self;
+        let load_s = begin.elapsed().as_secs_f64();
+        if let Wish::Method(m) = &wish {
+            specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held)?;
+        }
+        let bench = input.bench(backend, request.seed, cancelled);
+        let budget = |seconds| Budget { begin, seconds, spent };
+        let (method, schedule) = match wish {
+            Wish::Method(mut method) => {
+                let schedule = request.budget.map(|s| budget(s).plan(&bench, &mut method)).transpose()?;
+                (method, schedule)
+            }
+            Wish::OneOf(front, seconds) => {
+                let (method, schedule) = budget(seconds).choose(&bench, &front, |spec, own| {
+                    let sets = [own, &request.sets].concat();
+                    method::planned(&|s| specs::read(spec, s), &sets, request.init.as_deref(), backend, &run)
+                })?;
+                specs::check_held_out(&method.loaded, method.plan.as_ref(), &input.held)?;
+                (method, Some(schedule))
+            }
+        };
+        schedule.iter().flat_map(|s| s.lines(&method.loaded.spec.name)).for_each(|line| info!("{line}"));
+        info!("memory: {}", method.memory.line());
+        let (seed, limits) = (request.seed, request.limits);
+        Ok(Run { input, method, schedule, backend, seed, limits, budget: request.budget, begin, spent, load_s })
+    }
+}
+
+/// A planned run.
+pub struct Run<'a> {
+    /// The inputs.
+    pub input: Input,
+    /// The method.
+    pub method: Planned,
+    /// The plan of a budget.
+    pub schedule: Option<Schedule>,
+    backend: &'a dyn Backend,
+    seed: u64,
+    limits: Limits,
+    budget: Option<f64>,
+    begin: Instant,
+    spent: f64,
+    load_s: f64,
+}
+
+/// A solution with the times around it.
+pub struct Solved {
+    /// The solution.
+    pub solution: Solution,
+    /// Seconds of solving without training: before the first step, and for metrics.
+    pub prepare_s: f64,
+}
+
+/// A result in memory.
+pub struct InMemory {
+    /// The volume, in attenuation per unit of the scan.
+    pub volume: Volume,
+    /// Its scores, if there is a reference, and the time to compute both.
+    pub written: Written,
+}
+
+impl Run<'_> {
+    /// Runs the method from `start`, a volume, or from the checkpoint `resume`.
+    pub fn solve(
+        &mut self,
+        start: Option<&Volume>,
+        resume: Option<&Resume>,
+        observer: &mut dyn Observer,
+    ) -> Result<Solved> {
+        let begin = Instant::now();
+        let job = self.input.job(self.backend, self.seed, self.limits, self.schedule.as_ref());
+        let job = Job { start, resume, ..job };
+        let Planned { loaded, plan, .. } = &mut self.method;
+        let solution = plan.run(&job, observer).map_err(|e| loaded.locate(e))?;
+        let prepare_s = (begin.elapsed().as_secs_f64() + self.spent - solution.train_s).max(0.0);
+        Ok(Solved { solution, prepare_s })
+    }
+
+    /// Scores of `volume`, called `place` in errors, against the reference, if there is one.
+    pub fn scores(&self, place: &str, volume: &Volume) -> Result<Option<Scores>> {
+        self.input.reference.as_ref().map(|r| score::score(place, volume, r, self.input.peak)).transpose()
+    }
+
+    /// The scored volume of a solution; `collect` computes its voxels.
+    pub fn in_memory(
+        &self,
+        solved: &mut Solved,
+        collect: impl FnOnce(&mut Reconstruction, &dyn Backend) -> Result<Volume>,
+    ) -> Result<InMemory> {
+        let start = Instant::now();
+        let mut volume = collect(&mut solved.solution.result, self.backend)?;
+        volume.affine = volume.affine.or(self.input.reference.as_ref().and_then(|r| r.affine));
+        let export_s = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let scores = self.scores("the volume", &volume)?;
+        let parameters = parameters(&solved.solution.result);
+        let written = Written { parameters, export_s, picture_s: 0.0, score_s: start.elapsed().as_secs_f64(), scores };
+        Ok(InMemory { volume, written })
+    }
+
+    /// The record of the whole run; `last` is its last record of progress. The caller adds the names of files.
+    pub fn record(&self, solved: &Solved, last: Option<&Record>, written: Written) -> RunRecord {
+        let Solved { solution, prepare_s } = solved;
+        let (method, best) = (&self.method, solution.best);
+        RunRecord {
+            version: env!("CARGO_PKG_VERSION"),
+            spec: method.loaded.spec.name.clone(),
+            seed: self.seed,
+            scan: None,
+            held_out_views: self.input.held.clone(),
+            limits: Ends::from(&self.limits),
+            budget_s: self.budget,
+            plan: self.schedule.clone(),
+            init: None,
+            reference: None,
+            plugins: plugins::used(&method.loaded.tree),
+            backend: method.plan.outline().backend(),
+            simd: simd_level(),
+            threads: rayon::current_num_threads(),
+            machine: Machine::here(),
+            memory: method.memory,
+            peak_bytes: memory::peak(),
+            steps: solution.steps,
+            rollbacks: solution.rollbacks,
+            load_s: self.load_s,
+            prepare_s: *prepare_s,
+            train_s: solution.train_s,
+            written,
+            total_s: self.begin.elapsed().as_secs_f64() + self.spent,
+            samples: solution.samples,
+            samples_per_s: (solution.sampling_s > 0.0).then(|| solution.samples as f64 / solution.sampling_s),
+            loss: last.and_then(|r| r.loss),
+            held_out: best.map(|b| b.held_out).or(last.and_then(|r| r.held_out)),
+            best_step: best.map(|b| b.step),
+            peak: self.input.peak,
+        }
+    }
+}
+
+/// Number of parameters of the field in `result`; 0 without a field.
+pub fn parameters(result: &Reconstruction) -> usize {
+    result.field().map_or(0, |f| f.model.pipeline.layout().len())
+}
+
+/// The trained field in `result`, if there is one.
+pub fn field(result: Reconstruction) -> Option<TrainedField> {
+    match result {
+        Reconstruction::Volume(_) => None,
+        Reconstruction::Field(field) => Some(field),
+        Reconstruction::Refined { field, .. } => Some(*field),
+    }
+}
