@@ -9,6 +9,7 @@ mod by_row;
 mod coarse_to_fine;
 mod composition;
 mod core_modules;
+mod crates;
 mod drift;
 mod gaussians;
 mod guard;
