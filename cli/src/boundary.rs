@@ -8,9 +8,6 @@ use conefield_core::{Error, Result};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// Keys of a spec whose values name files.
-const FILES: [&str; 4] = ["weights", "path", "paths", "start"];
-
 /// The files and folders that a command reads.
 #[derive(Default)]
 pub struct Inputs(Vec<PathBuf>);
@@ -29,9 +26,7 @@ impl Inputs {
 
     /// Adds a spec with everything it extends and names.
     pub fn and_spec(self, loaded: &Loaded) -> Self {
-        let mut named = vec![];
-        texts(&loaded.tree, &|key| FILES.contains(&key), &mut named);
-        self.and(loaded.sources()).and(named)
+        self.and(loaded.sources()).and(loaded.input_files())
     }
 
     /// Adds a TOML description with every file that it names.
@@ -39,7 +34,7 @@ impl Inputs {
         let text = conefield_core::files::read_text(path, 16 << 20).unwrap_or_default();
         let tree: Value = toml::from_str(&text).unwrap_or_default();
         let mut named = vec![];
-        texts(&tree, &|_| true, &mut named);
+        texts(&tree, &mut named);
         let folder = path.parent().unwrap_or(Path::new("")).to_path_buf();
         self.and([path]).and(named.into_iter().map(|n| folder.join(n)))
     }
@@ -86,17 +81,14 @@ fn below(path: &Path, folder: &Path) -> bool {
     folder.canonicalize().is_ok_and(|f| path.starts_with(f))
 }
 
-/// All strings of `tree` under keys accepted by `wanted`.
-fn texts(tree: &Value, wanted: &dyn Fn(&str) -> bool, found: &mut Vec<String>) {
-    fn walk(value: &Value, take: bool, wanted: &dyn Fn(&str) -> bool, found: &mut Vec<String>) {
-        match value {
-            Value::String(text) if take => found.push(text.clone()),
-            Value::Array(all) => all.iter().for_each(|v| walk(v, take, wanted, found)),
-            Value::Object(map) => map.iter().for_each(|(key, v)| walk(v, wanted(key), wanted, found)),
-            _ => {}
-        }
+/// All strings of `tree`.
+fn texts(tree: &Value, found: &mut Vec<String>) {
+    match tree {
+        Value::String(text) => found.push(text.clone()),
+        Value::Array(all) => all.iter().for_each(|v| texts(v, found)),
+        Value::Object(map) => map.values().for_each(|v| texts(v, found)),
+        _ => {}
     }
-    walk(tree, false, wanted, found);
 }
 
 /// Refuses to overwrite an existing path unless `force`.

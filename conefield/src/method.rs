@@ -2,11 +2,12 @@
 
 use crate::files;
 use crate::memory::{self, Memory};
-use conefield_core::Result;
 use conefield_core::backend::Backend;
-use conefield_core::method::{Context, Plan};
+use conefield_core::input_file::InputFile;
+use conefield_core::method::{Context, Plan, StartFile};
 use conefield_core::spec::load::Loaded;
-use serde_json::Value;
+use conefield_core::spec::marks::marked;
+use conefield_core::{Error, Result};
 use std::path::Path;
 
 /// A spec, built, with its memory estimate.
@@ -47,7 +48,7 @@ pub fn planned(
         if conefield_io::is_volume(path) {
             Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
         }
-        sets.push(init(&read(&sets)?.tree, path));
+        sets.push(init(&read(&sets)?, path)?);
     }
     let loaded = read(&sets)?;
     let plan = plan(&loaded, backend)?;
@@ -61,29 +62,25 @@ pub fn planned(
     Ok(Planned { loaded, plan, memory })
 }
 
-/// Settings that reduce the tables of a hash grid, from the largest below the current size.
+/// Settings that reduce the largest tables of an encoder, from the largest below the current size.
 fn smaller_tables(loaded: &Loaded) -> Vec<(u32, String)> {
-    let paths = ["encoder", "methods.0.encoder"];
-    let found = paths.into_iter().find_map(|path| {
-        let pointer = format!("/{}/log2_table_size", path.replace('.', "/"));
-        Some((path, loaded.tree.pointer(&pointer)?.as_u64()?))
-    });
-    let Some((path, bits)) = found else { return vec![] };
-    (10..bits as u32).rev().map(|bits| (bits, format!("{path}.log2_table_size={bits}"))).collect()
+    let sizes = marked(&loaded.tree, &|schema| schema["x-log2-memory"] == true);
+    let Some((path, Some(bits))) = sizes.first().map(|(path, bits)| (path, bits.as_u64())) else { return vec![] };
+    (10..bits as u32).rev().map(|bits| (bits, format!("{path}={bits}"))).collect()
 }
 
-/// The setting that makes the method `tree` start from the file `path`, weights or a volume. In a chain, it applies to
-/// the first method.
-pub fn init(tree: &Value, path: &Path) -> String {
-    if let Some(first) = tree["methods"].get(0) {
-        return format!("methods.0.{}", init(first, path));
-    }
-    let file = toml::Value::String(path.display().to_string());
-    match conefield_io::is_volume(path) {
-        false => format!("initializer={{ type = \"mci\", weights = {file} }}"),
-        true if tree.get("initializer").is_some() => format!("initializer={{ type = \"volume\", path = {file} }}"),
-        true => format!("start={file}"),
-    }
+/// The setting that makes the method of `loaded` start from the file `path`, weights or a volume.
+pub fn init(loaded: &Loaded, path: &Path) -> Result<String> {
+    let place = path.display().to_string();
+    let file = InputFile(place.clone());
+    let start = if conefield_io::is_volume(path) { StartFile::Volume(file) } else { StartFile::Weights(file) };
+    let Some((setting, value)) = loaded.spec.method.start_setting(&start) else {
+        let expected = format!("a method that starts from {}; {} does not", start.kind(), loaded.spec.name);
+        return Err(Error::invalid(place, "init", start.kind(), expected));
+    };
+    let value: toml::Value = serde_json::from_value(value)
+        .map_err(|e| Error::unsupported("init", format!("the setting cannot be written: {e}")))?;
+    Ok(format!("{setting}={value}"))
 }
 
 #[cfg(test)]

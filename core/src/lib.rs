@@ -30,6 +30,7 @@ pub mod files;
 pub mod finite;
 pub mod geometry;
 pub mod host;
+pub mod input_file;
 pub mod loss;
 pub mod method;
 pub mod opened;

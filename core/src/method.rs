@@ -6,6 +6,7 @@ use crate::backend::{Backend, Explain};
 use crate::checkpoint::{Checkpoint, Resume};
 use crate::error::{Error, Result};
 use crate::geometry::VoxelGrid;
+use crate::input_file::InputFile;
 use crate::parts::{Part, Voxels};
 use crate::pipeline::{Model, Pipeline};
 use crate::scan::{Scan, ScanHeader, Volume};
@@ -273,6 +274,39 @@ impl<'a> Context<'a> {
 pub trait Method: Send + Sync {
     /// Checks the settings, builds and compiles every stage, and reads the weights named in the settings, each once.
     fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>>;
+
+    /// The setting, by its path in the spec, with which the method starts from `file`; `None` if it cannot.
+    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
+        let _ = file;
+        None
+    }
+}
+
+/// A file that a run starts from.
+#[derive(Debug, Clone, PartialEq)]
+pub enum StartFile {
+    /// Weights of a field.
+    Weights(InputFile),
+    /// A volume.
+    Volume(InputFile),
+}
+
+impl StartFile {
+    /// What the file holds.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Weights(_) => "weights",
+            Self::Volume(_) => "a volume",
+        }
+    }
+
+    /// The setting `start` of methods on voxels: a volume.
+    pub fn as_volume(&self) -> Option<(String, serde_json::Value)> {
+        match self {
+            Self::Weights(_) => None,
+            Self::Volume(file) => Some(("start".into(), file.0.clone().into())),
+        }
+    }
 }
 
 /// A method that is built and checked, ready to be explained, priced and run.

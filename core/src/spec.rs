@@ -5,6 +5,7 @@
 
 mod check;
 pub mod load;
+pub mod marks;
 mod one_of;
 pub mod schema;
 pub mod stage;

@@ -48,6 +48,7 @@ pub struct HashGrid {
     /// Ratio of consecutive levels' resolutions.
     pub growth: f64,
     /// Largest table, as a power of two.
+    #[schemars(extend("x-log2-memory" = true))]
     pub log2_table_size: u32,
 }
 

@@ -9,6 +9,7 @@ mod made;
 use conefield_core::checkpoint::Checkpoint;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::method::StartFile;
 use conefield_core::method::{
     Context, Findings, Job, Limits, Line, Method, Needs, Observer, Outline, Plan, PretrainJob, Record, Solution,
 };
@@ -74,6 +75,11 @@ impl Method for Chain {
             links.push(link);
         }
         Ok(Box::new(ChainPlan { links, mean: self.mean, merge: self.merge }))
+    }
+
+    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
+        let (path, value) = self.methods.first()?.start_setting(file)?;
+        Some((format!("methods.0.{path}"), value))
     }
 }
 

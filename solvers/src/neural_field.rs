@@ -5,6 +5,7 @@ use crate::optimizer::Optimizer;
 use crate::pretrain::Pretraining;
 use crate::training::CallbackSpec;
 use conefield_core::error::Result;
+use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Line, Method, Plan, StageLine};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scene::SceneSettings;
@@ -12,6 +13,8 @@ use conefield_core::settings::{
     EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 use conefield_core::spec::stage;
+use conefield_fields::initializers::mci::Mci;
+use conefield_fields::initializers::volume::FromVolume;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -89,6 +92,14 @@ impl Method for NeuralField {
             callbacks: &self.callbacks,
         };
         trained.plan(pipeline, stages, vec![projector], context)
+    }
+
+    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
+        let initializer: Box<dyn InitializerSpec> = match file {
+            StartFile::Weights(file) => Box::new(Mci { weights: file.clone() }),
+            StartFile::Volume(file) => Box::new(FromVolume::new(file.clone())),
+        };
+        Some(("initializer".into(), serde_json::to_value(initializer).ok()?))
     }
 }
 

@@ -36,7 +36,7 @@ impl Method {
         let mut loaded = specs::read(spec, sets)?;
         if let Some(file) = init {
             ensure(Path::new(file).exists(), "init", file, "nothing", "weights or a volume")?;
-            let start = method::init(&loaded.tree, Path::new(file));
+            let start = method::init(&loaded, Path::new(file))?;
             loaded = specs::read(spec, &[sets, &[start]].concat())?;
         }
         let plan = method::plan(&loaded, backend)?;

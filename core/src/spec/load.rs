@@ -8,7 +8,8 @@ use super::tree::{At, Entry, Is, Node, parse_json, parse_toml};
 use super::{LABEL, Spec, check, one_of};
 use crate::allowance::Work;
 use crate::error::{Error, Result, ensure};
-use crate::{files, registry};
+use crate::spec::marks::marked;
+use crate::{files, input_file, registry};
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -142,6 +143,13 @@ impl Loaded {
         let mut all = BTreeSet::from([self.source.clone()]);
         self.written.sources(&mut all);
         all
+    }
+
+    /// The files that its settings name ([`InputFile`](crate::input_file::InputFile)), and the libraries of its stages.
+    pub fn input_files(&self) -> Vec<String> {
+        let named = marked(&self.tree, &|schema| schema["format"] == input_file::FORMAT).into_iter();
+        let named = named.filter_map(|(_, name)| name.as_str().map(str::to_owned));
+        named.chain(self.spec.plugins.paths.iter().cloned()).collect()
     }
 
     /// The same error, with the line of the spec it refers to.

@@ -2,6 +2,7 @@
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Result, ensure};
+use conefield_core::input_file::InputFile;
 use conefield_core::settings::{Initializer, InitializerSpec};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -11,7 +12,7 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields)]
 pub struct CheckpointSettings {
     /// The weights file. It must contain every weight of the pipeline, in the same shape.
-    pub weights: String,
+    pub weights: InputFile,
 }
 
 conefield_core::stage_type!(
@@ -26,7 +27,7 @@ conefield_core::stage_type!(
 impl InitializerSpec for CheckpointSettings {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
         ensure(!self.weights.is_empty(), "spec", "weights", "no name", "a weights file")?;
-        Ok(Box::new(CheckpointInitializer { path: self.weights.clone(), weights: weights(&self.weights)? }))
+        Ok(Box::new(CheckpointInitializer { path: self.weights.to_string(), weights: weights(&self.weights)? }))
     }
 }
 
@@ -68,6 +69,6 @@ mod tests {
         assert_eq!(built.apply(&layout, &mut arena).unwrap().loaded, ["encoder.0.table"]);
         assert_eq!(*arena.params, [1.0, 2.0]);
         assert!(settings.build(&|p| Err(Error::invalid(p, "file", "nothing", "weights"))).is_err());
-        assert!(CheckpointSettings { weights: String::new() }.build(&|_| Ok(Weights::default())).is_err());
+        assert!(CheckpointSettings { weights: InputFile::default() }.build(&|_| Ok(Weights::default())).is_err());
     }
 }

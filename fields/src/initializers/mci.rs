@@ -6,6 +6,7 @@
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::input_file::InputFile;
 use conefield_core::settings::{Initializer, InitializerSpec};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -15,7 +16,7 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields)]
 pub struct Mci {
     /// The weights file of the trained model.
-    pub weights: String,
+    pub weights: InputFile,
 }
 
 conefield_core::stage_type!(
@@ -30,7 +31,7 @@ conefield_core::stage_type!(
 impl InitializerSpec for Mci {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
         ensure(!self.weights.is_empty(), "spec", "weights", "no name", "a weights file")?;
-        Ok(Box::new(MciInitializer { path: self.weights.clone(), weights: weights(&self.weights)? }))
+        Ok(Box::new(MciInitializer { path: self.weights.to_string(), weights: weights(&self.weights)? }))
     }
 }
 

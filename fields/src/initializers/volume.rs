@@ -3,6 +3,7 @@
 
 use conefield_core::arena::{Arena, InitReport, Layout, Weights};
 use conefield_core::error::{Result, ensure};
+use conefield_core::input_file::InputFile;
 use conefield_core::settings::{Initializer, InitializerSpec, KnownVolume};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -12,10 +13,17 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields)]
 pub struct FromVolume {
     /// The volume file, in 1/unit of the scan and with as many voxels.
-    pub path: String,
+    pub path: InputFile,
     /// Number of training steps on the volume.
     #[serde(default = "steps")]
     pub steps: u64,
+}
+
+impl FromVolume {
+    /// The volume `path`, learned in the default number of steps.
+    pub fn new(path: InputFile) -> Self {
+        Self { path, steps: steps() }
+    }
 }
 
 fn steps() -> u64 {
@@ -45,7 +53,7 @@ impl Initializer for FromVolume {
     }
 
     fn volume(&self) -> Option<KnownVolume> {
-        Some(KnownVolume { path: self.path.clone(), steps: self.steps })
+        Some(KnownVolume { path: self.path.to_string(), steps: self.steps })
     }
 
     fn describe(&self) -> String {

@@ -10,6 +10,8 @@ use super::shared::Shared;
 use super::tv::{anisotropy, descend};
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::Result;
+use conefield_core::input_file::InputFile;
+use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
@@ -34,7 +36,7 @@ pub struct AsdPocs {
     pub scene: VoxelScene,
     /// File of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<String>,
+    pub start: Option<InputFile>,
     /// Stopping criteria.
     pub stop: Stop,
     /// Number of ordered subsets of the views, or "views" for one view at a time.
@@ -72,6 +74,10 @@ conefield_core::stage_type!(Method, "asd-pocs", AsdPocs, "alternates data passes
 impl Method for AsdPocs {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         Ok(Box::new(IterativePlan(self.built()?)))
+    }
+
+    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
+        file.as_volume()
     }
 }
 

@@ -7,6 +7,8 @@ use super::plan::{Iterative, IterativePlan};
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::Result;
+use conefield_core::input_file::InputFile;
+use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Reconstruction, Solution};
 use conefield_core::scan::ScanHeader;
 use conefield_core::scene::VoxelScene;
@@ -31,7 +33,7 @@ pub struct Cgls {
     pub scene: VoxelScene,
     /// File of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<String>,
+    pub start: Option<InputFile>,
     /// Stopping criteria.
     pub stop: Stop,
     /// Set negative attenuation to 0 at the end.
@@ -52,6 +54,10 @@ impl Method for Cgls {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         let shared = Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?;
         Ok(Box::new(IterativePlan(Built { shared, nonnegative: self.nonnegative })))
+    }
+
+    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
+        file.as_volume()
     }
 }
 

@@ -25,6 +25,8 @@ use conefield_core::basis::{Basis, BasisSpec, Expansion};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::input_file::InputFile;
+use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
 use conefield_core::random::stream;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update};
@@ -65,7 +67,7 @@ pub struct Fista {
     pub scene: VoxelScene,
     /// File of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<String>,
+    pub start: Option<InputFile>,
     /// Stopping criteria.
     pub stop: Stop,
     /// Set pixels outside the object's shadow to 0, whatever noise they have. If negative values were clipped, noise
@@ -111,6 +113,10 @@ conefield_core::stage_type!(Method, "fista", Fista, "ordered-subset FISTA with a
 impl Method for Fista {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         Ok(Box::new(IterativePlan(self.built()?)))
+    }
+
+    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
+        file.as_volume()
     }
 }
 

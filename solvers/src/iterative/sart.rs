@@ -9,6 +9,8 @@ use super::problem::{images_mut, invert, room};
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
 use conefield_core::error::{Result, ensure};
+use conefield_core::input_file::InputFile;
+use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
@@ -33,7 +35,7 @@ pub struct Sart {
     pub scene: VoxelScene,
     /// File of a known volume to start from.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<String>,
+    pub start: Option<InputFile>,
     /// Stopping criteria.
     pub stop: Stop,
     /// Number of ordered subsets of the views, or "views" for one view at a time. 1 uses all views at once.
@@ -70,6 +72,10 @@ conefield_core::stage_type!(Method, "sart", Sart, "simultaneous algebraic recons
 impl Method for Sart {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         Ok(Box::new(IterativePlan(self.built()?)))
+    }
+
+    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
+        file.as_volume()
     }
 }
 

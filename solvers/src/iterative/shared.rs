@@ -9,6 +9,7 @@ use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
 use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::input_file::InputFile;
 use conefield_core::method::{Job, Observer};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::VoxelScene;
@@ -25,7 +26,7 @@ pub(super) struct Shared {
     pub(super) projector_kind: &'static str,
     pub(super) scene: VoxelScene,
     /// File of the start volume.
-    start: Option<String>,
+    start: Option<InputFile>,
     pub(super) stop: Stop,
 }
 
@@ -34,7 +35,7 @@ impl Shared {
     pub(super) fn of(
         projector: &dyn VoxelProjectorSpec,
         scene: VoxelScene,
-        start: &Option<String>,
+        start: &Option<InputFile>,
         stop: &Stop,
     ) -> Result<Self> {
         stop.validate()?;
