@@ -12,8 +12,9 @@ use conefield_core::voxel::VoxelView;
 use ndarray::{ArrayViewMut3, Axis};
 use rayon::prelude::*;
 
-/// Planes of voxels per task.
-const TILE: usize = 4;
+/// Lines of voxels per task, along x and along y. A tile, and the columns of pixels that it meets in a view, stay in a
+/// core's cache while all views are added; whole planes of voxels would meet most columns of each view.
+const TILE: usize = 32;
 /// Largest slant of a line of voxels: change in columns per change in rows. Steeper lines are processed voxel by voxel.
 const SLANT: f64 = 0.5;
 
@@ -28,39 +29,49 @@ pub fn backproject<R: Real>(
     let seen = |(&v, &scale): (&usize, &f64)| Pinhole::of(geometry, v).voxels(&geometry.volume, scale);
     let all: Vec<VoxelView> = views.iter().zip(scales).map(seen).collect();
     let zeros = vec![R::ZERO; geometry.detector[0] + 2 * PAD];
-    volume.axis_chunks_iter_mut(Axis(0), TILE).into_par_iter().enumerate().for_each(|(n, planes)| {
-        run(Planes { detector: geometry.detector, pixels, zeros: &zeros, views: &all, first: n * TILE, planes });
+    let mut tiles = vec![];
+    for (i, mut rest) in volume.axis_chunks_iter_mut(Axis(0), TILE).enumerate() {
+        let ny = rest.dim().1;
+        for y in (0..ny).step_by(TILE) {
+            let (lines, after) = rest.split_at(Axis(1), TILE.min(ny - y));
+            tiles.push(([i * TILE, y], lines));
+            rest = after;
+        }
+    }
+    tiles.into_par_iter().for_each(|(first, lines)| {
+        run(Tile { detector: geometry.detector, pixels, zeros: &zeros, views: &all, first, lines });
     });
 }
 
-/// Some planes of voxels, in all views.
-struct Planes<'a, R> {
+/// A tile of lines of voxels along z, in all views.
+struct Tile<'a, R> {
     detector: [usize; 2],
     pixels: &'a ColumnMajor<R>,
     /// A column of pixels outside the detector.
     zeros: &'a [R],
     views: &'a [VoxelView],
-    first: usize,
-    planes: ArrayViewMut3<'a, R>,
+    /// Its first line.
+    first: [usize; 2],
+    lines: ArrayViewMut3<'a, R>,
 }
 
-impl<R: Real> Op for Planes<'_, R> {
+impl<R: Real> Op for Tile<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
-        let Self { detector, pixels, zeros, views, first, mut planes } = self;
-        let nz = planes.dim().2;
+        let Self { detector, pixels, zeros, views, first, mut lines } = self;
+        let nz = lines.dim().2;
         let mut q = vec![R::ZERO; nz.next_multiple_of(V::<S, R>::LEN)];
         let (mut stands, mut ends) = (Stands::new(q.len() / V::<S, R>::LEN), Ends::default());
         for (index, view) in views.iter().enumerate() {
             let image = Image { view, detector, pixels, index, zeros };
-            for (x, mut plane) in planes.outer_iter_mut().enumerate() {
+            for (x, mut plane) in lines.outer_iter_mut().enumerate() {
                 for (y, line) in plane.outer_iter_mut().enumerate() {
                     let Some(voxels) = line.into_slice() else { continue };
-                    match Line::of(&image, [first + x, y], nz) {
+                    match Line::of(&image, [first[0] + x, first[1] + y], nz) {
                         Some(line) => image.add(s, &line, &mut q, (&mut ends, &mut stands), voxels),
-                        None => image.add_one_by_one([first + x, y], voxels),
+                        None => image.add_one_by_one([first[0] + x, first[1] + y], voxels),
                     }
                 }
             }

@@ -282,10 +282,10 @@ fn cone(orbit: &FdkOrbit, volume: VoxelGrid, axis: Option<&OrbitAxis>) -> [f64; 
     [nearest, low.abs().max(high.abs())].map(|z| (z / radius).atan())
 }
 
-/// Bytes of views to hold at once: 1/32 of scan and volume, but at least one MiB and no more than fits into the
-/// last-level cache.
+/// Bytes of views to hold at once: 1/16 of scan and volume, within 1 and 256 MiB. The whole volume passes through memory,
+/// and from and to a device, once for all views held.
 fn held(header: &ScanHeader) -> u64 {
-    (header.pixels().saturating_add(header.voxels()) / 8).clamp(1 << 20, 12 << 20)
+    (header.pixels().saturating_add(header.voxels()) / 4).clamp(1 << 20, 256 << 20)
 }
 
 /// Number of views that fit into `bytes`.

@@ -126,7 +126,11 @@ fn no_crate_needs_what_needs_it() {
         std::fs::write(&file, picture(&needs)).unwrap();
     }
     let drawn = std::fs::read_to_string(&file).unwrap_or_default();
-    assert_eq!(drawn, picture(&needs), "CONEFIELD_BLESS=1 cargo test --release -p conefield-tests --test library crates");
+    assert_eq!(
+        drawn,
+        picture(&needs),
+        "CONEFIELD_BLESS=1 cargo test --release -p conefield-tests --test library crates"
+    );
     // A circle is found.
     let mut wrong = needs.clone();
     wrong.get_mut("core").unwrap().insert("io".into());
