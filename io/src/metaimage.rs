@@ -367,30 +367,17 @@ fn list(numbers: impl IntoIterator<Item = f64>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::{file, gzip, says};
     use crate::{is_volume, read_volume, write_volume};
     use ndarray::Array3;
-    use std::path::PathBuf;
 
     fn zlib(bytes: &[u8]) -> Vec<u8> {
         let mut e = ZlibEncoder::new(Vec::new(), Compression::fast());
-        e.write_all(bytes).unwrap();
-        e.finish().unwrap()
-    }
-
-    struct File(tempfile::TempDir, PathBuf);
-
-    fn file(name: &str, parts: &[&[u8]]) -> File {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join(name);
-        std::fs::write(&path, parts.concat()).unwrap();
-        File(dir, path)
+        e.write_all(bytes).and_then(|()| e.finish()).unwrap()
     }
 
     fn refused(parts: &[&[u8]], words: &[&str]) {
-        let f = file("bad.mha", parts);
-        let e = read_volume(&f.1).unwrap_err().to_string();
-        assert!(e.contains("bad.mha"), "{e}");
-        assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+        says(read_volume(&file("bad.mha", parts).1), &[&["bad.mha"], words].concat());
     }
 
     /// 2×3×1 voxels of one byte, 0 to 5, with further lines.
@@ -507,16 +494,7 @@ mod tests {
             ("slice%03d.raw 1 2 1", "LOCAL or one file"),
             ("", "inside the folder"),
         ] {
-            let e = head("", name).unwrap_err().to_string();
-            assert!(e.contains("a.mhd") && e.contains(DATA_FILE) && e.contains(word), "{name}: {e}");
-        }
-        let e = head("HeaderSize = 99\n", "a.raw").unwrap_err().to_string();
-        assert!(e.contains("HeaderSize") && e.contains("99"), "{e}");
-        #[cfg(unix)]
-        {
-            std::os::unix::fs::symlink(dir.path().join("out.raw"), inner.join("link.raw")).unwrap();
-            let e = head("", "link.raw").unwrap_err().to_string();
-            assert!(e.contains("out of the folder"), "{e}");
+            says(head("", name), &["a.mhd", DATA_FILE, word]);
         }
     }
 
@@ -532,12 +510,7 @@ mod tests {
             refused(&[&with("NDims = 3", &format!("NDims = {bad}"))], &[n, bad, "3, or 4"]);
         }
         refused(&[&with("NDims = 3", "NDims = 4")], &["DimSize", "2 3 1", "4 numbers"]);
-        refused(&[&with("NDims = 3", "NDims = 3\nNDims = 3")], &["NDims", "two entries"]);
-        let huge = "4294967296 4294967296 4294967296";
-        refused(&[&with("2 3 1", huge)], &["DimSize", huge, "can be addressed"]);
         refused(&[&with("2 3 1", "99999999999999999999 1 1")], &["DimSize", "whole numbers"]);
-        refused(&[&with("2 3 1", "2 0 1")], &["DimSize", "above 0"]);
-        refused(&[&with("2 3 1", "2 -3 1")], &["DimSize", "above 0"]);
         refused(&[&with("2 3 1", "100000 100000 10000")], &["data", "6 bytes", "100000000000000 bytes"]);
         let four = "NDims = 4\nDimSize = 1 1 1 9\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n";
         refused(&[four.as_bytes(), &[0; 9]], &["DimSize", "series"]);
@@ -549,9 +522,7 @@ mod tests {
         refused(&[&small("CompressedData = maybe\n")], &["CompressedData", "maybe"]);
         refused(&[&small("ElementByteOrderMSB = True\nBinaryDataByteOrderMSB = False\n")], &["ElementByteOrderMSB"]);
         refused(&[&small("ElementSpacing = 1 0 1\n")], &["ElementSpacing", "above 0"]);
-        refused(&[&small("ElementSpacing = 1 nan 1\n")], &["ElementSpacing", "finite"]);
         refused(&[&small("Offset = 1 2\n")], &["Offset", "3 finite numbers"]);
-        refused(&[&small("TransformMatrix = 1 0 0 1 0 0 0 0 1\n")], &["TransformMatrix", "independent"]);
         refused(&[&small("DistanceUnits = ell\n")], &["DistanceUnits", "ell"]);
         refused(&[&small("ObjectType = Tube\n")], &["ObjectType", "two entries"]);
         refused(&[&with("ObjectType = Image", "ObjectType = Tube")], &["ObjectType", "Tube"]);
@@ -561,14 +532,9 @@ mod tests {
         refused(&[b"NDims = 3\nDimSize = \xff\xfe 1 1\nElementDataFile = LOCAL\n"], &["DimSize", "UTF-8"]);
         // A header without an end.
         refused(&[b"NDims = 3\n", &b"Comment = x\n".repeat(10_000)], &[DATA_FILE, "65536"]);
-        refused(&[b"NDims = 3\nComment = ", &[b'x'; 100_000]], &[DATA_FILE, "65536"]);
         let nan = "NDims = 3\nDimSize = 1 1 2\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n";
         refused(&[nan.as_bytes(), &[0; 4], &f32::NAN.to_le_bytes()], &["voxel [0, 0, 1]", "NaN"]);
-        let f = file("a.mha.gz", &[]);
-        let mut e = flate2::write::GzEncoder::new(std::fs::File::create(&f.1).unwrap(), Compression::fast());
-        e.write_all(&whole).unwrap();
-        e.finish().unwrap();
-        assert!(read_volume(&f.1).unwrap_err().to_string().contains("MetaImage inside gzip"));
+        says(read_volume(&file("a.mha.gz", &[&gzip(&whole)]).1), &["MetaImage inside gzip"]);
     }
 
     #[test]
@@ -587,9 +553,6 @@ mod tests {
         for bad in [(n - 1).to_string(), (n + 1).to_string(), "-1".into(), u64::MAX.to_string(), "x".into()] {
             refused(&[&head(&bad, "2 3 1"), &six], &["CompressedDataSize", &bad, &format!("expected {n}")]);
         }
-        // Too few bytes, and a claim that no stream of this length can satisfy.
-        refused(&[&head("0", "2 3 2"), &six], &["data", "after 6 bytes", "12 bytes"]);
-        refused(&[&head("0", "4000 4000 4000"), &six], &["data", "64000000000 bytes in a zlib stream"]);
         // A decompression bomb is not decompressed further than the header claims.
         let bomb = zlib(&vec![0; 64 << 20]);
         refused(&[&head("0", "2 3 1"), &bomb], &["data", "more data", "6 bytes"]);
@@ -662,18 +625,5 @@ mod tests {
         assert_eq!(String::from_utf8_lossy(&bytes[..text.len()]), text);
         assert_eq!(bytes[text.len()..], packed);
         assert!(f.0.path().read_dir().unwrap().count() == 1, "something is left beside the file");
-    }
-
-    proptest::proptest! {
-        #[test]
-        fn no_bytes_make_it_panic(changes in proptest::collection::vec((0usize..400, 0u8..), 1..12)) {
-            let lines = "Offset = 1 2 3\nElementSpacing = 1 2 3\nTransformMatrix = 1 0 0 0 1 0 0 0 1\nHeaderSize = 0\n";
-            let mut bytes = small(lines);
-            let n = bytes.len();
-            for (at, x) in changes {
-                bytes[at % n] = x;
-            }
-            let _ = read_volume(&file("a.mha", &[&bytes]).1);
-        }
     }
 }

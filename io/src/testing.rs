@@ -5,7 +5,30 @@ use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
 use ndarray::Array3;
+use std::io::Write;
 use std::path::{Path, PathBuf};
+use tempfile::TempDir;
+
+/// Fails unless `result` is an error that names all of `words`.
+pub(crate) fn says<T>(result: Result<T>, words: &[&str]) {
+    let Err(e) = result else { panic!("no error: {words:?}") };
+    let e = e.to_string();
+    assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+}
+
+/// A file called `name` in a folder of its own.
+pub(crate) fn file(name: &str, parts: &[&[u8]]) -> (TempDir, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join(name);
+    std::fs::write(&path, parts.concat()).unwrap();
+    (dir, path)
+}
+
+/// `bytes` in gzip.
+pub(crate) fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut w = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    w.write_all(bytes).and_then(|()| w.finish()).unwrap()
+}
 
 /// A file of the shared data, or `None` with a note that the test is skipped.
 pub(crate) fn data(name: &str) -> Option<PathBuf> {

@@ -156,6 +156,7 @@ fn halved(values: ArrayView3<f32>) -> Array3<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::says;
     use conefield_core::scan::Volume;
     use flate2::read::ZlibDecoder;
     use std::io::Read;
@@ -190,8 +191,7 @@ mod tests {
         assert_eq!(sets[1]["coordinateTransformations"][1]["translation"][0], json!(first[2] + 1.0));
         // Overwrites its own output, but nothing else.
         volume.data[[0, 0, 0]] = f32::NAN;
-        let e = write(&path, &mut &volume).unwrap_err().to_string();
-        assert!(e.contains("a.zarr: voxel [0, 0, 0]") && e.contains("NaN"), "{e}");
+        says(write(&path, &mut &volume), &["a.zarr: voxel [0, 0, 0]", "NaN"]);
         assert_eq!(chunk(&path.join("0/0/0/0"))[[0, 0, 0]], 0.0);
         volume.data[[0, 0, 0]] = 1.0;
         write(&path, &mut &volume).unwrap();

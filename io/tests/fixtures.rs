@@ -2,8 +2,8 @@
 //! program: closed-form integrals through ellipsoids, in pickles of NumPy 1 and 2 and in `.npy` files.
 
 use conefield_core::geometry::Vec3;
-use conefield_core::scan::{Scan, Volume};
-use conefield_io::{DataSet, read_naf, read_r2};
+use conefield_core::scan::{Scan, Unit, Volume};
+use conefield_io::{DataSet, Stored, read_naf, read_r2, read_scan, read_truth};
 use std::path::{Path, PathBuf};
 
 /// Centre, half axes, rotation about z, attenuation, as in `make.py`.
@@ -88,6 +88,10 @@ fn data_is_right(data: &DataSet, what: &str) {
     views_are_right(&data.train, 6, what);
     views_are_right(data.test.as_ref().unwrap(), 2, what);
     volume_is_right(data.volume.as_ref().unwrap(), what);
+    assert_eq!(data.train.unit, Unit::default(), "{what}");
+    let Stored::Scan(scan) = read_scan(file(what)).unwrap() else { panic!("{what}: counts") };
+    assert_eq!((&scan.geometry, &scan.projections), (&data.train.geometry, &data.train.projections), "{what}");
+    assert_eq!(read_truth(file(what)).unwrap().unwrap().data, data.volume.as_ref().unwrap().data, "{what}");
 }
 
 #[test]
@@ -107,7 +111,7 @@ fn nafs_pickle_is_read_as_it_is_meant() {
 #[test]
 fn r2s_folder_is_read_as_it_is_meant() {
     let data = read_r2(file("ellipsoids_r2")).unwrap();
-    data_is_right(&data, "R2-Gaussian's folder");
+    data_is_right(&data, "ellipsoids_r2");
     let found = data.train.provenance["unit_from"].as_str().unwrap();
     assert!(found.contains("lengths in m"), "{found}");
 }

@@ -2,47 +2,17 @@
  * conformance kit must detect. Without a fault it is a valid encoder: y = a * x, each coordinate times a learned
  * number. */
 #define _POSIX_C_SOURCE 199309L
-#include "conefield_plugin.h"
+#include "faulty.h"
 
-#include <math.h>
 #include <stdatomic.h>
-#include <stdlib.h>
-#include <string.h>
 #include <time.h>
 
 enum Fault {
-    NONE,
-    WRONG_ABI,
-    SHORT_TABLE,
-    SHORT_FUNCTIONS,
-    NO_FORWARD,
-    NO_STAGES,
-    NOT_A_NUMBER,
-    NOT_A_NUMBER_LATER,
-    MORE_CHANNELS,
-    MORE_PARAMETERS,
-    TWIN_BLOCKS,
-    PAST_TILE,
-    NO_FORWARD_PASS,
-    WRONG_PASSES,
-    REDUCES_NOTHING,
-    FEW_RESOLUTIONS,
-    MORE_RESOLUTIONS,
-    NAN_RESOLUTION,
-    NEGATIVE_RESOLUTION,
-    BEFORE_GRADIENTS,
-    WRONG_GRADIENT,
-    WRONG_INPUT_GRADIENT,
-    REMEMBERS,
-    FAILS,
-    FAILS_LATER,
-    SLEEPS,
-    SLEEPS_IN_CREATE,
-    ABORTS,
+    NONE, WRONG_ABI, SHORT_TABLE, SHORT_FUNCTIONS, NO_FORWARD, NO_STAGES, NOT_A_NUMBER, NOT_A_NUMBER_LATER,
+    MORE_CHANNELS, MORE_PARAMETERS, TWIN_BLOCKS, PAST_TILE, NO_FORWARD_PASS, WRONG_PASSES, REDUCES_NOTHING,
+    FEW_RESOLUTIONS, MORE_RESOLUTIONS, NAN_RESOLUTION, NEGATIVE_RESOLUTION, BEFORE_GRADIENTS, WRONG_GRADIENT,
+    WRONG_INPUT_GRADIENT, REMEMBERS, FAILS, FAILS_LATER, SLEEPS, SLEEPS_IN_CREATE, ABORTS,
 };
-#ifndef FAULT
-#define FAULT NONE
-#endif
 #ifndef ENTRY
 #define ENTRY conefield_plugin
 #endif
@@ -52,14 +22,6 @@ enum Fault {
 #ifndef SCHEMA
 #define SCHEMA "{\"type\":\"object\",\"properties\":{}}"
 #endif
-
-#define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
-
-static void say(struct ConefieldText *out, const char *line) {
-    if (out == NULL) return;
-    out->length = strlen(line);
-    memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
-}
 
 static atomic_int calls;
 
@@ -114,10 +76,7 @@ static ConefieldStatus forward(const void *stage, const float *params, struct Co
     int call = atomic_fetch_add(&calls, 1);
     if (FAULT == ABORTS) abort();
     if (FAULT == SLEEPS) nanosleep(&(struct timespec){.tv_sec = 600}, NULL);
-    if (FAULT == FAILS || (FAULT == FAILS_LATER && call > 100)) {
-        say(error, "no more numbers");
-        return CONEFIELD_FAILED;
-    }
+    if (FAULT == FAILS || (FAULT == FAILS_LATER && call > 100)) return fails(error, "no more numbers");
     for (size_t c = 0; c < 3; c++)
         for (size_t i = 0; i < x.rows; i++) {
             float v = params[c] * x.data[c * x.stride + i];

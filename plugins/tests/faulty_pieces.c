@@ -1,63 +1,14 @@
 /* A regularizer, a data term, a basis and a line field, one of them with one fault, selected by -DFAULT=…, which the host
  * or the conformance kit must detect. Without a fault they are valid: half the squares of coefficients, half the squares of
  * residuals, the voxels themselves, and one blob in the middle of the cube. */
-#include "conefield_plugin.h"
-
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
+#include "faulty.h"
 
 enum Fault {
-    NONE,
-    R_NO_PROX,
-    R_NEGATIVE,
-    R_NOT_A_NUMBER,
-    R_PAST,
-    R_BELOW,
-    R_FAILS,
-    R_NO_GRID,
-    R_ITSELF,
-    R_TWIN_STATE,
-    R_WEIGHT,
-    R_HALVED,
-    R_FORGETS,
-    R_LATER,
-    D_NO_OF,
-    D_NEGATIVE,
-    D_NOT_A_NUMBER,
-    D_PAST,
-    D_NOISE,
-    D_NO_SCAN,
-    D_STEEP,
-    D_LOW_BOUND,
-    D_LATER,
-    B_NO_COEFFICIENTS,
-    B_PAST,
-    B_UNWRITTEN,
-    B_FAILS,
-    B_LONG_ADJOINT,
-    B_LATER,
-    L_NO_LINES,
-    L_PAST,
-    L_MISSED,
-    L_LONG_ADJOINT,
+    NONE, R_NO_PROX, R_NEGATIVE, R_NOT_A_NUMBER, R_PAST, R_BELOW, R_FAILS, R_NO_GRID, R_ITSELF, R_TWIN_STATE,
+    R_WEIGHT, R_HALVED, R_FORGETS, R_LATER, D_NO_OF, D_NEGATIVE, D_NOT_A_NUMBER, D_PAST, D_NOISE, D_NO_SCAN, D_STEEP,
+    D_LOW_BOUND, D_LATER, B_NO_COEFFICIENTS, B_PAST, B_UNWRITTEN, B_FAILS, B_LONG_ADJOINT, B_LATER, L_NO_LINES,
+    L_PAST, L_MISSED, L_LONG_ADJOINT,
 };
-#ifndef FAULT
-#define FAULT NONE
-#endif
-
-#define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
-
-static void say(struct ConefieldText *out, const char *line) {
-    if (out == NULL) return;
-    out->length = strlen(line);
-    memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
-}
-
-static ConefieldStatus fails(struct ConefieldText *error, const char *line) {
-    say(error, line);
-    return CONEFIELD_FAILED;
-}
 
 /* Calls of this process. */
 static _Atomic size_t calls;
@@ -73,17 +24,6 @@ struct Stage {
     float state;
 };
 
-static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
-                              struct ConefieldText *error) {
-    (void)context, (void)settings, (void)width, (void)error;
-    *stage = calloc(1, sizeof(struct Stage));
-    return *stage == NULL ? CONEFIELD_FAILED : CONEFIELD_OK;
-}
-
-static void destroy(void *stage) {
-    free(stage);
-}
-
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
     (void)stage;
     say(text, "for tests");
@@ -96,10 +36,8 @@ static ConefieldStatus on(const void *stage, const struct ConefieldGrid *grid, v
         *made = (void *)stage;
         return CONEFIELD_OK;
     }
-    struct Stage *s = calloc(1, sizeof *s);
-    if (s == NULL) return CONEFIELD_FAILED;
-    s->grid = *grid;
-    *made = s;
+    if (make(made) != CONEFIELD_OK) return CONEFIELD_FAILED;
+    ((struct Stage *)*made)->grid = *grid;
     return CONEFIELD_OK;
 }
 
@@ -166,8 +104,7 @@ static ConefieldStatus of(const void *stage, const float *measured, const size_t
                           struct ConefieldText *error) {
     (void)stage, (void)measured, (void)shape;
     if (FAULT == D_NO_SCAN) return fails(error, "no such scan");
-    *misfit = calloc(1, sizeof(struct Stage));
-    return *misfit == NULL ? CONEFIELD_FAILED : CONEFIELD_OK;
+    return make(misfit);
 }
 
 static double noise(const void *misfit) {
@@ -338,31 +275,7 @@ static const struct ConefieldMap MAP = {
     .backproject_f64 = backproject_f64,
 };
 
-#define STAGE(code, table) \
-    { \
-        .kind = code, .name = TEXT("faulty"), .doc = TEXT("for tests"), .schema = TEXT("{\"type\":\"object\"}"), \
-        .create = create, .destroy = destroy, .describe = describe, table \
-    }
-
-static const struct ConefieldStage STAGES[] = {
-    STAGE(CONEFIELD_REGULARIZER, .regularizer = &REGULARIZER),
-    STAGE(CONEFIELD_DATA_TERM, .data_term = &DATA_TERM),
-    STAGE(CONEFIELD_BASIS, .basis = &BASIS),
-    STAGE(CONEFIELD_LINE_FIELD, .map = &MAP),
-};
-
-static const struct ConefieldPlugin PLUGIN = {
-    .size = sizeof PLUGIN,
-    .abi_major = CONEFIELD_ABI_MAJOR,
-    .abi_minor = CONEFIELD_ABI_MINOR,
-    .name = TEXT("faulty"),
-    .version = TEXT("0.1.0"),
-    .licence = TEXT("Apache-2.0 OR MIT"),
-    .stages = STAGES,
-    .stage_count = sizeof STAGES / sizeof *STAGES,
-    .stage_size = sizeof *STAGES,
-};
-
-const struct ConefieldPlugin *conefield_plugin(void) {
-    return &PLUGIN;
-}
+PLUGIN(STAGE(CONEFIELD_REGULARIZER, "for tests", .regularizer = &REGULARIZER),
+       STAGE(CONEFIELD_DATA_TERM, "for tests", .data_term = &DATA_TERM),
+       STAGE(CONEFIELD_BASIS, "for tests", .basis = &BASIS),
+       STAGE(CONEFIELD_LINE_FIELD, "for tests", .map = &MAP))

@@ -4,8 +4,9 @@
 mod device;
 
 use conefield_conformance::{
-    Options, check, check_basis, check_data_term, check_encoder, check_initializer, check_loss, check_loss_wgsl,
-    check_prior, check_prior_wgsl, check_projector, check_regularizer, check_settings, check_voxel_projector,
+    Options, Report, check, check_basis, check_data_term, check_encoder, check_initializer, check_loss,
+    check_loss_wgsl, check_prior, check_prior_wgsl, check_projector, check_regularizer, check_settings,
+    check_voxel_projector,
 };
 use conefield_core::arena::{Arena, InitReport, Layout};
 use conefield_core::basis::{Basis, BasisOperator, Expansion};
@@ -26,6 +27,7 @@ use conefield_core::wgsl::Fragment;
 use conefield_core::{Error, Result};
 use conefield_projectors::voxel::{Joseph, Siddon};
 use ndarray::{ArrayView3, ArrayViewMut3};
+use std::fmt::Debug;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 
@@ -284,6 +286,16 @@ fn quietly<T>(f: impl FnOnce() -> T) -> T {
     result
 }
 
+/// Each fault fails its property, and what is sound passes.
+fn each_fails<F: Copy + Debug>(sound: F, faults: &[(F, &str)], check: impl Fn(F) -> Report) {
+    let report = check(sound);
+    assert!(report.passed(), "{report}");
+    for &(fault, property) in faults {
+        let report = quietly(|| check(fault));
+        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
+    }
+}
+
 #[test]
 fn every_fault_fails_its_property_and_the_sound_stage_none() {
     let faults = [
@@ -319,12 +331,7 @@ fn every_fault_fails_its_property_and_the_sound_stage_none() {
         (Fault::FallingResolutions, "resolutions"),
         (Fault::OtherResolutions, "resolutions"),
     ];
-    let sound = check_encoder(&Toy::new(Fault::None), &Options::encoder());
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in faults {
-        let report = quietly(|| check_encoder(&Toy::new(fault), &Options::encoder()));
-        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
-    }
+    each_fails(Fault::None, &faults, |fault| check_encoder(&Toy::new(fault), &Options::encoder()));
 }
 
 #[test]
@@ -343,16 +350,12 @@ fn faults_of_one_kind_leave_the_other_properties_alone() {
 #[test]
 fn a_stage_in_single_precision_only_is_differenced_coarsely() {
     let toy = |fault| Toy { double: false, ..Toy::new(fault) };
-    let sound = check_encoder(&toy(Fault::None), &Options::encoder());
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in [
+    let faults = [
         (Fault::Forgotten, "finite differences: parameters"),
         (Fault::LastRow, "finite differences: parameters"),
         (Fault::InputGradient, "finite differences: inputs"),
-    ] {
-        let report = check(&toy(fault), &Options::encoder());
-        assert!(report.failed().contains(&property), "{report}");
-    }
+    ];
+    each_fails(Fault::None, &faults, |fault| check_encoder(&toy(fault), &Options::encoder()));
 }
 
 #[test]
@@ -449,9 +452,7 @@ impl VoxelProjector for VoxelFault {
 
 #[test]
 fn every_fault_of_a_voxel_projector_fails_its_property() {
-    let sound = check_voxel_projector(&VoxelFault::None);
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in [
+    let faults = [
         (VoxelFault::OtherAdjoint, "adjoint: double precision"),
         (VoxelFault::LongAdjoint, "adjoint: single precision"),
         (VoxelFault::LongAdjoint, "adjoint: double precision"),
@@ -467,10 +468,8 @@ fn every_fault_of_a_voxel_projector_fails_its_property() {
         (VoxelFault::Rounds, "linear"),
         (VoxelFault::NotANumber, "finite"),
         (VoxelFault::Panics, "closed form"),
-    ] {
-        let report = quietly(|| check_voxel_projector(&fault));
-        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
-    }
+    ];
+    each_fails(VoxelFault::None, &faults, |fault| check_voxel_projector(&fault));
     // Faults that keep to all else fail nothing else.
     for (fault, properties) in [
         (VoxelFault::Longer, &["closed form"][..]),
@@ -586,9 +585,7 @@ impl Projector for ToyRays {
 #[test]
 fn every_fault_of_a_ray_projector_fails_its_property() {
     let toy = |fault| ToyRays { fault, samples: 10, calls: AtomicU32::new(0) };
-    let sound = check_projector(&toy(RayFault::None));
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in [
+    let faults = [
         (RayFault::TooMany, "samples are bounded"),
         (RayFault::LostWeight, "samples are bounded"),
         (RayFault::NotANumber, "samples are finite"),
@@ -603,10 +600,8 @@ fn every_fault_of_a_ray_projector_fails_its_property() {
         (RayFault::FitsUnsound, "fitted to a scene"),
         (RayFault::FitsAnew, "fitted to a scene"),
         (RayFault::FitsNot, "fitted to a scene"),
-    ] {
-        let report = quietly(|| check_projector(&toy(fault)));
-        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
-    }
+    ];
+    each_fails(RayFault::None, &faults, |fault| check_projector(&toy(fault)));
 }
 
 /// What is wrong with an initializer.
@@ -665,18 +660,14 @@ impl Initializer for ToyWeights {
 #[test]
 fn every_fault_of_an_initializer_fails_its_property() {
     let toy = |fault| ToyWeights { fault, calls: AtomicU32::new(0) };
-    let sound = check_initializer(&toy(WeightFault::None));
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in [
+    let faults = [
         (WeightFault::Silent, "leaves the rest alone"),
         (WeightFault::Forgets, "applies"),
         (WeightFault::Infinite, "finite"),
         (WeightFault::Remembers, "repeatable"),
         (WeightFault::Refuses, "applies"),
-    ] {
-        let report = check_initializer(&toy(fault));
-        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
-    }
+    ];
+    each_fails(WeightFault::None, &faults, |fault| check_initializer(&toy(fault)));
 }
 
 /// What is wrong with a loss.
@@ -768,9 +759,7 @@ impl Loss for ToyLoss {
 
 #[test]
 fn every_fault_of_a_loss_fails_its_property() {
-    let sound = check_loss(&ToyLoss::new(LossFault::None));
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in [
+    let faults = [
         (LossFault::Derivative, "finite differences"),
         (LossFault::Away, "least where values agree"),
         (LossFault::Offset, "least where values agree"),
@@ -782,10 +771,8 @@ fn every_fault_of_a_loss_fails_its_property() {
         (LossFault::Grows, "learns from a scan"),
         (LossFault::Reports, "no fault"),
         (LossFault::Panics, "finite differences"),
-    ] {
-        let report = quietly(|| check_loss(&ToyLoss::new(fault)));
-        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
-    }
+    ];
+    each_fails(LossFault::None, &faults, |fault| check_loss(&ToyLoss::new(fault)));
     assert_eq!(check_loss(&ToyLoss::new(LossFault::Derivative)).failed(), ["finite differences"]);
 }
 
@@ -873,9 +860,7 @@ impl Prior for ToyPrior {
 #[test]
 fn every_fault_of_a_prior_fails_its_property() {
     let toy = |fault| ToyPrior { fault, calls: AtomicU32::new(0) };
-    let sound = check_prior(&toy(PriorFault::None));
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in [
+    let faults = [
         (PriorFault::Forgotten, "finite differences"),
         (PriorFault::Overwrites, "gradients add"),
         (PriorFault::Unscaled, "scale"),
@@ -886,10 +871,8 @@ fn every_fault_of_a_prior_fails_its_property() {
         (PriorFault::Remembers, "repeatable"),
         (PriorFault::NoBlocks, "blocks"),
         (PriorFault::Reports, "no fault"),
-    ] {
-        let report = quietly(|| check_prior(&toy(fault)));
-        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
-    }
+    ];
+    each_fails(PriorFault::None, &faults, |fault| check_prior(&toy(fault)));
     assert_eq!(check_prior(&toy(PriorFault::Forgotten)).failed(), ["finite differences"]);
 }
 
@@ -1029,9 +1012,7 @@ impl<R: Real> BasisOperator<R> for BasisOn {
 
 #[test]
 fn every_fault_of_a_basis_fails_its_property() {
-    let sound = check_basis(&BasisFault::None);
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in [
+    let faults = [
         (BasisFault::Refuses, "builds"),
         (BasisFault::CountsMillimetres, "builds"),
         (BasisFault::LongAdjoint, "adjoint: double precision"),
@@ -1044,10 +1025,8 @@ fn every_fault_of_a_basis_fails_its_property() {
         (BasisFault::Doubles, "samples"),
         (BasisFault::Threads, "threads"),
         (BasisFault::Fails, "no fault"),
-    ] {
-        let report = quietly(|| check_basis(&fault));
-        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
-    }
+    ];
+    each_fails(BasisFault::None, &faults, |fault| check_basis(&fault));
     assert_eq!(check_basis(&BasisFault::Doubles).failed(), ["samples"]);
 }
 
@@ -1137,9 +1116,7 @@ impl Penalty for PenaltyOn {
 
 #[test]
 fn every_fault_of_a_regularizer_fails_its_property() {
-    let sound = check_regularizer(&RegularizerFault::None);
-    assert!(sound.passed(), "{sound}");
-    for (fault, property) in [
+    let faults = [
         (RegularizerFault::Halved, "proximal map"),
         (RegularizerFault::Grows, "nonexpansive"),
         (RegularizerFault::Concave, "convex"),
@@ -1152,10 +1129,8 @@ fn every_fault_of_a_regularizer_fails_its_property() {
         (RegularizerFault::Uncounted, "tally"),
         (RegularizerFault::Threads, "threads"),
         (RegularizerFault::Fails, "no fault"),
-    ] {
-        let report = quietly(|| check_regularizer(&fault));
-        assert!(report.failed().contains(&property), "{fault:?} passed {property:?}:\n{report}");
-    }
+    ];
+    each_fails(RegularizerFault::None, &faults, |fault| check_regularizer(&fault));
     assert_eq!(check_regularizer(&RegularizerFault::Uncounted).failed(), ["tally"]);
 }
 

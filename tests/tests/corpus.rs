@@ -29,8 +29,7 @@ fn every_reader_has_its_fuzz_target() {
     let bins = manifest["bin"].as_array().unwrap();
     let names: Vec<&str> = bins.iter().map(|b| b["name"].as_str().unwrap()).collect();
     assert_eq!(names, PARSERS.iter().map(|p| p.name).collect::<Vec<_>>());
-    for name in names {
-        let target = std::fs::read_to_string(fuzz.join(format!("fuzz_targets/{name}.rs"))).unwrap();
-        assert!(target.contains(&format!("target!(\"{name}\")")), "{target}");
+    for bin in bins {
+        assert!(fuzz.join(bin["path"].as_str().unwrap()).is_file(), "{bin}");
     }
 }

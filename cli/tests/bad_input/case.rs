@@ -50,6 +50,14 @@ pub fn refused(
     Case { what, make: Box::new(make), args, end: End::Refused, says, memory: Some(USUAL) }
 }
 
+/// A table of inputs that must be refused, a row each: the arguments of [`refused`], then how the case differs.
+macro_rules! table {
+    ($($what:expr, $make:expr, $args:expr, [$($says:expr),*] $(.$change:ident($to:expr))*;)*) => {
+        vec![$($crate::case::refused($what, $make, $args, &[$($says),*])$(.$change($to))*),*]
+    };
+}
+pub(crate) use table;
+
 impl Case {
     /// The same with another outcome.
     pub fn ends(self, end: End) -> Self {
@@ -207,6 +215,14 @@ pub fn replaced(
         let text = fs::read_to_string(dir.join(file)).unwrap();
         assert!(text.contains(from), "{from} is not in {file}:\n{text}");
         put(dir.join(file), text.replacen(from, to, 1));
+    }
+}
+
+/// Creates `seed`, then does `more`.
+pub fn then(seed: fn(&Path), more: impl Fn(&Path) + Sync + Send + 'static) -> impl Fn(&Path) + Sync + Send {
+    move |dir| {
+        seed(dir);
+        more(dir);
     }
 }
 

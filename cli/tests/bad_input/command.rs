@@ -1,6 +1,6 @@
 //! Values on the command line, and the small files that they may name.
 
-use crate::case::{Case, End, put, refused};
+use crate::case::{Case, End, put, refused, table, then};
 use conefield_tests::hostile::seeds::{nifti, npy_bytes, scan_toml};
 use std::path::Path;
 
@@ -23,7 +23,7 @@ const SEGMENT: &str = "evaluate a.nii a.nii --segmenter './segment {in} {out}'";
 
 pub fn cases() -> Vec<Case> {
     let wrong = |what, args, says| refused(what, none, args, says).ends(End::WrongUse);
-    vec![
+    let mut all = vec![
         wrong("no command", "--quiet", &[]),
         wrong("an unknown command", "recontsruct scan", &["recontsruct"]),
         wrong("no threads", "backends --threads 0", &["--threads"]),
@@ -56,176 +56,72 @@ pub fn cases() -> Vec<Case> {
             &["dso", "object's size", "offset-u"],
         ),
         wrong("every view held out", "reconstruct scan --spec fast -o run --hold-out every:1", &["every:10"]),
-        refused("a phantom that is not known", none, "simulate phantom:hand -o scan", &["`hand`", "`head`"]),
-        refused(
-            "a phantom of 10^9 voxels a side",
-            none,
-            "simulate phantom:head:1000000000 -o scan",
-            &["1000000000", "8 to 1024"],
-        ),
-        refused(
-            "4 billion views",
-            none,
-            "simulate phantom:head:16 -o scan --views 4294967295",
-            &["views", "4294967295", "at most 1000000"],
-        ),
-        refused(
-            "a detector past 2^64",
-            none,
-            "simulate phantom:head:16 -o scan --detector 4294967296x4294967296",
-            &["detector", "addressed"],
-        ),
-        refused(
-            "a detector past memory",
-            none,
-            "simulate phantom:head:16 -o scan --detector 1000000x1000000",
-            &["memory", "--memory allows 1.0 GiB"],
-        ),
-        refused(
-            "blocks larger than the volume",
-            none,
-            "simulate phantom:head:16 -o scan --downsample 65535",
-            &["factor", "65535"],
-        ),
-        refused("a protocol that is missing", none, "simulate phantom:head:16 -o scan --protocol p.toml", &["p.toml"]),
-        refused(
-            "a protocol with a misspelt key",
-            |d| put(d.join("p.toml"), "dso = 5.0\nddd = 3.0\n"),
-            "simulate phantom:head:16 -o scan --protocol p.toml",
-            &["p.toml:2", "ddd"],
-        ),
-        refused(
-            "a protocol of bytes",
-            |d| put(d.join("p.toml"), [0xff, 0xfe, 0]),
-            "simulate phantom:head:16 -o scan --protocol p.toml",
-            &["p.toml", "UTF-8"],
-        ),
-        refused(
-            "angles that are words",
-            |d| put(d.join("angles.txt"), "0\n10\nten\n"),
-            "simulate phantom:head:16 -o scan --angles angles.txt",
-            &["angles.txt:3", "ten"],
-        ),
-        refused(
-            "angles that are infinite",
-            |d| put(d.join("angles.txt"), "0\ninf\n"),
-            "simulate phantom:head:16 -o scan --angles angles.txt",
-            &["angles.txt:2", "inf"],
-        ),
-        refused(
-            "a list without angles",
-            |d| put(d.join("angles.txt"), "# none\n"),
-            "simulate phantom:head:16 -o scan --angles angles.txt",
-            &["angles", "at least one view"],
-        ),
-        refused(
-            "a volume of another shape than the reference",
-            |d| {
-                nifti(d);
-                put(d.join("b.npy"), npy_bytes("<f4", "(1, 1, 1)", &[0; 4]));
-            },
-            "evaluate a.nii b.npy",
-            &["[4, 3, 2]", "[1, 1, 1]"],
-        ),
-        refused(
-            "a label map with halves",
-            segmenter(""),
-            "evaluate half.npy half.npy --labels",
-            &["half.npy", "voxel [0, 0, 0]", "0.5", "whole number"],
-        ),
-        refused(
-            "label maps of two shapes",
-            segmenter(""),
-            "evaluate one.npy zero.npy --labels",
-            &["one.npy", "[1, 1, 1]", "[4, 3, 2]"],
-        ),
-        refused(
-            "a segmenter that is not there",
-            nifti,
-            "evaluate a.nii a.nii --segmenter './segment {in} {out}'",
-            &["segmenter ./segment", "No such file"],
-        ),
-        refused(
-            "a segmenter that fails",
-            segmenter("echo loading >&2; echo no weights here >&2; exit 3"),
-            SEGMENT,
-            &["given a.nii", "exit status: 3", "loading | no weights here"],
-        ),
-        refused("a segmenter that writes nothing", segmenter(""), SEGMENT, &["no file", "{out}", "it printed nothing"]),
-        refused("a segmenter that writes text", segmenter("echo hello > $2"), SEGMENT, &["cannot be used", "{out}"]),
-        refused(
-            "a segmenter that writes another shape",
-            segmenter("cp one.npy $2"),
-            SEGMENT,
-            &["the label map of a.nii", "1 voxels", "24"],
-        ),
-        refused(
-            "a segmenter that writes halves",
-            segmenter("cp half.npy $2"),
-            SEGMENT,
-            &["the label map of a.nii", "voxel [0, 0, 0]", "0.5"],
-        ),
-        refused("features of a run that is not there", none, "features run -o f.png", &["run"]),
-        refused("a name without a known end to write", nifti, "convert a.nii b.png", &["b.png", ".nii.gz"]),
-        refused("a folder that does not exist to write in", nifti, "convert a.nii no/b.nii", &["no/b.nii"]),
-        refused(
-            "an output that stands there",
-            |d| {
-                nifti(d);
-                put(d.join("b.nii"), "mine");
-            },
-            "convert a.nii b.nii",
-            &["b.nii", "--force"],
-        ),
-        refused(
-            "patience without held-out views",
-            scan_toml,
+    ];
+    all.extend(table! {
+        "a phantom that is not known", none, "simulate phantom:hand -o scan", ["`hand`", "`head`"];
+        "a phantom of 10^9 voxels a side", none,
+            "simulate phantom:head:1000000000 -o scan", ["1000000000", "8 to 1024"];
+        "4 billion views", none,
+            "simulate phantom:head:16 -o scan --views 4294967295", ["views", "4294967295", "at most 1000000"];
+        "a detector past 2^64", none,
+            "simulate phantom:head:16 -o scan --detector 4294967296x4294967296", ["detector", "addressed"];
+        "a detector past memory", none,
+            "simulate phantom:head:16 -o scan --detector 1000000x1000000", ["memory", "--memory allows 1.0 GiB"];
+        "blocks larger than the volume", none,
+            "simulate phantom:head:16 -o scan --downsample 65535", ["factor", "65535"];
+        "a protocol that is missing", none, "simulate phantom:head:16 -o scan --protocol p.toml", ["p.toml"];
+        "a protocol with a misspelt key", |d| put(d.join("p.toml"), "dso = 5.0\nddd = 3.0\n"),
+            "simulate phantom:head:16 -o scan --protocol p.toml", ["p.toml:2", "ddd"];
+        "a protocol of bytes", |d| put(d.join("p.toml"), [0xff, 0xfe, 0]),
+            "simulate phantom:head:16 -o scan --protocol p.toml", ["p.toml", "UTF-8"];
+        "angles that are words", |d| put(d.join("angles.txt"), "0\n10\nten\n"),
+            "simulate phantom:head:16 -o scan --angles angles.txt", ["angles.txt:3", "ten"];
+        "angles that are infinite", |d| put(d.join("angles.txt"), "0\ninf\n"),
+            "simulate phantom:head:16 -o scan --angles angles.txt", ["angles.txt:2", "inf"];
+        "a list without angles", |d| put(d.join("angles.txt"), "# none\n"),
+            "simulate phantom:head:16 -o scan --angles angles.txt", ["angles", "at least one view"];
+        "a volume of another shape than the reference",
+            then(nifti, |d| put(d.join("b.npy"), npy_bytes("<f4", "(1, 1, 1)", &[0; 4]))),
+            "evaluate a.nii b.npy", ["[4, 3, 2]", "[1, 1, 1]"];
+        "a label map with halves", segmenter(""),
+            "evaluate half.npy half.npy --labels", ["half.npy", "voxel [0, 0, 0]", "0.5", "whole number"];
+        "label maps of two shapes", segmenter(""),
+            "evaluate one.npy zero.npy --labels", ["one.npy", "[1, 1, 1]", "[4, 3, 2]"];
+        "a segmenter that is not there", nifti,
+            "evaluate a.nii a.nii --segmenter './segment {in} {out}'", ["segmenter ./segment", "No such file"];
+        "a segmenter that fails", segmenter("echo loading >&2; echo no weights here >&2; exit 3"),
+            SEGMENT, ["given a.nii", "exit status: 3", "loading | no weights here"];
+        "a segmenter that writes nothing", segmenter(""), SEGMENT, ["no file", "{out}", "it printed nothing"];
+        "a segmenter that writes text", segmenter("echo hello > $2"), SEGMENT, ["cannot be used", "{out}"];
+        "a segmenter that writes another shape", segmenter("cp one.npy $2"),
+            SEGMENT, ["the label map of a.nii", "1 voxels", "24"];
+        "a segmenter that writes halves", segmenter("cp half.npy $2"),
+            SEGMENT, ["the label map of a.nii", "voxel [0, 0, 0]", "0.5"];
+        "features of a run that is not there", none, "features run -o f.png", ["run"];
+        "a name without a known end to write", nifti, "convert a.nii b.png", ["b.png", ".nii.gz"];
+        "a folder that does not exist to write in", nifti, "convert a.nii no/b.nii", ["no/b.nii"];
+        "an output that stands there", then(nifti, |d| put(d.join("b.nii"), "mine")),
+            "convert a.nii b.nii", ["b.nii", "--force"];
+        "patience without held-out views", scan_toml,
             "reconstruct scan --spec fast -o run --set callbacks.1.type=patience",
-            &["--set callbacks.1.type=patience", "no held-out views", "--hold-out every:10"],
-        ),
-        refused(
-            "patience of voxels without held-out views",
-            scan_toml,
+            ["--set callbacks.1.type=patience", "no held-out views", "--hold-out every:10"];
+        "patience of voxels without held-out views", scan_toml,
             "compare scan --specs sirt -o all --set stop={passes=5,patience=3}",
-            &["stop.patience", "no held-out views", "--hold-out every:10"],
-        ),
-        refused(
-            "a held-out view that does not exist",
-            scan_toml,
-            "reconstruct scan --spec fast -o run --hold-out 3",
-            &["found 3", "below 3"],
-        ),
-        refused(
-            "no step",
-            scan_toml,
-            "reconstruct scan --spec fast -o run --set training.steps=0",
-            &["training.steps", "at least 1"],
-        ),
-        refused(
-            "windows of more pixels than a step has rays",
-            scan_toml,
+            ["stop.patience", "no held-out views", "--hold-out every:10"];
+        "a held-out view that does not exist", scan_toml,
+            "reconstruct scan --spec fast -o run --hold-out 3", ["found 3", "below 3"];
+        "no step", scan_toml,
+            "reconstruct scan --spec fast -o run --set training.steps=0", ["training.steps", "at least 1"];
+        "windows of more pixels than a step has rays", scan_toml,
             "reconstruct scan --spec fast -o run --set training.windows={count=100,side=8}",
-            &["training.windows.count", "100"],
-        ),
-        refused("a correction that is not known", scan_toml, "convert scan out --correct ring", &["ring"]),
-        refused(
-            "a correction with a setting that it does not have",
-            scan_toml,
-            "convert scan out --correct rings.size=5",
-            &["size", "window"],
-        ),
-        refused(
-            "a correction with a setting out of range",
-            scan_toml,
-            "convert scan out --correct rings.window=4",
-            &["rings.window", "odd"],
-        ),
-        refused("a correction of a volume", nifti, "convert a.nii out.npy --correct flux", &["--correct"]),
-        refused(
-            "all views held out",
-            scan_toml,
-            "reconstruct scan --spec fast -o run --hold-out 0,1,2",
-            &["at least one view"],
-        ),
-    ]
+            ["training.windows.count", "100"];
+        "a correction that is not known", scan_toml, "convert scan out --correct ring", ["ring"];
+        "a correction with a setting that it does not have", scan_toml,
+            "convert scan out --correct rings.size=5", ["size", "window"];
+        "a correction with a setting out of range", scan_toml,
+            "convert scan out --correct rings.window=4", ["rings.window", "odd"];
+        "a correction of a volume", nifti, "convert a.nii out.npy --correct flux", ["--correct"];
+        "all views held out", scan_toml, "reconstruct scan --spec fast -o run --hold-out 0,1,2", ["at least one view"];
+    });
+    all
 }

@@ -1,7 +1,7 @@
 //! Small files that claim or unpack to much. Memory is drawn from one allowance as it is allocated, whatever a header,
 //! a packed size or an estimate says; work that grows faster than its input has its own limit.
 
-use crate::case::{Case, put, refused};
+use crate::case::{Case, put, table};
 use conefield_tests::hostile::seeds;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -126,98 +126,40 @@ fn extreme(d: &Path) {
 
 pub fn cases() -> Vec<Case> {
     const SCAN: &str = "reconstruct scan --spec fdk -o run";
-    vec![
-        refused(
-            "weights of a few bytes whose notes name a network of 137 GB",
-            huge_network("[]"),
-            "export w.safetensors -o v.npy",
-            &["w.safetensors", "found nothing", "a tensor of shape"],
-        ),
-        refused(
-            "the same with a mask, which leaves less of it",
-            huge_network("[[0]]"),
-            "export w.safetensors -o v.npy",
-            &["parameters", "--memory"],
-        ),
-        refused(
-            "weights of attenuation below 0",
-            placed("-0.02", "1.0"),
-            "export w.safetensors -o v.npy",
-            &["w.safetensors", "placement.attenuation: found -0.02", "above 0"],
-        ),
-        refused(
-            "weights of a unit below 0",
-            placed("0.02", "-1.0"),
-            "export w.safetensors -o v.npy",
-            &["w.safetensors", "placement.unit_mm: found -1", "above 0"],
-        ),
-        refused(
-            "DICOM run lengths of 4 MB that stand for 268 MB of zeros",
-            |d| seeds::dicom_of_zeros(d, 8192),
-            "info series",
-            &["memory", "200 MiB"],
-        )
-        .memory(Some("200MiB")),
-        refused(
-            "DICOM run lengths that stand for more than there is",
-            |d| seeds::dicom_of_zeros(d, 16384),
-            "convert series out.npy",
-            &["memory"],
-        )
-        .memory(None),
-        refused(
-            "a TIFF of 0.1 MB that unpacks to 96 MB",
-            |d| seeds::scanner_tiff_of_zeros(d, 4000),
-            "import scanner.toml -o scan",
-            &["memory: needs", "200 MiB"],
-        )
-        .memory(Some("200MiB")),
-        refused(
-            "the same, asked about",
-            |d| seeds::scanner_tiff_of_zeros(d, 4000),
-            "info scanner.toml",
-            &["memory: needs", "200 MiB"],
-        )
-        .memory(Some("200MiB")),
-        refused("16 packed projections of 0.13 MB, 134 MB each", packed_r2, "info r2", &["memory"]).memory(None),
-        refused(
-            "a packed volume of 64 kB, 256 MB, as a reference",
-            packed_nifti,
+    table! {
+        "weights of a few bytes whose notes name a network of 137 GB", huge_network("[]"),
+            "export w.safetensors -o v.npy", ["w.safetensors", "found nothing", "a tensor of shape"];
+        "the same with a mask, which leaves less of it", huge_network("[[0]]"),
+            "export w.safetensors -o v.npy", ["parameters", "--memory"];
+        "weights of attenuation below 0", placed("-0.02", "1.0"),
+            "export w.safetensors -o v.npy", ["w.safetensors", "placement.attenuation: found -0.02", "above 0"];
+        "weights of a unit below 0", placed("0.02", "-1.0"),
+            "export w.safetensors -o v.npy", ["w.safetensors", "placement.unit_mm: found -1", "above 0"];
+        "DICOM run lengths of 4 MB that stand for 268 MB of zeros", |d| seeds::dicom_of_zeros(d, 8192),
+            "info series", ["memory", "200 MiB"].memory(Some("200MiB"));
+        "DICOM run lengths that stand for more than there is", |d| seeds::dicom_of_zeros(d, 16384),
+            "convert series out.npy", ["memory"].memory(None);
+        "a TIFF of 0.1 MB that unpacks to 96 MB", |d| seeds::scanner_tiff_of_zeros(d, 4000),
+            "import scanner.toml -o scan", ["memory: needs", "200 MiB"].memory(Some("200MiB"));
+        "the same, asked about", |d| seeds::scanner_tiff_of_zeros(d, 4000),
+            "info scanner.toml", ["memory: needs", "200 MiB"].memory(Some("200MiB"));
+        "16 packed projections of 0.13 MB, 134 MB each", packed_r2, "info r2", ["memory"].memory(None);
+        "a packed volume of 64 kB, 256 MB, as a reference", packed_nifti,
             "reconstruct scan --spec sirt -o run --reference b.nii.gz",
-            &["b.nii.gz", "data", "--memory"],
-        )
-        .memory(Some("60MiB")),
-        refused(
-            "the same to start from",
-            packed_nifti,
-            "reconstruct scan --spec sirt -o run --init b.nii.gz",
-            &["memory: needs", "60.0 MiB"],
-        )
-        .memory(Some("60MiB")),
-        refused("the same to score", packed_nifti, "evaluate b.nii.gz b.nii.gz", &["memory: needs", "60.0 MiB"])
-            .memory(Some("60MiB")),
-        refused("a demo in 40 MiB", |_| {}, "demo -o out", &["memory: needs", "40.0 MiB"]).memory(Some("40MiB")),
-        refused(
-            "a packed array of 60 kB as a volume",
-            |d| packed_npy(d, "z.npy", "(400, 400, 400)", 64_000_000),
-            "info z.npy",
-            &["memory: needs", "60.0 MiB"],
-        )
-        .memory(Some("60MiB")),
-        refused(
-            "a pickle of 40 000 times the same key",
-            |d| repeated_keys(d, 40_000),
-            "info scan.pickle",
-            &["scan.pickle", "keys", "at most 1024"],
-        ),
-        refused(
-            "RTK's geometry of 500 000 views, the last one wrong",
-            |d| many_views(d, 500_000),
-            "info geometry.xml",
-            &["line 500002", "SourceToDetectorDistance"],
-        ),
-        refused("specs that extend two others each", doubling, "explain 0.toml", &["extends", "256"]),
-        refused("10 000 specs, each over the next", long_chain, "explain 0.toml", &["extends", "32 specs"]),
-        refused("a line integral at the end of single precision", extreme, SCAN, &["projections[1, 2, 3]", "1e15"]),
-    ]
+            ["b.nii.gz", "data", "--memory"].memory(Some("60MiB"));
+        "the same to start from", packed_nifti,
+            "reconstruct scan --spec sirt -o run --init b.nii.gz", ["memory: needs", "60.0 MiB"].memory(Some("60MiB"));
+        "the same to score", packed_nifti,
+            "evaluate b.nii.gz b.nii.gz", ["memory: needs", "60.0 MiB"].memory(Some("60MiB"));
+        "a demo in 40 MiB", |_| {}, "demo -o out", ["memory: needs", "40.0 MiB"].memory(Some("40MiB"));
+        "a packed array of 60 kB as a volume", |d| packed_npy(d, "z.npy", "(400, 400, 400)", 64_000_000),
+            "info z.npy", ["memory: needs", "60.0 MiB"].memory(Some("60MiB"));
+        "a pickle of 40 000 times the same key", |d| repeated_keys(d, 40_000),
+            "info scan.pickle", ["scan.pickle", "keys", "at most 1024"];
+        "RTK's geometry of 500 000 views, the last one wrong", |d| many_views(d, 500_000),
+            "info geometry.xml", ["line 500002", "SourceToDetectorDistance"];
+        "specs that extend two others each", doubling, "explain 0.toml", ["extends", "256"];
+        "10 000 specs, each over the next", long_chain, "explain 0.toml", ["extends", "32 specs"];
+        "a line integral at the end of single precision", extreme, SCAN, ["projections[1, 2, 3]", "1e15"];
+    }
 }

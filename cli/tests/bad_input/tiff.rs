@@ -1,6 +1,6 @@
 //! TIFF stacks, through a scanner's description.
 
-use crate::case::{Case, End, changed, cut, cut_end, put, refused};
+use crate::case::{Case, End, changed, cut, cut_end, put, refused, replaced, table};
 use conefield_tests::hostile::seeds::{
     CIRCLE, scanner_tiff, scanner_tiff_deflate, scanner_tiff_lzw, scanner_tiff_zstd, scanner_toml,
 };
@@ -71,157 +71,86 @@ fn hnd(what: &'static str, args: &'static str) -> Case {
 }
 
 pub fn cases() -> Vec<Case> {
-    vec![
-        refused("an empty file", changed(scanner_tiff, FILE, cut(0)), IMPORT, &["counts.tif"]),
-        refused("cut within the mark", changed(scanner_tiff, FILE, cut(6)), IMPORT, &["counts.tif"]),
-        refused("cut in the middle", changed(scanner_tiff, FILE, |b| b.truncate(b.len() / 2)), IMPORT, &["counts.tif"]),
-        refused("cut at the end", changed(scanner_tiff_lzw, FILE, cut_end(10)), IMPORT, &["counts.tif"]),
-        refused(
-            "a first page far behind the end",
-            changed(scanner_tiff, FILE, |b| b[4..8].fill(0x7f)),
-            IMPORT,
-            &["counts.tif"],
-        ),
-        refused("no columns", entry(256, |e| e[6..].fill(0)), IMPORT, &["counts.tif"]),
-        refused("4 billion columns", entry(256, |e| e[6..].fill(255)), IMPORT, &["page 0", "4294967295 pixels"]),
-        refused("an entry of 4 GB", entry(273, |e| e[2..6].fill(255)), IMPORT, &["page 0", "in the entry 273"]),
-        refused("a packing that does not exist", entry(259, |e| e[6] = 77), IMPORT, &["counts.tif"]),
-        refused(
-            "packed data that is damaged",
-            changed(scanner_tiff_deflate, FILE, |b| b[12..30].fill(0xff)),
-            IMPORT,
-            &["counts.tif"],
-        ),
-        refused(
-            "Zstandard that is damaged",
-            changed(scanner_tiff_zstd, FILE, |b| {
-                let start = b.windows(4).position(|w| w == [0x28, 0xb5, 0x2f, 0xfd]).expect("a stream of the seed");
-                b[start + 6..start + 20].fill(0xff);
-            }),
-            IMPORT,
-            &["counts.tif", "Zstandard"],
-        ),
-        refused(
-            "colours",
-            image::<colortype::RGB8>(2, 1, vec![1; 6], Compression::Uncompressed),
-            IMPORT,
-            &["page 0", "RGB", "grey"],
-        ),
-        refused(
-            "a pixel that is NaN",
-            image::<colortype::Gray32Float>(2, 1, vec![1.0, f32::NAN], Compression::Uncompressed),
-            IMPORT,
-            &["row 0, column 1", "NaN"],
-        ),
-        refused(
-            "a page of another size",
-            |d| {
-                scanner_tiff(d);
-                let mut file = Cursor::new(Vec::new());
-                let mut w = TiffEncoder::new(&mut file).unwrap();
-                w.write_image::<colortype::Gray8>(3, 2, &[1; 6]).unwrap();
-                w.write_image::<colortype::Gray8>(2, 3, &[1; 6]).unwrap();
-                put(d.join(FILE), file.into_inner());
-            },
-            IMPORT,
-            &["page 1", "size of the first page"],
-        ),
-        refused(
-            "fewer pages than angles",
-            |d| {
-                scanner_tiff(d);
-                put(
-                    d.join("scanner.toml"),
-                    scanner_toml(FILE, CIRCLE).replace("range_deg = 360.0", "angles_deg = [0, 90, 180, 270]"),
-                );
-            },
-            IMPORT,
-            &["circle.angles_deg", "4 of them", "expected 3"],
-        ),
-        refused(
-            "deflate bomb: 90 million zeros in 90 kB",
+    let mut all = table! {
+        "an empty file", changed(scanner_tiff, FILE, cut(0)), IMPORT, ["counts.tif"];
+        "cut within the mark", changed(scanner_tiff, FILE, cut(6)), IMPORT, ["counts.tif"];
+        "cut in the middle", changed(scanner_tiff, FILE, |b| b.truncate(b.len() / 2)), IMPORT, ["counts.tif"];
+        "cut at the end", changed(scanner_tiff_lzw, FILE, cut_end(10)), IMPORT, ["counts.tif"];
+        "a first page far behind the end", changed(scanner_tiff, FILE, |b| b[4..8].fill(0x7f)), IMPORT, ["counts.tif"];
+        "no columns", entry(256, |e| e[6..].fill(0)), IMPORT, ["counts.tif"];
+        "4 billion columns", entry(256, |e| e[6..].fill(255)), IMPORT, ["page 0", "4294967295 pixels"];
+        "an entry of 4 GB", entry(273, |e| e[2..6].fill(255)), IMPORT, ["page 0", "in the entry 273"];
+        "a packing that does not exist", entry(259, |e| e[6] = 77), IMPORT, ["counts.tif"];
+        "packed data that is damaged", changed(scanner_tiff_deflate, FILE, |b| b[12..30].fill(0xff)),
+            IMPORT, ["counts.tif"];
+        "Zstandard that is damaged", changed(scanner_tiff_zstd, FILE, |b| {
+            let start = b.windows(4).position(|w| w == [0x28, 0xb5, 0x2f, 0xfd]).expect("a stream of the seed");
+            b[start + 6..start + 20].fill(0xff);
+        }), IMPORT, ["counts.tif", "Zstandard"];
+        "colours", image::<colortype::RGB8>(2, 1, vec![1; 6], Compression::Uncompressed),
+            IMPORT, ["page 0", "RGB", "grey"];
+        "a pixel that is NaN", image::<colortype::Gray32Float>(2, 1, vec![1.0, f32::NAN], Compression::Uncompressed),
+            IMPORT, ["row 0, column 1", "NaN"];
+        "a page of another size", |d| {
+            scanner_tiff(d);
+            let mut file = Cursor::new(Vec::new());
+            let mut w = TiffEncoder::new(&mut file).unwrap();
+            w.write_image::<colortype::Gray8>(3, 2, &[1; 6]).unwrap();
+            w.write_image::<colortype::Gray8>(2, 3, &[1; 6]).unwrap();
+            put(d.join(FILE), file.into_inner());
+        }, IMPORT, ["page 1", "size of the first page"];
+        "fewer pages than angles",
+            replaced(scanner_tiff, "scanner.toml", "range_deg = 360.0", "angles_deg = [0, 90, 180, 270]"),
+            IMPORT, ["circle.angles_deg", "4 of them", "expected 3"];
+        "deflate bomb: 90 million zeros in 90 kB",
             image::<colortype::Gray8>(9000, 10000, vec![0; 90_000_000], Compression::Deflate(Default::default())),
-            IMPORT,
-            &["page 0", "100 times"],
-        ),
-        refused(
-            "a folder without images",
-            |d| {
-                std::fs::create_dir(d.join("views")).unwrap();
-                put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
-            },
-            IMPORT,
-            &["files.projections", ".tif"],
-        ),
-        refused(
-            "one directory for eight images, of which three are there",
-            one_directory(Some(8), 3),
-            IMPORT,
-            &["images", "found 8 in the ImageDescription", "36 bytes"],
-        ),
-        refused(
-            "one directory, and images that nothing counts",
-            one_directory(None, 3),
-            IMPORT,
-            &["file size", "24 bytes after the one page"],
-        ),
-        refused(
-            "pages of other numbers",
-            |d| {
-                scanner_tiff(d);
-                let mut file = Cursor::new(Vec::new());
-                let mut w = TiffEncoder::new(&mut file).unwrap();
-                w.write_image::<colortype::Gray16>(3, 2, &[1; 6]).unwrap();
-                w.write_image::<colortype::Gray8>(3, 2, &[1; 6]).unwrap();
-                put(d.join(FILE), file.into_inner());
-            },
-            IMPORT,
-            &["page 1", "8-bit unsigned", "16-bit unsigned"],
-        ),
-        refused(
-            "a folder whose numbers have a gap",
-            |d| {
-                scanner_tiff(d);
-                std::fs::create_dir(d.join("views")).unwrap();
-                let image = std::fs::read(d.join(FILE)).unwrap();
-                for i in [1, 2, 3, 4, 7, 8, 9] {
-                    put(d.join(format!("views/view_{i:04}.tif")), &image);
-                }
-                put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
-            },
-            IMPORT,
-            &["files.projections", "view_0004.tif and view_0007.tif"],
-        )
-        .ends(End::Warned),
-        refused(
-            "a folder with two series",
-            |d| {
-                scanner_tiff(d);
-                std::fs::create_dir(d.join("views")).unwrap();
-                let image = std::fs::read(d.join(FILE)).unwrap();
-                for name in ["flat", "view_1", "view_2"] {
-                    put(d.join(format!("views/{name}.tif")), &image);
-                }
-                put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
-            },
-            IMPORT,
-            &["files.projections", "flat.tif and view_1.tif", "two series"],
-        )
-        .ends(End::Warned),
-        refused(
-            "HND of Varian in place of images",
-            |d| {
-                scanner_tiff(d);
-                std::fs::create_dir(d.join("views")).unwrap();
-                put(d.join("views/Proj_00001.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0");
-                put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
-            },
-            IMPORT,
-            &["Proj_00001.hnd", "Varian's HND", "rtkprojections"],
-        ),
+            IMPORT, ["page 0", "100 times"];
+        "a folder without images", |d| {
+            std::fs::create_dir(d.join("views")).unwrap();
+            put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
+        }, IMPORT, ["files.projections", ".tif"];
+        "one directory for eight images, of which three are there", one_directory(Some(8), 3),
+            IMPORT, ["images", "found 8 in the ImageDescription", "36 bytes"];
+        "one directory, and images that nothing counts", one_directory(None, 3),
+            IMPORT, ["file size", "24 bytes after the one page"];
+        "pages of other numbers", |d| {
+            scanner_tiff(d);
+            let mut file = Cursor::new(Vec::new());
+            let mut w = TiffEncoder::new(&mut file).unwrap();
+            w.write_image::<colortype::Gray16>(3, 2, &[1; 6]).unwrap();
+            w.write_image::<colortype::Gray8>(3, 2, &[1; 6]).unwrap();
+            put(d.join(FILE), file.into_inner());
+        }, IMPORT, ["page 1", "8-bit unsigned", "16-bit unsigned"];
+        "a folder whose numbers have a gap", |d| {
+            scanner_tiff(d);
+            std::fs::create_dir(d.join("views")).unwrap();
+            let image = std::fs::read(d.join(FILE)).unwrap();
+            for i in [1, 2, 3, 4, 7, 8, 9] {
+                put(d.join(format!("views/view_{i:04}.tif")), &image);
+            }
+            put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
+        }, IMPORT, ["files.projections", "view_0004.tif and view_0007.tif"].ends(End::Warned);
+        "a folder with two series", |d| {
+            scanner_tiff(d);
+            std::fs::create_dir(d.join("views")).unwrap();
+            let image = std::fs::read(d.join(FILE)).unwrap();
+            for name in ["flat", "view_1", "view_2"] {
+                put(d.join(format!("views/{name}.tif")), &image);
+            }
+            put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
+        }, IMPORT, ["files.projections", "flat.tif and view_1.tif", "two series"].ends(End::Warned);
+        "HND of Varian in place of images", |d| {
+            scanner_tiff(d);
+            std::fs::create_dir(d.join("views")).unwrap();
+            put(d.join("views/Proj_00001.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0");
+            put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
+        }, IMPORT, ["Proj_00001.hnd", "Varian's HND", "rtkprojections"];
+    };
+    all.extend([
         hnd("HND of Varian, asked about", "info a.hnd"),
         hnd("HND of Varian in place of a description", "import a.hnd -o scan"),
         hnd("HND of Varian in place of a volume", "simulate a.hnd -o scan"),
         hnd("HND of Varian in place of a scan", "reconstruct a.hnd --spec fdk -o run"),
-    ]
+    ]);
+    all
 }

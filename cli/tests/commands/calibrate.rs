@@ -45,17 +45,7 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
 
     let (wrong, out, png) = (text(&at("wrong")), text(&at("out")), text(&at("curves.png")));
     let found = json(&[
-        "calibrate",
-        &wrong,
-        "-o",
-        &out,
-        "--png",
-        &png,
-        "--pixels",
-        "24",
-        "--parameters",
-        "offset-u,rotation",
-        "--json",
+        "calibrate", &wrong, "-o", &out, "--png", &png, "--pixels", "24", "--parameters", "offset-u,rotation", "--json",
     ]);
     let u = of(&found, "offset-u");
     assert_eq!((&u["verdict"], &u["unit"]), (&"corrected".into(), &"mm".into()), "{found}");

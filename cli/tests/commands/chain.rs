@@ -8,13 +8,7 @@ use tempfile::{TempDir, tempdir};
 
 /// Settings so small that a few steps take no time.
 const SMALL: [&str; 8] = [
-    "--set",
-    "encoder.levels=3",
-    "--set",
-    "encoder.log2_table_size=10",
-    "--set",
-    "projector.samples=24",
-    "--steps",
+    "--set", "encoder.levels=3", "--set", "encoder.log2_table_size=10", "--set", "projector.samples=24", "--steps",
     "12",
 ];
 

@@ -72,16 +72,8 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
     );
     let rows = markdown(&out);
     let heads = [
-        "method",
-        "PSNR dB",
-        "ssim_2d",
-        "ssim_3d",
-        "ssim_skimage",
-        "held-out error",
-        "steps or passes",
-        "solve time, s",
-        "total time, s",
-        "peak memory",
+        "method", "PSNR dB", "ssim_2d", "ssim_3d", "ssim_skimage", "held-out error", "steps or passes",
+        "solve time, s", "total time, s", "peak memory",
     ];
     assert_eq!(rows[0], heads);
     let methods = table["methods"].as_array().unwrap();

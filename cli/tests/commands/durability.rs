@@ -47,16 +47,8 @@ fn writers(dir: &Path) -> Vec<(Vec<String>, &'static str)> {
     all.push((words(&["convert", &at("scan"), "--to", "r2", "--force"]), "out.r2"));
     all.push((words(&["convert", &at("scan"), "--to", "conefield", "--force"]), "out.scan"));
     let weights = [
-        "pretrain",
-        "phantom:head:16",
-        "--spec",
-        "naf",
-        "--steps",
-        "1",
-        "--set",
-        "encoder.log2_table_size=12",
-        "--force",
-        "-o",
+        "pretrain", "phantom:head:16", "--spec", "naf", "--steps", "1", "--set", "encoder.log2_table_size=12",
+        "--force", "-o",
     ];
     all.push((words(&weights), "out.safetensors"));
     all.push((words(&["evaluate", &at("v.npy"), &at("v.npy"), "--png"]), "out.png"));

@@ -13,10 +13,7 @@ const SMALL: &[&str] =
 const DENSE: &[&str] = &["training.rays=128", "projector.samples=64", "optimizer.lr=1e-2"];
 const MIXTURE: &[&str] = &["most=6000", "start.count=5000"];
 const WINDOW: &[&str] = &[
-    "training.rays=128",
-    "training.windows.count=1",
-    "projector.samples=64",
-    "optimizer.lr=5e-3",
+    "training.rays=128", "training.windows.count=1", "projector.samples=64", "optimizer.lr=5e-3",
     "encoder.log2_table_size=14",
 ];
 /// The wide network of `nerf` takes many minutes to get better than an empty volume.

@@ -319,18 +319,7 @@ fn a_run_that_is_watched_shows_its_page_to_this_machine_alone() {
     let watch = format!("--watch={port}");
     let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
         .args([
-            "-q",
-            "reconstruct",
-            &scan,
-            "--spec",
-            "fast",
-            "-o",
-            &run,
-            "--steps",
-            "1000000",
-            "--live",
-            "0.1s",
-            &watch,
+            "-q", "reconstruct", &scan, "--spec", "fast", "-o", &run, "--steps", "1000000", "--live", "0.1s", &watch,
         ])
         .spawn()
         .unwrap();

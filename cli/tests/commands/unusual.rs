@@ -12,16 +12,8 @@ use std::fs;
 use tempfile::{TempDir, tempdir};
 
 const SMALL: [&str; 10] = [
-    "--set",
-    "encoder.levels=3",
-    "--set",
-    "encoder.log2_table_size=10",
-    "--set",
-    "projector.samples=24",
-    "--steps",
-    "8",
-    "--seed",
-    "2",
+    "--set", "encoder.levels=3", "--set", "encoder.log2_table_size=10", "--set", "projector.samples=24", "--steps",
+    "8", "--seed", "2",
 ];
 
 /// A short scan with uneven steps, in degrees.
@@ -83,19 +75,8 @@ fn near(a: &Value, b: &Value, what: &str) {
 
 /// Facts that every format preserves.
 const KEPT: [&str; 13] = [
-    "views",
-    "detector",
-    "pixel_mm",
-    "detector_mm",
-    "offset_mm",
-    "source_to_axis_mm",
-    "source_to_detector_mm",
-    "angles",
-    "circle",
-    "field_of_view",
-    "volume",
-    "coverage",
-    "line_integrals",
+    "views", "detector", "pixel_mm", "detector_mm", "offset_mm", "source_to_axis_mm", "source_to_detector_mm",
+    "angles", "circle", "field_of_view", "volume", "coverage", "line_integrals",
 ];
 
 #[test]

@@ -11,261 +11,168 @@ use std::path::Path;
 struct Fault {
     /// Description for the page.
     what: &'static str,
-    /// Compiler defines.
-    defines: &'static [&'static str],
+    /// The fault, or a compiler define `NAME=VALUE`.
+    define: &'static str,
     /// Part of the message of each of `plugins list`, `plugins check` and `reconstruct`; empty for success.
     list: &'static str,
     check: &'static str,
     reconstruct: &'static str,
 }
 
-const fn fault(
-    what: &'static str,
-    defines: &'static [&'static str],
-    [list, check, reconstruct]: [&'static str; 3],
-) -> Fault {
-    Fault { what, defines, list, check, reconstruct }
+const fn fault(what: &'static str, define: &'static str, [list, check, reconstruct]: [&'static str; 3]) -> Fault {
+    Fault { what, define, list, check, reconstruct }
 }
 
 /// Refused in the same way wherever it is loaded.
-const fn refused(what: &'static str, defines: &'static [&'static str], why: &'static str) -> Fault {
-    fault(what, defines, [why; 3])
+const fn refused(what: &'static str, define: &'static str, why: &'static str) -> Fault {
+    fault(what, define, [why; 3])
 }
 
 /// Loads, but its stage fails the trial.
-const fn untried(what: &'static str, defines: &'static [&'static str], why: &'static str) -> Fault {
-    fault(what, defines, ["", why, why])
+const fn untried(what: &'static str, define: &'static str, why: &'static str) -> Fault {
+    fault(what, define, ["", why, why])
 }
 
-const FAULTS: &[Fault] = &[
-    fault("nothing", &["FAULT=NONE"], ["", "", ""]),
-    refused(
-        "no plugin: the function is missing",
-        &["ENTRY=another_name"],
-        "a library without the function conefield_plugin",
-    ),
-    refused("another version of the contract", &["FAULT=WRONG_ABI"], "ABI version: found 4.0, expected 3.x"),
-    refused("a table that is too short", &["FAULT=SHORT_TABLE"], "the table is too short"),
-    refused("functions that are too few", &["FAULT=SHORT_FUNCTIONS"], "the table is too short"),
-    refused("a function that must be there is NULL", &["FAULT=NO_FORWARD"], "no function forward"),
-    refused("no stages", &["FAULT=NO_STAGES"], "stages: found 0"),
-    refused("a name that no spec could write", &["NAME=\"Faulty Encoder\""], "lower-case letters, digits and hyphens"),
-    refused("a name that is taken", &["NAME=\"hash-grid\""], "a name that conefield itself (conefield-encoders) has"),
-    refused("a schema that is no JSON", &["SCHEMA=\"{type: object}\""], "a JSON Schema"),
-    untried("more channels out than it writes", &["FAULT=MORE_CHANNELS"], "is left unwritten"),
-    untried(
-        "more parameters than its blocks have",
-        &["FAULT=MORE_PARAMETERS"],
-        "blocks of 3 parameters in all, where there are 5",
-    ),
-    untried("two blocks of one name", &["FAULT=TWIN_BLOCKS"], "two blocks are called \"factor\""),
-    untried("writes past its tile", &["FAULT=PAST_TILE"], "it writes outside its output: 1 past"),
-    untried(
-        "passes without a function for them",
-        &["FAULT=NO_FORWARD_PASS"],
-        "it goes forward in 2 passes with no function forward_pass",
-    ),
-    untried("passes that are not its forward", &["FAULT=WRONG_PASSES"], "its passes together are not its forward"),
-    untried("writes before its gradients", &["FAULT=BEFORE_GRADIENTS"], "it writes outside its gradients: 1 before"),
-    untried("returns NaN", &["FAULT=NOT_A_NUMBER"], "number 0 of 3 of its output is NaN"),
-    untried("fails", &["FAULT=FAILS"], "forward failed: no more numbers"),
-    untried("sleeps in forward", &["FAULT=SLEEPS"], "it did not return within 5 s"),
-    untried("sleeps in create", &["FAULT=SLEEPS_IN_CREATE"], "it did not return within 5 s"),
-    fault(
-        "a parameter gradient that is 10 % too large",
-        &["FAULT=WRONG_GRADIENT"],
-        ["", "finite differences: parameters", ""],
-    ),
-    fault(
-        "an input gradient of the wrong sign",
-        &["FAULT=WRONG_INPUT_GRADIENT"],
-        ["", "finite differences: inputs", ""],
-    ),
-    fault("keeps all channels where some are to go", &["FAULT=REDUCES_NOTHING"], ["", "keep outputs", ""]),
-    untried("too few resolutions", &["FAULT=FEW_RESOLUTIONS"], "resolutions failed: channel 2 of 3 is left unwritten"),
-    untried(
-        "more resolutions than channels",
-        &["FAULT=MORE_RESOLUTIONS"],
-        "resolutions failed: it writes past the 3 channels that there are",
-    ),
-    untried(
-        "a resolution that is NaN",
-        &["FAULT=NAN_RESOLUTION"],
-        "resolutions failed: channel 1 of 3 resolves NaN cells",
-    ),
-    untried(
-        "a negative resolution",
-        &["FAULT=NEGATIVE_RESOLUTION"],
-        "resolutions failed: channel 1 of 3 resolves -8 cells",
-    ),
-    fault("results that depend on earlier calls", &["FAULT=REMEMBERS"], ["", "tile sizes: outputs", ""]),
-    fault("returns NaN after a hundred calls", &["FAULT=NOT_A_NUMBER_LATER"], ["", "extremes", "training diverged"]),
-    fault("fails after a hundred calls", &["FAULT=FAILS_LATER"], ["", "no fault", "forward failed: no more numbers"]),
-    fault("calls abort", &["FAULT=ABORTS"], ["", "crashed the checking process (signal 6)", ABORTED]),
-];
+/// A table of faults, a row each: how it ends, and the arguments of the function of that name.
+macro_rules! faults {
+    ($($ends:ident $what:expr, $define:expr, $says:expr;)*) => { &[$($ends($what, $define, $says)),*] };
+}
+
+const FAULTS: &[Fault] = faults! {
+    fault "nothing", "NONE", ["", "", ""];
+    refused "no plugin: the function is missing", "ENTRY=another_name",
+        "a library without the function conefield_plugin";
+    refused "another version of the contract", "WRONG_ABI", "ABI version: found 4.0, expected 3.x";
+    refused "a table that is too short", "SHORT_TABLE", "the table is too short";
+    refused "functions that are too few", "SHORT_FUNCTIONS", "the table is too short";
+    refused "a function that must be there is NULL", "NO_FORWARD", "no function forward";
+    refused "no stages", "NO_STAGES", "stages: found 0";
+    refused "a name that no spec could write", "NAME=\"Faulty Encoder\"", "lower-case letters, digits and hyphens";
+    refused "a name that is taken", "NAME=\"hash-grid\"", "a name that conefield itself (conefield-encoders) has";
+    refused "a schema that is no JSON", "SCHEMA=\"{type: object}\"", "a JSON Schema";
+    untried "more channels out than it writes", "MORE_CHANNELS", "is left unwritten";
+    untried "more parameters than its blocks have", "MORE_PARAMETERS",
+        "blocks of 3 parameters in all, where there are 5";
+    untried "two blocks of one name", "TWIN_BLOCKS", "two blocks are called \"factor\"";
+    untried "writes past its tile", "PAST_TILE", "it writes outside its output: 1 past";
+    untried "passes without a function for them", "NO_FORWARD_PASS",
+        "it goes forward in 2 passes with no function forward_pass";
+    untried "passes that are not its forward", "WRONG_PASSES", "its passes together are not its forward";
+    untried "writes before its gradients", "BEFORE_GRADIENTS", "it writes outside its gradients: 1 before";
+    untried "returns NaN", "NOT_A_NUMBER", "number 0 of 3 of its output is NaN";
+    untried "fails", "FAILS", "forward failed: no more numbers";
+    untried "sleeps in forward", "SLEEPS", "it did not return within 5 s";
+    untried "sleeps in create", "SLEEPS_IN_CREATE", "it did not return within 5 s";
+    fault "a parameter gradient that is 10 % too large", "WRONG_GRADIENT", ["", "finite differences: parameters", ""];
+    fault "an input gradient of the wrong sign", "WRONG_INPUT_GRADIENT", ["", "finite differences: inputs", ""];
+    fault "keeps all channels where some are to go", "REDUCES_NOTHING", ["", "keep outputs", ""];
+    untried "too few resolutions", "FEW_RESOLUTIONS", "resolutions failed: channel 2 of 3 is left unwritten";
+    untried "more resolutions than channels", "MORE_RESOLUTIONS",
+        "resolutions failed: it writes past the 3 channels that there are";
+    untried "a resolution that is NaN", "NAN_RESOLUTION", "resolutions failed: channel 1 of 3 resolves NaN cells";
+    untried "a negative resolution", "NEGATIVE_RESOLUTION", "resolutions failed: channel 1 of 3 resolves -8 cells";
+    fault "results that depend on earlier calls", "REMEMBERS", ["", "tile sizes: outputs", ""];
+    fault "returns NaN after a hundred calls", "NOT_A_NUMBER_LATER", ["", "extremes", "training diverged"];
+    fault "fails after a hundred calls", "FAILS_LATER", ["", "no fault", "forward failed: no more numbers"];
+    fault "calls abort", "ABORTS", ["", "crashed the checking process (signal 6)", ABORTED];
+};
 
 /// Faults of projectors that are fitted to a scene: `faulty_rays.c`.
-const RAY_FAULTS: &[Fault] = &[
-    fault("a projector that is fitted", &["FAULT=NONE"], ["", "", ""]),
-    fault(
-        "a projector that cannot be fitted",
-        &["FAULT=FITS_NOT"],
-        ["", "fitted to a scene", "fitted failed: no scene suits it"],
-    ),
-    fault(
-        "a fitted projector that is the old one",
-        &["FAULT=FITS_ITSELF"],
-        ["", "fitted to a scene", "fitted: found the old stage, expected a new one"],
-    ),
-    fault("a fitted projector that returns NaN", &["FAULT=FITS_NAN"], ["", "fitted to a scene", "sample 0 is at"]),
-    fault("a fitted projector whose lengths are 10 % too long", &["FAULT=FITS_LONGER"], ["", "fitted to a scene", ""]),
-];
+const RAY_FAULTS: &[Fault] = faults! {
+    fault "a projector that is fitted", "NONE", ["", "", ""];
+    fault "a projector that cannot be fitted", "FITS_NOT",
+        ["", "fitted to a scene", "fitted failed: no scene suits it"];
+    fault "a fitted projector that is the old one", "FITS_ITSELF",
+        ["", "fitted to a scene", "fitted: found the old stage, expected a new one"];
+    fault "a fitted projector that returns NaN", "FITS_NAN", ["", "fitted to a scene", "sample 0 is at"];
+    fault "a fitted projector whose lengths are 10 % too long", "FITS_LONGER", ["", "fitted to a scene", ""];
+};
 
 /// Faults of losses: `faulty_loss.c`.
-const LOSS_FAULTS: &[Fault] = &[
-    refused("a loss without its function", &["FAULT=NO_AT"], "no function at"),
-    untried("a negative loss", &["FAULT=NEGATIVE"], "refused: predicted -0.25, measured -0.5: loss -0.03125"),
-    untried("a loss that is NaN", &["FAULT=NOT_A_NUMBER"], "refused: predicted -0.5, measured -0.5: loss NaN"),
-    untried(
-        "a loss that writes past its slopes",
-        &["FAULT=PAST_SLOPES"],
-        "it writes outside its slopes: 1 past 16 numbers",
-    ),
-    untried("a loss that fails", &["FAULT=FAILS"], "at failed: no more numbers"),
-    fault("a slope that is 10 % too large", &["FAULT=WRONG_SLOPE"], ["", "finite differences", ""]),
-    fault(
-        "a loss for a scan that is the old one",
-        &["FAULT=FITS_ITSELF"],
-        ["", "learns from a scan", "fitted: found the old stage, expected a new one"],
-    ),
-    fault(
-        "a loss that cannot learn from a scan",
-        &["FAULT=FITS_NOT"],
-        ["", "learns from a scan", "fitted failed: no scan suits it"],
-    ),
-];
+const LOSS_FAULTS: &[Fault] = faults! {
+    refused "a loss without its function", "NO_AT", "no function at";
+    untried "a negative loss", "NEGATIVE", "refused: predicted -0.25, measured -0.5: loss -0.03125";
+    untried "a loss that is NaN", "NOT_A_NUMBER", "refused: predicted -0.5, measured -0.5: loss NaN";
+    untried "a loss that writes past its slopes", "PAST_SLOPES", "it writes outside its slopes: 1 past 16 numbers";
+    untried "a loss that fails", "FAILS", "at failed: no more numbers";
+    fault "a slope that is 10 % too large", "WRONG_SLOPE", ["", "finite differences", ""];
+    fault "a loss for a scan that is the old one", "FITS_ITSELF",
+        ["", "learns from a scan", "fitted: found the old stage, expected a new one"];
+    fault "a loss that cannot learn from a scan", "FITS_NOT",
+        ["", "learns from a scan", "fitted failed: no scan suits it"];
+};
 
 /// Faults of priors: `faulty_prior.c`.
-const PRIOR_FAULTS: &[Fault] = &[
-    untried("blocks of one point", &["FAULT=FLAT_BLOCKS"], "edge: found 1, expected 2 to 32"),
-    untried("a negative penalty", &["FAULT=NEGATIVE"], "refused: the penalty of a block is -"),
-    untried("a penalty that is NaN", &["FAULT=NOT_A_NUMBER"], "refused: the penalty of a block is NaN"),
-    untried(
-        "a prior that writes before its gradient",
-        &["FAULT=BEFORE_GRADIENT"],
-        "it writes outside its gradient: 1 before 64 numbers",
-    ),
-    untried("a prior that fails", &["FAULT=FAILS"], "block failed: no more numbers"),
-    fault("a prior's gradient that is 10 % too large", &["FAULT=WRONG_GRADIENT"], ["", "finite differences", ""]),
-    fault("a prior's gradient that overwrites", &["FAULT=OVERWRITES"], ["", "gradients add", ""]),
-];
+const PRIOR_FAULTS: &[Fault] = faults! {
+    untried "blocks of one point", "FLAT_BLOCKS", "edge: found 1, expected 2 to 32";
+    untried "a negative penalty", "NEGATIVE", "refused: the penalty of a block is -";
+    untried "a penalty that is NaN", "NOT_A_NUMBER", "refused: the penalty of a block is NaN";
+    untried "a prior that writes before its gradient", "BEFORE_GRADIENT",
+        "it writes outside its gradient: 1 before 64 numbers";
+    untried "a prior that fails", "FAILS", "block failed: no more numbers";
+    fault "a prior's gradient that is 10 % too large", "WRONG_GRADIENT", ["", "finite differences", ""];
+    fault "a prior's gradient that overwrites", "OVERWRITES", ["", "gradients add", ""];
+};
 
 /// Faults of parts of iterative methods and of line fields: `faulty_pieces.c`, with the spec that uses them.
 const PIECE_FAULTS: &[(&str, &[Fault])] = &[
     (
         "prior.type=faulty",
-        &[
-            fault("sound pieces of methods", &["FAULT=NONE"], ["", "", ""]),
-            refused("a regularizer without its proximal map", &["FAULT=R_NO_PROX"], "no function prox"),
-            untried("a negative penalty of a regularizer", &["FAULT=R_NEGATIVE"], "refused: the penalty is -"),
-            untried(
-                "a proximal map that is NaN",
-                &["FAULT=R_NOT_A_NUMBER"],
-                "refused: number 0 of 120 of its coefficients is NaN",
-            ),
-            untried(
-                "a proximal map that writes past its coefficients",
-                &["FAULT=R_PAST"],
-                "it writes outside its coefficients: 1 past 120 numbers",
-            ),
-            untried("a proximal map below 0", &["FAULT=R_BELOW"], "refused: its proximal map gives -"),
-            untried("a proximal map that fails", &["FAULT=R_FAILS"], "prox failed: no more numbers"),
-            untried("a regularizer for no grid", &["FAULT=R_NO_GRID"], "on failed: no such grid"),
-            untried(
-                "a penalty that is the regularizer",
-                &["FAULT=R_ITSELF"],
-                "on: found the old stage, expected a new one",
-            ),
-            untried("two states of one name", &["FAULT=R_TWIN_STATE"], "two entries are called \"calls\""),
-            untried("a weight that is NaN", &["FAULT=R_WEIGHT"], "weight: found NaN, expected a finite number"),
-            fault("a proximal map that shrinks half as much", &["FAULT=R_HALVED"], ["", "proximal map", ""]),
-            fault("a state that is not reported", &["FAULT=R_FORGETS"], ["", "state", ""]),
-            fault(
-                "a proximal map that fails later",
-                &["FAULT=R_LATER"],
-                ["", "no fault", "prox failed: no more numbers"],
-            ),
-        ],
+        faults! {
+            fault "sound pieces of methods", "NONE", ["", "", ""];
+            refused "a regularizer without its proximal map", "R_NO_PROX", "no function prox";
+            untried "a negative penalty of a regularizer", "R_NEGATIVE", "refused: the penalty is -";
+            untried "a proximal map that is NaN", "R_NOT_A_NUMBER", "refused: number 0 of 120 of its coefficients is NaN";
+            untried "a proximal map that writes past its coefficients", "R_PAST",
+                "it writes outside its coefficients: 1 past 120 numbers";
+            untried "a proximal map below 0", "R_BELOW", "refused: its proximal map gives -";
+            untried "a proximal map that fails", "R_FAILS", "prox failed: no more numbers";
+            untried "a regularizer for no grid", "R_NO_GRID", "on failed: no such grid";
+            untried "a penalty that is the regularizer", "R_ITSELF", "on: found the old stage, expected a new one";
+            untried "two states of one name", "R_TWIN_STATE", "two entries are called \"calls\"";
+            untried "a weight that is NaN", "R_WEIGHT", "weight: found NaN, expected a finite number";
+            fault "a proximal map that shrinks half as much", "R_HALVED", ["", "proximal map", ""];
+            fault "a state that is not reported", "R_FORGETS", ["", "state", ""];
+            fault "a proximal map that fails later", "R_LATER", ["", "no fault", "prox failed: no more numbers"];
+        },
     ),
     (
         "data.type=faulty",
-        &[
-            refused("a data term for no scan", &["FAULT=D_NO_OF"], "no function of"),
-            untried("a negative misfit", &["FAULT=D_NEGATIVE"], "refused: the misfit is -"),
-            untried("a derivative that is NaN", &["FAULT=D_NOT_A_NUMBER"], "number 0 of 42 of its derivatives is NaN"),
-            untried(
-                "a data term that writes past its values",
-                &["FAULT=D_PAST"],
-                "it writes outside its curvatures: 1 past 42 numbers",
-            ),
-            untried("noise that is NaN", &["FAULT=D_NOISE"], "refused: the noise that it finds is NaN"),
-            untried("a data term that refuses a scan", &["FAULT=D_NO_SCAN"], "of failed: no such scan"),
-            fault("a derivative that is 10 % too large", &["FAULT=D_STEEP"], ["", "finite differences", ""]),
-            fault("a bound of the curvature that is too low", &["FAULT=D_LOW_BOUND"], ["", "curvature", ""]),
-            fault(
-                "a data term that fails later",
-                &["FAULT=D_LATER"],
-                ["", "no fault", "differentiate failed: no more numbers"],
-            ),
-        ],
+        faults! {
+            refused "a data term for no scan", "D_NO_OF", "no function of";
+            untried "a negative misfit", "D_NEGATIVE", "refused: the misfit is -";
+            untried "a derivative that is NaN", "D_NOT_A_NUMBER", "number 0 of 42 of its derivatives is NaN";
+            untried "a data term that writes past its values", "D_PAST",
+                "it writes outside its curvatures: 1 past 42 numbers";
+            untried "noise that is NaN", "D_NOISE", "refused: the noise that it finds is NaN";
+            untried "a data term that refuses a scan", "D_NO_SCAN", "of failed: no such scan";
+            fault "a derivative that is 10 % too large", "D_STEEP", ["", "finite differences", ""];
+            fault "a bound of the curvature that is too low", "D_LOW_BOUND", ["", "curvature", ""];
+            fault "a data term that fails later", "D_LATER", ["", "no fault", "differentiate failed: no more numbers"];
+        },
     ),
     (
         "basis.type=faulty",
-        &[
-            untried(
-                "no coefficients",
-                &["FAULT=B_NO_COEFFICIENTS"],
-                "info failed: coefficients: volume.shape: found [0, 4, 6]",
-            ),
-            untried(
-                "a basis that writes past its voxels",
-                &["FAULT=B_PAST"],
-                "it writes outside its voxels: 1 past 120 numbers",
-            ),
-            untried(
-                "a voxel that is left unwritten",
-                &["FAULT=B_UNWRITTEN"],
-                "number 119 of 120 of its voxels is left unwritten",
-            ),
-            untried("a basis that fails", &["FAULT=B_FAILS"], "expand failed: no more numbers"),
-            fault("an adjoint that is 1 % too long", &["FAULT=B_LONG_ADJOINT"], ["", "adjoint: single precision", ""]),
-            fault("a basis that fails later", &["FAULT=B_LATER"], ["", "no fault", "expand failed: no more numbers"]),
-        ],
+        faults! {
+            untried "no coefficients", "B_NO_COEFFICIENTS", "info failed: coefficients: volume.shape: found [0, 4, 6]";
+            untried "a basis that writes past its voxels", "B_PAST", "it writes outside its voxels: 1 past 120 numbers";
+            untried "a voxel that is left unwritten", "B_UNWRITTEN", "number 119 of 120 of its voxels is left unwritten";
+            untried "a basis that fails", "B_FAILS", "expand failed: no more numbers";
+            fault "an adjoint that is 1 % too long", "B_LONG_ADJOINT", ["", "adjoint: single precision", ""];
+            fault "a basis that fails later", "B_LATER", ["", "no fault", "expand failed: no more numbers"];
+        },
     ),
     (
         "field.type=faulty",
-        &[
-            untried(
-                "a line field without line integrals",
-                &["FAULT=L_NO_LINES"],
-                "it has no line integrals of its own",
-            ),
-            untried(
-                "a line field that writes past its line integrals",
-                &["FAULT=L_PAST"],
-                "it writes outside its line integrals: 1 past 4 numbers",
-            ),
-            untried(
-                "a line integral of a ray that is not inside",
-                &["FAULT=L_MISSED"],
-                "refused: a ray that is not inside has a line integral",
-            ),
-            fault(
-                "an adjoint of line integrals that is 10 % too long",
-                &["FAULT=L_LONG_ADJOINT"],
-                ["", "lines: finite differences", ""],
-            ),
-        ],
+        faults! {
+            untried "a line field without line integrals", "L_NO_LINES", "it has no line integrals of its own";
+            untried "a line field that writes past its line integrals", "L_PAST",
+                "it writes outside its line integrals: 1 past 4 numbers";
+            untried "a line integral of a ray that is not inside", "L_MISSED",
+                "refused: a ray that is not inside has a line integral";
+            fault "an adjoint of line integrals that is 10 % too long", "L_LONG_ADJOINT",
+                ["", "lines: finite differences", ""];
+        },
     ),
 ];
 
@@ -386,7 +293,9 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         let own = dir.path().join(format!("plugin-{i}"));
         std::fs::create_dir(&own).unwrap();
         let library = own.join("faulty.so");
-        cc(&sources().join("plugins/tests").join(source), fault.defines, &library);
+        let fault_is = format!("FAULT={}", fault.define);
+        let define = if fault.define.contains('=') { fault.define } else { &fault_is };
+        cc(&sources().join("plugins/tests").join(source), &[define], &library);
         let (library, here) = (text(&library), [own.as_path(), dir.path()]);
         let list = refusal(&library, &here);
         let check = said(&["plugins", "check", &library], &here);

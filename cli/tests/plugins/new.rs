@@ -6,17 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 const KINDS: [&str; 11] = [
-    "encoder",
-    "normalizer",
-    "field",
-    "line-field",
-    "projector",
-    "initializer",
-    "loss",
-    "prior",
-    "regularizer",
-    "data-term",
-    "basis",
+    "encoder", "normalizer", "field", "line-field", "projector", "initializer", "loss", "prior", "regularizer",
+    "data-term", "basis",
 ];
 
 /// Kinds that are parts of iterative methods.

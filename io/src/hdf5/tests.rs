@@ -1,7 +1,7 @@
 //! Files written by h5py (`tests/fixtures/make_formats.py`), intact and damaged.
 
 use crate::scan_size;
-use crate::testing::read_scanner;
+use crate::testing::{read_scanner, says};
 use conefield_core::Result;
 use conefield_core::geometry::{Millimetres, Radians, View};
 use conefield_core::scan::Scan;
@@ -42,8 +42,7 @@ fn files(name: &str) -> String {
 }
 
 fn refused(files: &str, rest: &str, change: impl Fn(&mut Vec<u8>), words: &[&str]) {
-    let e = import(files, rest, change).unwrap_err().to_string();
-    assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
+    says(import(files, rest, change), words);
 }
 
 #[test]
@@ -99,13 +98,6 @@ fn what_is_not_there_or_damaged_is_refused_in_words() {
     let turn = format!("{CIRCLE}range_deg = 360\n[values]\ni0 = 20000\n");
     let of = |name: &str| format!("projections = \"{name}\"");
     refused(
-        &of("dxchange.h5:/exchange/datum"),
-        &turn,
-        same,
-        &["dxchange.h5: /exchange/datum", "no such thing", "DXchange"],
-    );
-    refused(&of("dxchange.h5:/exchange/theta"), &turn, same, &["theta", "[3]", "two axes"]);
-    refused(
         &of("dxchange.h5"),
         &format!("{CIRCLE}angles_deg = \"nxtomo.nxs:/entry/sample\"\n"),
         same,
@@ -127,15 +119,6 @@ fn what_is_not_there_or_damaged_is_refused_in_words() {
 }
 
 #[test]
-fn any_changed_byte_is_refused_or_changes_only_values() {
-    let turn = format!("{CIRCLE}range_deg = 360\n[values]\ni0 = 20000\n");
-    let size = fs::metadata(fixture("dxchange.h5")).unwrap().len() as usize;
-    for at in (0..size).step_by(13) {
-        let _ = import("projections = \"dxchange.h5\"", &turn, |b| b[at] ^= 0x81);
-    }
-}
-
-#[test]
 fn a_filter_that_is_not_read_is_named_with_the_way_out() {
     let dir = tempfile::tempdir().unwrap();
     let whole = fs::read(fixture("nxtomo.nxs")).unwrap();
@@ -153,8 +136,7 @@ fn a_filter_that_is_not_read_is_named_with_the_way_out() {
              [values]\ni0 = 20000\n[volume]\nshape = [4, 3, 2]\nspacing = [0.5, 0.75, 2.0]\n"
         );
         fs::write(dir.path().join("s.toml"), text).unwrap();
-        let e = read_scanner(dir.path().join("s.toml"), None).unwrap_err().to_string();
         let words = ["a.h5", &format!("packed by {name} (filter id {id})"), "h5repack -f NONE"];
-        assert!(words.iter().all(|w| e.contains(w)), "{e}");
+        says(read_scanner(dir.path().join("s.toml"), None), &words);
     }
 }

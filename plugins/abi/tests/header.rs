@@ -28,16 +28,8 @@ fn the_header_is_current() {
         ),
         export: cbindgen::ExportConfig {
             include: [
-                "ConefieldPlugin",
-                "ConefieldMap",
-                "ConefieldProjector",
-                "ConefieldInitializer",
-                "ConefieldLoss",
-                "ConefieldPrior",
-                "ConefieldRegularizer",
-                "ConefieldDataTerm",
-                "ConefieldBasis",
-                "ConefieldStage",
+                "ConefieldPlugin", "ConefieldMap", "ConefieldProjector", "ConefieldInitializer", "ConefieldLoss",
+                "ConefieldPrior", "ConefieldRegularizer", "ConefieldDataTerm", "ConefieldBasis", "ConefieldStage",
             ]
             .map(String::from)
             .to_vec(),

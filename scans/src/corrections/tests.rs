@@ -234,12 +234,7 @@ fn corrections_are_recorded_in_the_scan() {
     for value in [0.0, 80.0, 1e14, -1e14, 1e-30] {
         let odd = changed(&scan, |v, _, c, a| if (v + c) % 3 == 0 { value } else { a });
         for text in [
-            "pixels",
-            "flux",
-            "rings",
-            "low-counts.photons=1000",
-            "scatter.share=0.5",
-            "hardening.water.kvp=90",
+            "pixels", "flux", "rings", "low-counts.photons=1000", "scatter.share=0.5", "hardening.water.kvp=90",
             "truncation",
         ] {
             if let Ok((mended, _)) = Corrections::parse(&[text]).unwrap().apply(odd.clone(), "test") {

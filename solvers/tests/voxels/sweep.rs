@@ -289,26 +289,10 @@ fn no_geometry_gives_wrong_numbers_without_a_word() {
 #[test]
 fn usual_geometries_are_right_without_warnings() {
     let usual = [
-        "arc 210, centred, narrow",
-        "arc 225, centred, wide",
-        "arc 240, centred, aside",
-        "arc 300, centred, wide",
-        "arc 360, centred, wide",
-        "arc 360, offset, wide",
-        "arc 360, offset, aside",
-        "backwards",
-        "backwards, short",
-        "four exact turns",
-        "one and a half turns",
-        "380 degrees",
-        "every view twice",
-        "there and back",
-        "half of it denser",
-        "golden angles",
-        "the detector wobbles",
-        "rows upwards",
-        "columns backwards",
-        "one slice",
+        "arc 210, centred, narrow", "arc 225, centred, wide", "arc 240, centred, aside", "arc 300, centred, wide",
+        "arc 360, centred, wide", "arc 360, offset, wide", "arc 360, offset, aside", "backwards", "backwards, short",
+        "four exact turns", "one and a half turns", "380 degrees", "every view twice", "there and back",
+        "half of it denser", "golden angles", "the detector wobbles", "rows upwards", "columns backwards", "one slice",
         "a ball 5 mm above the circle",
     ];
     let all = all();

@@ -23,18 +23,7 @@ const EDGES: [u64; 14] = [
 
 /// What a number in a text may become.
 const WORDS: [&str; 12] = [
-    "0",
-    "-1",
-    "nan",
-    "inf",
-    "1e999",
-    "-1e-320",
-    "18446744073709551616",
-    "4611686018427387904",
-    "\"\"",
-    "[]",
-    "{}",
-    "x",
+    "0", "-1", "nan", "inf", "1e999", "-1e-320", "18446744073709551616", "4611686018427387904", "\"\"", "[]", "{}", "x",
 ];
 
 /// One to four changes to `seed`, of what `number` chooses; `text` adds those that keep a text readable.

@@ -35,68 +35,11 @@ enum Language {
 
 /// Names that a crate or its types cannot have: Rust keywords and crates always in scope.
 const RESERVED: [&str; 62] = [
-    "abstract",
-    "alloc",
-    "as",
-    "async",
-    "await",
-    "become",
-    "box",
-    "break",
-    "const",
-    "continue",
-    "core",
-    "crate",
-    "do",
-    "dyn",
-    "else",
-    "enum",
-    "extern",
-    "false",
-    "final",
-    "fn",
-    "for",
-    "gen",
-    "if",
-    "impl",
-    "in",
-    "let",
-    "loop",
-    "macro",
-    "match",
-    "mod",
-    "move",
-    "mut",
-    "override",
-    "priv",
-    "proc-macro",
-    "pub",
-    "ref",
-    "return",
-    "self",
-    "static",
-    "std",
-    "struct",
-    "super",
-    "test",
-    "trait",
-    "true",
-    "try",
-    "type",
-    "typeof",
-    "unsafe",
-    "unsized",
-    "use",
-    "virtual",
-    "where",
-    "while",
-    "yield",
-    "conefield-plugin",
-    "conefield-conformance",
-    "build",
-    "deps",
-    "examples",
-    "incremental",
+    "abstract", "alloc", "as", "async", "await", "become", "box", "break", "const", "continue", "core", "crate", "do",
+    "dyn", "else", "enum", "extern", "false", "final", "fn", "for", "gen", "if", "impl", "in", "let", "loop", "macro",
+    "match", "mod", "move", "mut", "override", "priv", "proc-macro", "pub", "ref", "return", "self", "static", "std",
+    "struct", "super", "test", "trait", "true", "try", "type", "typeof", "unsafe", "unsized", "use", "virtual",
+    "where", "while", "yield", "conefield-plugin", "conefield-conformance", "build", "deps", "examples", "incremental",
 ];
 
 macro_rules! template {
@@ -115,10 +58,10 @@ struct Start {
     build: &'static str,
 }
 
-/// Kinds of stages and their templates: the stage in C (without the common start and end), the stage in Rust, and its
-/// test.
+/// Kinds of stages and their templates: the stage in C (without the common start and end) and in Rust, and the test of
+/// the latter.
 macro_rules! kinds {
-    ($($kind:ident $file:literal,)*) => {
+    ($($kind:ident $file:literal $test:literal,)*) => {
         #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
         enum StageKind {
             $($kind,)*
@@ -137,10 +80,11 @@ macro_rules! kinds {
                 }
             }
 
-            fn rust(self) -> [&'static str; 2] {
+            fn rust(self) -> (&'static str, String) {
                 match self {
                     $(Self::$kind => {
-                        [template!(concat!("rust/", $file, ".rs")), template!(concat!("rust/", $file, "_test.rs"))]
+                        let test = template!(concat!("rust/", $test, "_test.rs"));
+                        (template!(concat!("rust/", $file, ".rs")), test.replace("@kind@", $file))
                     })*
                 }
             }
@@ -149,17 +93,17 @@ macro_rules! kinds {
 }
 
 kinds! {
-    Encoder "encoder",
-    Normalizer "normalizer",
-    Field "field",
-    LineField "line_field",
-    Projector "projector",
-    Initializer "initializer",
-    Loss "loss",
-    Prior "prior",
-    Regularizer "regularizer",
-    DataTerm "data_term",
-    Basis "basis",
+    Encoder "encoder" "encoder",
+    Normalizer "normalizer" "normalizer",
+    Field "field" "field",
+    LineField "line_field" "line_field",
+    Projector "projector" "projector",
+    Initializer "initializer" "initializer",
+    Loss "loss" "piece",
+    Prior "prior" "piece",
+    Regularizer "regularizer" "piece",
+    DataTerm "data_term" "piece",
+    Basis "basis" "piece",
 }
 
 impl New {
@@ -206,12 +150,12 @@ impl New {
     }
 
     fn rust(&self) -> Result<Start> {
-        let [stage, test] = self.kind.rust();
+        let (stage, test) = self.kind.rust();
         let files = vec![
             ("Cargo.toml".into(), self.fill(template!("rust/manifest.toml"))?),
             (".gitignore".into(), "/target\n".into()),
             ("src/lib.rs".into(), self.fill(stage)?),
-            ("tests/conformance.rs".into(), self.fill(test)?),
+            ("tests/conformance.rs".into(), self.fill(&test)?),
             ("spec.toml".into(), self.spec()),
         ];
         let name = self.name.replace('-', "_");

@@ -1,3 +1,0 @@
-#![no_main]
-
-conefield_fuzz::target!("dicom_run_length");
