@@ -1,5 +1,5 @@
 //! Draws the conventions of docs/guide/geometry.md, with all positions computed by the library: `cargo run -p
-//! conefield-report --example draw_geometry` writes docs/images/geometry-*.svg. A test here compares.
+//! conefield-evaluation --features plots --example draw_geometry` writes docs/images/geometry-*.svg. A test here compares.
 
 use conefield_core::geometry::{Geometry, Millimetres, Radians, Vec3, View, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;

@@ -2,7 +2,7 @@
 //!
 //! The file contains all data and code and fetches nothing; its content security policy forbids it. Only the page of a
 //! run that goes on asks its own server for a newer one. The viewer and the plots use third-party libraries
-//! (`report/page/vendor`).
+//! (`evaluation/page/vendor`).
 
 mod picture;
 mod volume;
