@@ -2,8 +2,8 @@
 //! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last
 //! and only for a finished run, `record.json`.
 
+use conefield::record::ScanRecord;
 use conefield::tradeoff::json::{LONGEST, read_json};
-use conefield::tradeoff::trial::ScanRecord;
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::{Error, Result};

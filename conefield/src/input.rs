@@ -75,6 +75,8 @@ pub fn read(path: &Path, reference: Option<&Path>) -> Result<(Scan, Option<Volum
     let own = reference.is_some_and(is_truth);
     let DataSet { train: scan, volume, .. } =
         conefield_scans::read_data_set(path, Parts { tests: false, volume: own })?;
+    // A volume that came unasked is not held beside the reference.
+    let volume = volume.filter(|_| own);
     files::warn_of(path, &survey(&scan));
     let volume = match reference {
         None => None,

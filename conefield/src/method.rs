@@ -52,13 +52,14 @@ pub fn planned(
     }
     let loaded = read(&sets)?;
     let plan = plan(&loaded, backend)?;
-    let tables = smaller_tables(&loaded);
-    let smaller = tables.iter().filter_map(|(bits, set)| {
-        let loaded = read(&[&sets[..], std::slice::from_ref(set)].concat()).ok()?;
-        Some((*bits, plan_without_files(&loaded, backend).ok()?))
-    });
     let memory = run.memory(plan.as_ref());
-    memory.check(|available| run.smaller(plan.as_ref(), available, smaller))?;
+    memory.check(|available| {
+        let smaller = smaller_tables(&loaded).into_iter().filter_map(|(bits, set)| {
+            let loaded = read(&[&sets[..], &[set]].concat()).ok()?;
+            Some((bits, plan_without_files(&loaded, backend).ok()?))
+        });
+        run.smaller(plan.as_ref(), available, smaller)
+    })?;
     Ok(Planned { loaded, plan, memory })
 }
 

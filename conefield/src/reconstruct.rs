@@ -6,7 +6,7 @@ use crate::session::{self, InMemory, Request, Session};
 use crate::{memory, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
-use conefield_core::method::{Limits, Observer, Silent, Solution};
+use conefield_core::method::{Limits, Observer, Reconstruction, Silent, Solution};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::trained::TrainedField;
 use conefield_evaluation::metrics::Scores;
@@ -118,8 +118,8 @@ impl Reconstruct {
         let request = Request { spec, sets, limits, budget, seed, ..Request::default() };
         let session = Session::open(request, &backend, run, begin)?;
         let mut run = session.plan(Input::new(scan, held_out, reference, None)?, 0.0, &|| false)?;
-        let mut solved = run.solve(None, None, observer)?;
-        let InMemory { volume, written } = run.in_memory(&mut solved, |result, backend| result.volume(backend))?;
+        let solved = run.solve(None, None, observer)?;
+        let InMemory { volume, written } = run.in_memory(&solved, Reconstruction::volume)?;
         let Solution { result, steps, train_s, .. } = solved.solution;
         let spec = run.method.loaded.spec.name.clone();
         Ok(Reconstructed { volume, field: session::field(result), spec, steps, train_s, scores: written.scores })

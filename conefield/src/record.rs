@@ -3,12 +3,16 @@
 use crate::machine::Machine;
 use crate::memory::Memory;
 use crate::plugins::Used;
+use crate::tradeoff::json::to_json;
 use crate::tradeoff::schedule::Schedule;
-use crate::tradeoff::trial::ScanRecord;
+use conefield_core::Result;
 use conefield_core::backend::Explain;
 use conefield_core::method::Limits;
+use conefield_core::scan::Scan;
 use conefield_evaluation::metrics::Scores;
-use serde::Serialize;
+use conefield_evaluation::report::text::stem;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
 
 /// Everything needed to repeat a run, and its result.
 #[derive(Debug, Serialize)]
@@ -112,4 +116,53 @@ pub struct Written {
     pub score_s: f64,
     /// Scores against the reference.
     pub scores: Option<Scores>,
+}
+
+/// Identifies a scan.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct ScanRecord {
+    /// Path from which it was read.
+    pub path: String,
+    /// Number of views.
+    pub views: usize,
+    /// Rows and columns of the detector.
+    pub detector: [usize; 2],
+    /// Shape of the volume.
+    pub volume: [usize; 3],
+    /// Checksum of all line integrals.
+    pub projections_fnv1a64: String,
+    /// Checksum of geometry and unit.
+    pub geometry_fnv1a64: String,
+}
+
+impl ScanRecord {
+    /// The record of the whole scan read from `path`.
+    pub fn of(path: &Path, scan: &Scan) -> Result<Self> {
+        let placed = to_json(&(&scan.geometry, &scan.unit))?;
+        Ok(Self {
+            path: path.display().to_string(),
+            views: scan.geometry.views.len(),
+            detector: scan.geometry.detector,
+            volume: scan.geometry.volume.shape,
+            projections_fnv1a64: checksum(scan.projections.iter().flat_map(|x| x.to_le_bytes())),
+            geometry_fnv1a64: checksum(placed.into_bytes().into_iter()),
+        })
+    }
+
+    /// The name of its file or folder.
+    pub fn name(&self) -> String {
+        stem(&self.path)
+    }
+
+    /// Text for people.
+    pub fn line(&self) -> String {
+        let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
+        format!("{}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
+    }
+}
+
+/// FNV-1a hash, to recognize a scan.
+fn checksum(bytes: impl Iterator<Item = u8>) -> String {
+    let hash = bytes.fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
+    format!("{hash:016x}")
 }

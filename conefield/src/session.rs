@@ -180,11 +180,11 @@ impl Run<'_> {
     /// The scored volume of a solution; `collect` computes its voxels.
     pub fn in_memory(
         &self,
-        solved: &mut Solved,
-        collect: impl FnOnce(&mut Reconstruction, &dyn Backend) -> Result<Volume>,
+        solved: &Solved,
+        collect: impl FnOnce(&Reconstruction, &dyn Backend) -> Result<Volume>,
     ) -> Result<InMemory> {
         let start = Instant::now();
-        let mut volume = collect(&mut solved.solution.result, self.backend)?;
+        let mut volume = collect(&solved.solution.result, self.backend)?;
         volume.affine = volume.affine.or(self.input.reference.as_ref().and_then(|r| r.affine));
         let export_s = start.elapsed().as_secs_f64();
         let start = Instant::now();

@@ -181,11 +181,10 @@ pub fn reconstruct<'py>(
         let reference = wanted.reference(scan, reference)?;
         let mut run = wanted.planned(scan.scan.clone(), reference, start.as_ref(), backend.as_ref(), watch, begin)?;
         let mut progress = Progress::new(watch, function);
-        let mut solved = run.solve(start.as_ref(), None, &mut progress)?;
+        let solved = run.solve(start.as_ref(), None, &mut progress)?;
         progress.finish();
-        let InMemory { volume, written, .. } = run.in_memory(&mut solved, |result, backend| {
-            collect(result.voxels(backend)?.as_mut(), &|| watch.cancelled())
-        })?;
+        let InMemory { volume, written, .. } =
+            run.in_memory(&solved, |result, backend| collect(result.voxels(backend)?.as_mut(), &|| watch.cancelled()))?;
         let loaded = &run.method.loaded;
         let mut record = json!(run.record(&solved, progress.records().last(), written));
         record["spec_toml"] = to_toml(&loaded.spec)?.into();

@@ -9,7 +9,7 @@ use conefield::score::{SCORES, cells_of};
 use conefield::session::{InMemory, Request, Session};
 use conefield::{memory, parse, specs};
 use conefield_backend_cpu::Cpu;
-use conefield_core::method::{Limits, Solution};
+use conefield_core::method::{Limits, Reconstruction, Solution};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use conefield_evaluation::metrics::Scores;
@@ -98,6 +98,8 @@ impl DemoArgs {
         info!("simulated {} views of {size} x {size} pixels", self.views);
 
         signals::listen()?;
+        let path = folder.join("fast.safetensors");
+        conefield_io::write_atomic(&path, |w| w.write_all(specs::FAST_WEIGHTS).map_err(|e| Error::io(&path, e)))?;
         let scan = Arc::new(scan);
         let mut entries = vec![];
         for (name, session) in methods {
@@ -147,8 +149,8 @@ impl DemoArgs {
 
 fn compete(name: &'static str, session: Session<'_>, scan: Arc<Scan>, truth: Volume) -> Result<Entry> {
     let mut run = session.plan(Input::new(scan, vec![], Some(truth), Some(1.0))?, 0.0, &|| false)?;
-    let mut solved = run.solve(None, None, &mut Progress::new(name, None))?;
-    let InMemory { volume, written } = run.in_memory(&mut solved, |result, backend| result.volume(backend))?;
+    let solved = run.solve(None, None, &mut Progress::new(name, None))?;
+    let InMemory { volume, written } = run.in_memory(&solved, Reconstruction::volume)?;
     let Solution { steps, train_s, .. } = solved.solution;
     let scores = written.scores.ok_or_else(|| Error::unsupported("demo", "the phantom is not scored"))?;
     Ok(Entry { name, steps, train_s, export_s: written.export_s, scores, volume })

@@ -15,10 +15,9 @@ use conefield::input::{self, Input};
 use conefield::memory;
 use conefield::method::Read;
 use conefield::parse;
-use conefield::record::{RunRecord, Written};
+use conefield::record::{RunRecord, ScanRecord, Written};
 use conefield::session::{self, Request, Run, Session, Solved};
 use conefield::tradeoff::front::Front;
-use conefield::tradeoff::trial::ScanRecord;
 use conefield::{files, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
@@ -169,12 +168,12 @@ impl ReconstructArgs {
             watch::serve(&self.output, port)?;
         }
         let mut progress = self.progress(&folder, metrics, identity)?;
-        let mut solved = run.solve(None, resume.as_ref(), &mut progress)?;
+        let solved = run.solve(None, resume.as_ref(), &mut progress)?;
         let last = progress.records().last().cloned();
         let board = progress.take_board();
         drop(progress);
 
-        let written = self.write(&folder, &run, &mut solved, backend.as_ref())?;
+        let written = self.write(&folder, &run, &solved, backend.as_ref())?;
         if let Some(mut board) = board {
             board.picture(solved.solution.steps, "slices", &folder.file("slices.png"))?;
         }
@@ -257,8 +256,8 @@ impl ReconstructArgs {
     }
 
     /// Writes and scores the result.
-    fn write(&self, folder: &RunFolder, run: &Run<'_>, solved: &mut Solved, backend: &dyn Backend) -> Result<Written> {
-        let (reference, result) = (run.input.reference.as_ref(), &mut solved.solution.result);
+    fn write(&self, folder: &RunFolder, run: &Run<'_>, solved: &Solved, backend: &dyn Backend) -> Result<Written> {
+        let (reference, result) = (run.input.reference.as_ref(), &solved.solution.result);
         let place = folder.file("volume.nii.gz");
         let start = Instant::now();
         let parameters = session::parameters(result);

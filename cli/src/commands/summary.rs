@@ -2,8 +2,7 @@
 
 use super::evaluate;
 use crate::out;
-use conefield::record::RunRecord;
-use conefield::tradeoff::trial::ScanRecord;
+use conefield::record::{RunRecord, ScanRecord};
 use std::path::Path;
 
 /// Below this share a budget counts as not used up.

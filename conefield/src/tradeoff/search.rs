@@ -1,13 +1,14 @@
 //! The search: every candidate under the smallest budget, the best share of them under the next one, and so on. The
 //! state is kept in the search's folder, from which it can be resumed.
 
+use crate::record::ScanRecord;
 use crate::tradeoff::front::Unknowns;
 use crate::tradeoff::halving::{TrialOutcome, go_on, to_come};
 use crate::tradeoff::json::{read_json, to_json};
 use crate::tradeoff::levers::Candidate;
 use crate::tradeoff::schedule::TOO_SHORT;
 use crate::tradeoff::statistics::mean;
-use crate::tradeoff::trial::{Figures, ScanRecord};
+use crate::tradeoff::trial::Figures;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::text::duration;

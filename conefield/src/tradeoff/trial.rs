@@ -1,62 +1,13 @@
 //! A whole run in a search or a comparison: its inputs and its figures.
 
-use crate::tradeoff::json::{read_json, to_json};
+use crate::record::ScanRecord;
+use crate::tradeoff::json::read_json;
 use conefield_core::Result;
 use conefield_core::scan::{Scan, Volume};
 use conefield_evaluation::report::MiddleSlices;
-use conefield_evaluation::report::text::stem;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::Path;
-
-/// Identifies a scan.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct ScanRecord {
-    /// Path from which it was read.
-    pub path: String,
-    /// Number of views.
-    pub views: usize,
-    /// Rows and columns of the detector.
-    pub detector: [usize; 2],
-    /// Shape of the volume.
-    pub volume: [usize; 3],
-    /// Checksum of all line integrals.
-    pub projections_fnv1a64: String,
-    /// Checksum of geometry and unit.
-    pub geometry_fnv1a64: String,
-}
-
-impl ScanRecord {
-    /// The record of the whole scan read from `path`.
-    pub fn of(path: &Path, scan: &Scan) -> Result<Self> {
-        let placed = to_json(&(&scan.geometry, &scan.unit))?;
-        Ok(Self {
-            path: path.display().to_string(),
-            views: scan.geometry.views.len(),
-            detector: scan.geometry.detector,
-            volume: scan.geometry.volume.shape,
-            projections_fnv1a64: checksum(scan.projections.iter().flat_map(|x| x.to_le_bytes())),
-            geometry_fnv1a64: checksum(placed.into_bytes().into_iter()),
-        })
-    }
-
-    /// The name of its file or folder.
-    pub fn name(&self) -> String {
-        stem(&self.path)
-    }
-
-    /// Text for people.
-    pub fn line(&self) -> String {
-        let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
-        format!("{}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
-    }
-}
-
-/// FNV-1a hash, to recognize a scan.
-fn checksum(bytes: impl Iterator<Item = u8>) -> String {
-    let hash = bytes.fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
-    format!("{hash:016x}")
-}
 
 /// What is known about the input after it has been read.
 pub struct TrialInput {

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 type Needs = BTreeMap<String, BTreeSet<String>>;
 
 /// Crates that only developers build.
-const OWN: [&str; 5] = ["tests", "benches", "examples", "one-dependency", "fuzz"];
+const OWN: [&str; 4] = ["tests", "benches", "examples", "one-dependency"];
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")

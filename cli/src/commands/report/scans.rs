@@ -5,7 +5,7 @@ use crate::commands::info::lines;
 use crate::run_folder::RunOnDisk;
 use conefield::memory::Memory;
 use conefield::parse::HoldOut;
-use conefield::tradeoff::trial::ScanRecord;
+use conefield::record::ScanRecord;
 use conefield::{input, projection};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::{Scan, Unit, Volume};
