@@ -9,6 +9,7 @@ use conefield_benches::{bandwidth, multiply_adds, times};
 use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid, norm};
 use conefield_core::method::{Context, Job, Silent};
+use conefield_core::place::Host;
 use conefield_core::regularizer::Update;
 use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::space::Space;
@@ -61,7 +62,7 @@ fn main() -> Result<()> {
     };
     let (driven, driven_tilted) = (drive(&geometry), drive(&turned));
     let header = ScanHeader { views: 0, detector: [0; 2], volume: geometry.volume.shape };
-    let mut prox = TvProx::new(geometry.volume.shape, [1.0; 3], &Space::new(header));
+    let mut prox = TvProx::new(geometry.volume.shape, [1.0; 3], &Space::new(header, Arc::new(Host))).unwrap();
     let (noisy, mut smooth) = (volume.as_slice().unwrap_or_default(), vec![0.0; volume.len()]);
     let dual = times(RUNS, || prox.apply(noisy, 0.1, STEPS, &mut smooth));
     let mut arrays: [Vec<f32>; 3] = std::array::from_fn(|_| noisy.to_vec());

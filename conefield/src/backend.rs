@@ -4,8 +4,6 @@ use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::voxel::{VoxelProjector, VoxelView};
-use ndarray::{ArrayView3, ArrayViewMut3};
 use serde::{Serialize, Serializer};
 use std::fmt;
 use std::path::Path;
@@ -109,19 +107,6 @@ impl Backend for Auto {
         let (exe, mut explain) = self.cpu.compile(pipeline)?;
         explain.notes.insert(0, self.note());
         Ok((exe, explain))
-    }
-
-    fn place(&self, projector: Box<dyn VoxelProjector>) -> Result<Box<dyn VoxelProjector>> {
-        self.cpu.place(projector)
-    }
-
-    fn backproject(
-        &self,
-        views: &[VoxelView],
-        images: ArrayView3<'_, f32>,
-        volume: ArrayViewMut3<'_, f32>,
-    ) -> Result<bool> {
-        self.cpu.backproject(views, images, volume)
     }
 }
 

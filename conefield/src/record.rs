@@ -8,6 +8,7 @@ use crate::tradeoff::schedule::Schedule;
 use conefield_core::Result;
 use conefield_core::backend::Explain;
 use conefield_core::method::Limits;
+use conefield_core::place::Moved;
 use conefield_core::scan::Scan;
 use conefield_evaluation::metrics::Scores;
 use conefield_evaluation::report::text::stem;
@@ -45,6 +46,8 @@ pub struct RunRecord {
     pub plugins: Vec<Used>,
     /// The backend, and what it compiled.
     pub backend: Explain,
+    /// Bytes that crossed between the host and the backend's device; 0 on the CPU.
+    pub moved: Moved,
     /// The instruction set.
     pub simd: String,
     /// Number of threads.

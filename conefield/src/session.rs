@@ -15,11 +15,13 @@ use crate::{plugins, score, specs};
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Solution};
+use conefield_core::place::Moved;
 use conefield_core::scan::Volume;
 use conefield_core::spec::load::Loaded;
 use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
 use conefield_evaluation::metrics::Scores;
+use conefield_evaluation::report::text::bytes;
 use std::path::PathBuf;
 use std::time::Instant;
 use tracing::info;
@@ -118,7 +120,8 @@ impl<'a> Session<'a> {
         schedule.iter().flat_map(|s| s.lines(&method.loaded.spec.name)).for_each(|line| info!("{line}"));
         info!("memory: {}", method.memory.line());
         let (seed, limits) = (request.seed, request.limits);
-        Ok(Run { input, method, schedule, backend, seed, limits, budget: request.budget, begin, spent, load_s })
+        let (budget, moved) = (request.budget, backend.moved());
+        Ok(Run { input, method, schedule, backend, seed, limits, budget, begin, spent, load_s, moved })
     }
 }
 
@@ -137,6 +140,8 @@ pub struct Run<'a> {
     begin: Instant,
     spent: f64,
     load_s: f64,
+    /// Bytes that the backend had moved before.
+    moved: Moved,
 }
 
 /// A solution with the times around it.
@@ -169,7 +174,17 @@ impl Run<'_> {
         let Planned { loaded, plan, .. } = &mut self.method;
         let solution = plan.run(&job, observer).map_err(|e| loaded.locate(e))?;
         let prepare_s = (begin.elapsed().as_secs_f64() + self.spent - solution.train_s).max(0.0);
+        let Moved { to_device, from_device } = self.moved();
+        if to_device > 0 {
+            info!("moved {} to the device and {} from it", bytes(to_device), bytes(from_device));
+        }
         Ok(Solved { solution, prepare_s })
+    }
+
+    /// Bytes moved since the run was planned.
+    fn moved(&self) -> Moved {
+        let (before, now) = (self.moved, self.backend.moved());
+        Moved { to_device: now.to_device - before.to_device, from_device: now.from_device - before.from_device }
     }
 
     /// Scores of `volume`, called `place` in errors, against the reference, if there is one.
@@ -211,6 +226,7 @@ impl Run<'_> {
             reference: None,
             plugins: plugins::used(&method.loaded.tree),
             backend: method.plan.outline().backend(),
+            moved: self.moved(),
             simd: simd_level(),
             threads: rayon::current_num_threads(),
             machine: Machine::here(),

@@ -3,11 +3,11 @@
 use crate::error::Result;
 use crate::loss::Loss;
 use crate::pipeline::{Model, Pipeline};
+use crate::place::{Host, Moved, Place};
 use crate::prior::Prior;
 use crate::stage::UnitRay;
-use crate::voxel::{VoxelProjector, VoxelView};
-use ndarray::{ArrayView3, ArrayViewMut3};
 use serde::Serialize;
+use std::sync::Arc;
 
 /// A ray with its measured value, both in the scale of the stages.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -109,20 +109,13 @@ pub trait Backend: Send + Sync {
     fn name(&self) -> &'static str;
     /// Checks that this backend can run every stage and describes how; never falls back silently.
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)>;
-    /// Moves the projector to this backend's device; returns it unchanged if there is no device.
-    fn place(&self, projector: Box<dyn VoxelProjector>) -> Result<Box<dyn VoxelProjector>> {
-        Ok(projector)
+    /// Where this backend keeps volumes and views.
+    fn place(&self) -> Arc<dyn Place> {
+        Arc::new(Host)
     }
-    /// Adds `Σ s/U²·p(row, column)` to each voxel of `volume`, summed over the views with pixels `images`
-    /// (`[view, row, column]`), bilinear between pixels and 0 outside the detector. Returns whether it did: a backend
-    /// without a device leaves this to the method.
-    fn backproject(
-        &self,
-        _views: &[VoxelView],
-        _images: ArrayView3<'_, f32>,
-        _volume: ArrayViewMut3<'_, f32>,
-    ) -> Result<bool> {
-        Ok(false)
+    /// Bytes moved between the host and this backend's device so far.
+    fn moved(&self) -> Moved {
+        Moved::default()
     }
 }
 

@@ -2,6 +2,7 @@
 
 use crate::error::Result;
 use crate::scan::ScanHeader;
+use crate::wgsl::Fragment;
 use ndarray::ArrayView3;
 
 /// Settings of a data term.
@@ -43,6 +44,12 @@ pub trait Misfit: Send + Sync {
 
     /// Multiplies each value by the standard deviation of `φ'_i` under noise, in units of [`Misfit::noise`].
     fn spread(&self, view: usize, measured: &[f32], values: &mut [f32]);
+
+    /// The same formulas for a place with kernels: `stage_differentiate`, `stage_curve` and `stage_spread`; see
+    /// [`crate::wgsl`].
+    fn wgsl(&self) -> Option<Fragment> {
+        None
+    }
 
     /// Standard deviation of the noise of line integrals near 0, estimated from the scan.
     fn noise(&self) -> f64;

@@ -11,8 +11,9 @@
 //!   search for values that are not allowed.
 //! - [`settings`], [`spec`], [`registry`]: what a user writes, and the available types.
 //! - [`host`]: stages on the host, to inspect a model beside training.
-//! - [`voxel`]: line integrals of voxel volumes; [`resident`]: volumes that stay on a device.
-//! - [`basis`], [`data_term`], [`regularizer`]: parts of an iterative method; [`space`]: its arrays and their memory.
+//! - [`voxel`]: line integrals of voxel volumes.
+//! - [`basis`], [`data_term`], [`regularizer`]: parts of an iterative method; [`place`], [`space`]: its arrays, and
+//!   their memory.
 //! - [`method`]: methods, their plans and runs; [`pipeline`], [`backend`], [`trained`]: from the stages of a field to a
 //!   volume; [`checkpoint`]: the state of a run.
 
@@ -39,12 +40,12 @@ pub mod outside;
 pub mod pages;
 pub mod parts;
 pub mod pipeline;
+pub mod place;
 pub mod prelude;
 pub mod prior;
 pub mod random;
 pub mod registry;
 pub mod regularizer;
-pub mod resident;
 pub mod scan;
 pub mod scene;
 pub mod settings;

@@ -2,6 +2,7 @@
 
 use crate::error::{Result, ensure};
 use crate::geometry::VoxelGrid;
+use crate::place::{Array, State};
 use crate::space::Space;
 use crate::wgsl::Fragment;
 use ndarray::ArrayView3;
@@ -74,6 +75,11 @@ pub trait Penalty: Send {
     /// `R(x)`, without weight.
     fn value(&self, x: ArrayView3<'_, f32>) -> f64;
 
+    /// Whether it is adaptive; if not, [`Penalty::adapt`] is not called.
+    fn adapts(&self) -> bool {
+        false
+    }
+
     /// Adapts an adaptive penalty to the coefficients `x`. Called before each pass; the result depends on `x` only.
     /// Returns the new `R(x)` if it changed.
     fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
@@ -91,13 +97,13 @@ pub trait Penalty: Send {
         update.around(|v, u| self.prox(v, tau, u));
     }
 
-    /// The same proximal map for a GPU, if the penalty is one of differences and has WGSL.
-    fn dual(&mut self) -> Option<Dual<'_>> {
+    /// The same penalty for a place with kernels; `None` if it runs on the host only.
+    fn kernels(&mut self) -> Option<Kernels<'_>> {
         None
     }
 
     /// State for the next call, by name, for checkpoints.
-    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
+    fn state(&mut self) -> Vec<(&str, State<'_>)> {
         vec![]
     }
 
@@ -107,20 +113,40 @@ pub trait Penalty: Send {
     }
 }
 
-/// The proximal map of a penalty of differences, by steps on its dual variables `p`: `u = max(0, v − τ·∇ᵀp)`. ∇ takes
-/// forward differences times `weights`, 0 at the far faces. Each step replaces every voxel's `p` by
-/// `stage_ascend(p, ∇u/(L·τ), guide)`, with `L = 4·Σ weights²`, a bound of `‖∇‖²`.
+/// A penalty for a place with kernels.
+pub enum Kernels<'a> {
+    /// No penalty: the proximal map is `u = max(0, v)`.
+    Clip,
+    /// A penalty of differences.
+    Dual(Dual<'a>),
+}
+
+/// A penalty of differences, `R(x) = Σ_j stage_cost(∇x_j, guide_j)`. ∇ takes forward differences times `weights`, 0 at
+/// the far faces. The proximal map takes steps on dual variables `p`: `u = max(0, v − τ·∇ᵀp)`. Each step replaces every
+/// voxel's `p` by `stage_ascend(p, ∇u/(L·τ), guide)`, with `L = 4·Σ weights²`, a bound of `‖∇‖²`.
 pub struct Dual<'a> {
-    /// `stage_ascend`; see [`crate::wgsl`].
+    /// `stage_ascend` and `stage_cost`; see [`crate::wgsl`].
     pub fragment: Fragment,
     /// Weights of differences along x, y, z.
     pub weights: [f32; 3],
     /// Steps per update.
     pub steps: usize,
     /// The dual variables along x, y and z, from the previous update.
-    pub p: [&'a mut [f32]; 3],
+    pub p: [&'a mut Array; 3],
     /// A vector per voxel; 0 if there are none.
-    pub guide: Option<[&'a [f32]; 3]>,
+    pub guide: Option<Guide<'a>>,
+}
+
+/// Vectors normal to a volume's edges, which [`Penalty::adapt`] finds: `n = √strength·s/√(|s|² + η²)`, where the slope s
+/// is a central difference times the weights, smoothed by 1-2-1 along the other two axes (Sobel), 0 across the far faces,
+/// and η is `scale` times the root mean square of all |s|.
+pub struct Guide<'a> {
+    /// Components along x, y and z.
+    pub vectors: [&'a mut Array; 3],
+    /// Largest square of a vector's length.
+    pub strength: f32,
+    /// Threshold of a clear edge.
+    pub scale: f32,
 }
 
 impl Dual<'_> {

@@ -1,15 +1,18 @@
 //! The arrays of a method and their memory.
 //!
-//! A constructor requests its arrays from a [`Space`]. One kind of space allocates them. The other kind, a tally,
-//! returns empty arrays and adds up their bytes: the same code allocates and estimates memory.
+//! A constructor requests its arrays from a [`Space`]. One kind of space allocates them in a place. The other kind, a
+//! tally, returns empty arrays and adds up their bytes: the same code allocates and estimates memory.
 
+use crate::error::Result;
+use crate::place::{Array, Host, Place};
 use crate::scan::ScanHeader;
-use ndarray::Array3;
 use std::cell::Cell;
+use std::sync::Arc;
 
 /// Allocates arrays for a scan of known size, or only counts their bytes.
 pub struct Space {
     header: ScanHeader,
+    place: Arc<dyn Place>,
     tally: bool,
     /// Bytes currently held.
     held: Cell<u64>,
@@ -18,19 +21,24 @@ pub struct Space {
 }
 
 impl Space {
-    /// A space that allocates.
-    pub fn new(header: ScanHeader) -> Self {
-        Self { header, tally: false, held: Cell::new(0), most: Cell::new(0) }
+    /// A space that allocates in `place`.
+    pub fn new(header: ScanHeader, place: Arc<dyn Place>) -> Self {
+        Self { header, place, tally: false, held: Cell::new(0), most: Cell::new(0) }
     }
 
     /// A space that returns empty arrays and counts the bytes they would take.
     pub fn tally(header: ScanHeader) -> Self {
-        Self { tally: true, ..Self::new(header) }
+        Self { tally: true, ..Self::new(header, Arc::new(Host)) }
     }
 
     /// Whether it only counts: its arrays are empty.
     pub fn is_tally(&self) -> bool {
         self.tally
+    }
+
+    /// Where its arrays live.
+    pub fn place(&self) -> &Arc<dyn Place> {
+        &self.place
     }
 
     /// The sizes of the scan.
@@ -39,20 +47,20 @@ impl Space {
     }
 
     /// A zero for each voxel.
-    pub fn volume(&self) -> Array3<f32> {
+    pub fn volume(&self) -> Result<Array> {
         self.array(self.header.volume)
     }
 
     /// A zero for each pixel of `views` views.
-    pub fn projections(&self, views: usize) -> Array3<f32> {
+    pub fn projections(&self, views: usize) -> Result<Array> {
         let [rows, columns] = self.header.detector;
         self.array([views, rows, columns])
     }
 
     /// Zeros.
-    pub fn array(&self, shape: [usize; 3]) -> Array3<f32> {
+    pub fn array(&self, shape: [usize; 3]) -> Result<Array> {
         self.hold(shape.iter().fold(size_of::<f32>() as u64, |n, side| n.saturating_mul(*side as u64)));
-        Array3::zeros(if self.tally { [0; 3] } else { shape })
+        if self.tally { Host.zeros([0; 3]) } else { self.place.zeros(shape) }
     }
 
     /// Counts bytes held from now on.
@@ -89,10 +97,10 @@ mod tests {
 
     #[test]
     fn both_kinds_count_the_same() {
-        for space in [Space::new(HEADER), Space::tally(HEADER)] {
-            let volume = space.volume();
+        for space in [Space::new(HEADER, Arc::new(Host)), Space::tally(HEADER)] {
+            let volume = space.volume().unwrap();
             assert_eq!(space.bytes(), 96);
-            let views = space.briefly(|space| space.projections(2));
+            let views = space.briefly(|space| space.projections(2)).unwrap();
             assert_eq!(space.bytes(), 96 + 120);
             space.pass(10);
             assert_eq!(space.bytes(), 96 + 120);
@@ -107,8 +115,8 @@ mod tests {
     #[test]
     fn sizes_beyond_any_memory_are_counted_without_overflow() {
         let space = Space::tally(ScanHeader { volume: [usize::MAX; 3], ..HEADER });
-        space.volume();
-        space.volume();
+        space.volume().unwrap();
+        space.volume().unwrap();
         assert_eq!(space.bytes(), u64::MAX);
     }
 }

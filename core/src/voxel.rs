@@ -2,7 +2,6 @@
 
 use crate::error::Result;
 use crate::geometry::Geometry;
-use crate::resident::{Resident, Volumes};
 use crate::scan::ScanHeader;
 use crate::simd::Real;
 use crate::wgsl::Fragment;
@@ -29,13 +28,6 @@ pub trait VoxelProjector: Send + Sync {
         None
     }
 
-    /// Keeps the volumes of a proximal gradient method on this projector's device. `None` if it has none; an error if
-    /// the volumes or the penalty cannot be there.
-    fn resident(&self, volumes: Volumes<'_>) -> Option<Result<Box<dyn Resident>>> {
-        let _ = volumes;
-        None
-    }
-
     /// Working memory of either direction for `views` views of a scan of this size on the CPU, in bytes.
     fn scratch(&self, header: &ScanHeader, views: usize) -> u64 {
         let _ = (header, views);
@@ -56,9 +48,6 @@ impl VoxelProjector for Arc<dyn VoxelProjector> {
     }
     fn wgsl(&self) -> Option<Fragment> {
         self.as_ref().wgsl()
-    }
-    fn resident(&self, volumes: Volumes<'_>) -> Option<Result<Box<dyn Resident>>> {
-        self.as_ref().resident(volumes)
     }
     fn scratch(&self, header: &ScanHeader, views: usize) -> u64 {
         self.as_ref().scratch(header, views)

@@ -69,10 +69,20 @@
 //! fn stage_value(p: u32) -> f32                                          // the field at point p, z fastest
 //! ```
 //!
-//! A penalty of differences ([`Dual`](crate::regularizer::Dual)) defines a step of its dual variables at a voxel
+//! A penalty of differences ([`Dual`](crate::regularizer::Dual)) defines a step of its dual variables at a voxel, and its
+//! value
 //!
 //! ```wgsl
 //! fn stage_ascend(p: vec3<f32>, d: vec3<f32>, guide: vec3<f32>) -> vec3<f32>
+//! fn stage_cost(d: vec3<f32>, guide: vec3<f32>) -> f32                   // the penalty of the differences d at a voxel
+//! ```
+//!
+//! A data term ([`Misfit`](crate::data_term::Misfit)) defines, for a pixel with the measured value `p`,
+//!
+//! ```wgsl
+//! fn stage_differentiate(p: f32, r: f32) -> vec2<f32>                    // φ(r) and φ'(r)
+//! fn stage_curve(p: f32, x: f32) -> f32                                  // x times a bound of φ''
+//! fn stage_spread(p: f32, x: f32) -> f32                                 // x times the standard deviation of φ'
 //! ```
 //!
 //! A projector of voxels defines

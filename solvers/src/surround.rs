@@ -17,7 +17,7 @@ use conefield_core::outside::Outside;
 use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::scene::{CoarseSurround, SurroundRule};
 use conefield_projectors::voxel::Joseph;
-use ndarray::{Array3, Axis, Zip, s};
+use ndarray::{Array3, Axis, s};
 
 /// Most cells.
 const MOST: usize = 1 << 24;
@@ -163,15 +163,14 @@ impl Around {
         geometry: &Geometry,
         mut take: impl FnMut(usize, ndarray::ArrayView2<'_, f32>),
     ) -> Result<()> {
-        let projector = job.backend.place(Box::new(Joseph {}))?;
-        let (operator, [rows, columns]) = (projector.operator(), geometry.detector);
+        let (place, [rows, columns]) = (job.backend.place(), geometry.detector);
         let whole = Geometry { volume: self.cells, ..geometry.clone() };
+        let cells = place.adopt(cells.clone())?;
         let views: Vec<usize> = (0..geometry.views.len()).collect();
+        let mut lines = place.zeros([TOGETHER.min(views.len()), rows, columns])?;
         for some in views.chunks(TOGETHER) {
-            let mut lines = Array3::zeros((some.len(), rows, columns));
-            operator.forward(&whole, some, cells.view(), lines.view_mut());
-            operator.fault()?;
-            Zip::indexed(lines.outer_iter()).for_each(|i, image| take(some[i], image));
+            place.forward(&Joseph {}, &whole, some, &cells, &mut lines)?;
+            some.iter().zip(place.read(&lines)?.outer_iter()).for_each(|(&view, image)| take(view, image));
         }
         Ok(())
     }

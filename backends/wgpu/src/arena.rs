@@ -45,7 +45,7 @@ pub fn upload(shared: &Shared, buffers: &Buffers, chain: &Chain, arena: &Arena) 
             let Some(buffer) = buffers.get(&format!("{part}_{s}")) else { continue };
             let bytes: &[u8] = bytemuck::cast_slice(&data[segment(chain, s, data.len(), size)]);
             for (i, piece) in bytes.chunks(PIECE as usize).enumerate() {
-                gpu.queue.write_buffer(buffer, i as u64 * PIECE, piece);
+                gpu.write(buffer, i as u64 * PIECE, piece);
                 // Submits the piece, so that not all pieces wait in memory at once.
                 gpu.queue.submit([]);
             }

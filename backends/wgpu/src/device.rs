@@ -1,8 +1,10 @@
 //! Adapters and their features; an open device and its errors.
 
 use conefield_core::error::{Error, Result};
+use conefield_core::place::Moved;
 use serde::Serialize;
 use std::fmt;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::time::Duration;
 
@@ -182,6 +184,8 @@ pub struct Gpu {
     pub(crate) queue: wgpu::Queue,
     /// The first error outside of an error scope.
     failed: Arc<Mutex<Option<String>>>,
+    /// Bytes to the device and from it.
+    moved: [AtomicU64; 2],
 }
 
 impl Gpu {
@@ -237,7 +241,7 @@ impl Gpu {
                 note(&keep, format!("the device was lost: {message}"));
             }
         });
-        Ok(Self { adapter, device, queue, failed })
+        Ok(Self { adapter, device, queue, failed, moved: Default::default() })
     }
 
     /// The first error on the device since the last call.
@@ -250,6 +254,30 @@ impl Gpu {
 
     pub(crate) fn error(&self, what: impl Into<String>) -> Error {
         Error::Device { device: self.adapter.to_string(), what: what.into() }
+    }
+
+    /// Overwrites `data.len()` bytes of a buffer from byte `at` on.
+    pub(crate) fn write(&self, to: &wgpu::Buffer, at: u64, data: &[u8]) {
+        self.moved[0].fetch_add(data.len() as u64, Ordering::Relaxed);
+        self.queue.write_buffer(to, at, data);
+    }
+
+    /// Bytes that crossed between the host and the device.
+    pub fn moved(&self) -> Moved {
+        let [to_device, from_device] = self.moved.each_ref().map(|bytes| bytes.load(Ordering::Relaxed));
+        Moved { to_device, from_device }
+    }
+
+    /// Hands commands to the device.
+    pub(crate) fn submit(&self, encoder: wgpu::CommandEncoder) -> wgpu::SubmissionIndex {
+        self.queue.submit([encoder.finish()])
+    }
+
+    /// Waits until the device has finished a submission and all before it.
+    pub(crate) fn wait_for(&self, index: wgpu::SubmissionIndex) -> Result<()> {
+        let polled = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None });
+        self.fault()?;
+        polled.map(drop).map_err(|e| self.error(e.to_string()))
     }
 
     /// Waits until the device has finished all submitted work.
@@ -311,6 +339,7 @@ impl Gpu {
             Some(Err(e)) => return Err(self.error(e.to_string())),
             None => return Err(self.error("its result cannot be read back")),
         }
+        self.moved[1].fetch_add(bytes, Ordering::Relaxed);
         let view = slice.get_mapped_range().map_err(|e| self.error(e.to_string()))?;
         read(&view);
         drop(view);

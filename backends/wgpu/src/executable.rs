@@ -311,7 +311,7 @@ impl Wgpu {
     fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
         let buffer = self.buffers.get(name).ok_or_else(|| self.gpu().error(format!("no buffer {name}")))?;
         if !bytes.is_empty() {
-            self.gpu().queue.write_buffer(buffer, 0, bytes);
+            self.gpu().write(buffer, 0, bytes);
         }
         Ok(())
     }
@@ -417,7 +417,7 @@ impl Wgpu {
             let samples: Vec<[f32; 4]> = points.iter().map(|(p, _)| [p[0], p[1], p[2], 0.0]).collect();
             let targets: Vec<f32> = points.iter().map(|p| p.1).collect();
             let buffer = self.buffers.get("samples").ok_or_else(|| self.gpu().error("no buffer samples"))?;
-            self.gpu().queue.write_buffer(buffer, 16 * u64::from(wave.ray_rows), bytemuck::cast_slice(&samples));
+            self.gpu().write(buffer, 16 * u64::from(wave.ray_rows), bytemuck::cast_slice(&samples));
             self.write("targets", bytemuck::cast_slice(&targets))?;
         }
         let mut block_rows = 0;

@@ -9,8 +9,7 @@
 //! - [`measure`]: measured limits of a device.
 //! - [`profile`]: time on the device.
 //! - [`single`]: one stage alone, to compare it with the CPU.
-//! - [`voxels`]: projection of voxel volumes and FDK's back-projection.
-//! - `resident`: proximal gradient updates of volumes that stay on the device.
+//! - `place`: volumes and views on the device, and the kernels that combine them.
 //!
 //! Sums over rows have no fixed order. Results agree with the CPU's within rounding, and so do two runs.
 
@@ -21,31 +20,30 @@ pub mod executable;
 pub mod kernel;
 pub mod measure;
 mod pace;
+mod place;
 pub mod profile;
-mod resident;
 pub mod single;
 pub mod source;
 #[cfg(feature = "translations")]
 mod translations;
-pub mod voxels;
 pub mod wave;
 
 use compose::{Chain, Target};
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::Pipeline;
+use conefield_core::place::{Moved, Place};
 use conefield_core::stage::{GradKind, titled};
-use conefield_core::voxel::{VoxelProjector, VoxelView};
 pub use device::{Adapter, Atomics, Gpu, Limits, adapters};
 use executable::{Kernels, Wgpu as Running};
 use kernel::Cache;
-use ndarray::{ArrayView3, ArrayViewMut3};
+pub use place::DevicePlace;
 use std::sync::Arc;
-use voxels::OnDevice;
 
 /// An open device with the kernels compiled so far.
 pub struct Wgpu {
     shared: Arc<Shared>,
+    place: Arc<DevicePlace>,
 }
 
 /// State shared by all executables of a backend.
@@ -81,7 +79,8 @@ impl Wgpu {
     /// The same with other limits than the adapter's.
     pub fn with_limits(index: Option<usize>, limits: Limits) -> Result<Self> {
         let gpu = Gpu::open(index, limits)?;
-        Ok(Self { shared: Arc::new(Shared { gpu, kernels: Cache::default(), profile: limits.profile }) })
+        let shared = Arc::new(Shared { gpu, kernels: Cache::default(), profile: limits.profile });
+        Ok(Self { place: Arc::new(DevicePlace::new(shared.clone())), shared })
     }
 
     /// The device.
@@ -152,16 +151,11 @@ impl Backend for Wgpu {
         Ok((Box::new(running), explain))
     }
 
-    fn place(&self, projector: Box<dyn VoxelProjector>) -> Result<Box<dyn VoxelProjector>> {
-        Ok(Box::new(OnDevice::new(self.shared.clone(), projector)?))
+    fn place(&self) -> Arc<dyn Place> {
+        self.place.clone()
     }
 
-    fn backproject(
-        &self,
-        views: &[VoxelView],
-        images: ArrayView3<'_, f32>,
-        volume: ArrayViewMut3<'_, f32>,
-    ) -> Result<bool> {
-        voxels::backproject(&self.shared, views, images, volume).map(|()| true)
+    fn moved(&self) -> Moved {
+        self.shared.gpu.moved()
     }
 }

@@ -38,11 +38,11 @@ impl Shared {
         // No row is left out.
         buffers.reserve(gpu, "dmu", 4 * rows as u64, usage)?;
         for (name, data) in [("x", x), ("dy", dy), ("dmu", &vec![1.0; rows])] {
-            buffers.get(name).inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::cast_slice(data)));
+            buffers.get(name).inspect(|b| gpu.write(b, 0, bytemuck::cast_slice(data)));
         }
         buffers.reserve(gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
         let run = |label: &str, source: &crate::source::Source, step: Step, groups: usize| -> Result<()> {
-            buffers.get("step").inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::bytes_of(&step)));
+            buffers.get("step").inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(&step)));
             let kernel = self.kernels.get(gpu, label, source)?;
             let bound = kernel.bind(gpu, &buffers)?;
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
@@ -77,8 +77,8 @@ impl Shared {
             let on_device = GpuRay::new(ray, 0.0, seed.unwrap_or(0), 0, count as u32);
             let (rows, training) = (count as u32, u32::from(seed.is_some()));
             let step = Step { rows, ray_rows: rows, rays: 1, training, ..Step::default() };
-            buffers.get("rays").inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::bytes_of(&on_device)));
-            buffers.get("step").inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::bytes_of(&step)));
+            buffers.get("rays").inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(&on_device)));
+            buffers.get("step").inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(&step)));
             let kernel = self.kernels.get(gpu, "sample", &source)?;
             let bound = kernel.bind(gpu, &buffers)?;
             let staging = gpu.buffer("staging", 16 * count as u64, U::MAP_READ | U::COPY_DST)?;
@@ -139,10 +139,10 @@ impl Shared {
         let gpu = &self.gpu;
         let mut buffers = Buffers::default();
         buffers.reserve(gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
-        buffers.get("step").inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::bytes_of(&step)));
+        buffers.get("step").inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(&step)));
         for (name, values) in inputs {
             buffers.reserve(gpu, name, 4 * values.len() as u64, U::STORAGE | U::COPY_DST)?;
-            buffers.get(name).inspect(|b| gpu.queue.write_buffer(b, 0, bytemuck::cast_slice(values)));
+            buffers.get(name).inspect(|b| gpu.write(b, 0, bytemuck::cast_slice(values)));
         }
         let outputs = [("losses", losses), ("dmu", step.rows as usize)];
         for (name, count) in outputs {

@@ -150,11 +150,11 @@ impl Level {
             };
             let scan = Scan { geometry: among(&fold.training), ..fold.train.clone() };
             let volume = reconstruct(&scan, backend, cancelled)?;
-            let mut residual = Array3::zeros(fold.test.projections.raw_dim());
-            let projector = backend.place(Box::new(Joseph {}))?;
+            let place = backend.place();
             let all: Vec<usize> = (0..fold.held_out.len()).collect();
-            projector.operator().forward(&among(&fold.held_out), &all, volume.view(), residual.view_mut());
-            projector.operator().fault()?;
+            let (volume, mut lines) = (place.adopt(volume)?, place.zeros(fold.test.projections.dim().into())?);
+            place.forward(&Joseph {}, &among(&fold.held_out), &all, &volume, &mut lines)?;
+            let mut residual = place.take(lines)?;
             residual.zip_mut_with(&fold.test.projections, |a, p| *a = p - *a);
             Ok(residual)
         };

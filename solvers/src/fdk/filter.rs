@@ -73,6 +73,13 @@ impl Ramp {
         Self { forward, inverse, response }
     }
 
+    /// The same filter in space: the factor of a pixel by its distance, for distances below `columns`.
+    pub fn taps(&self, columns: usize) -> Vec<f32> {
+        let mut taps: Vec<Complex<f64>> = self.response.iter().map(|r| Complex::new(f64::from(*r), 0.0)).collect();
+        forward_f64(taps.len()).process(&mut taps);
+        taps[..columns].iter().map(|tap| tap.re as f32).collect()
+    }
+
     /// Filters consecutive rows of equal length in `rows`, two per complex transform.
     pub fn filter(&self, rows: &mut [f32], columns: usize) {
         let n = self.response.len();
@@ -116,6 +123,21 @@ mod tests {
             for (i, x) in row.iter().enumerate() {
                 let sum: f64 = (0..columns).map(|k| f64::from(want[k]) * kernel(i as i64 - k as i64)).sum();
                 assert!((f64::from(*x) - pitch * sum).abs() < 1e-5, "{i}: {x} and {}", pitch * sum);
+            }
+        }
+    }
+
+    #[test]
+    fn taps_are_the_filter_in_space() {
+        let (columns, pitch) = (23, 0.7);
+        for (window, cutoff) in [(Window::Ramp, 1.0), (Window::Hann, 0.6)] {
+            let ramp = Ramp::new(columns, pitch, window, cutoff);
+            let row: Vec<f32> = (0..columns).map(|i| (i as f32 * 0.9).sin() + 1.0).collect();
+            let (taps, mut filtered) = (ramp.taps(columns), row.clone());
+            ramp.filter(&mut filtered, columns);
+            for (i, x) in filtered.iter().enumerate() {
+                let sum: f32 = row.iter().enumerate().map(|(k, v)| taps[i.abs_diff(k)] * v).sum();
+                assert!((x - sum).abs() < 1e-5, "{window:?}, {i}: {x} and {sum}");
             }
         }
     }

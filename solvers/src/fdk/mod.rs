@@ -15,12 +15,12 @@ use crate::support::Blocks;
 use crate::surround::{self, Within};
 use axis::{Axis as OrbitAxis, upright};
 use conefield_core::Error;
-use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, dot, norm, sub};
 use conefield_core::method::{
     Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
 };
+use conefield_core::place::{Array, FLOOR, FilteredViews, RowWeights};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::SurroundRule;
 use conefield_core::space::Space;
@@ -29,7 +29,7 @@ use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::backproject::backproject;
 use conefield_projectors::voxel::layout::{ColumnMajor, Pinhole, column_major_bytes};
 use filter::{Ramp, Window};
-use ndarray::{Array3, ArrayViewMut3, Axis, s};
+use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, s};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -102,22 +102,22 @@ impl Plan for Fdk {
         doubts(job.scan, &orbit, &upright, axis.as_ref()).iter().for_each(|line| observer.warn(line));
         let (geometry, measured) = orbit.symmetric(&job.scan.geometry);
         let upright = &orbit.symmetric(&upright).0;
-        let (scan, backend) = (job.scan, job.backend);
-        let run =
-            Backprojection { settings: self, scan, backend, orbit: &orbit, upright, geometry: &geometry, measured };
-        let mut volume = run.all(start, observer)?;
-        let floor = if self.nonnegative { 0.0 } else { f32::NEG_INFINITY };
-        // A comparison, not a maximum, which would turn NaN into the floor.
-        volume.par_mapv_inplace(|x| if x < floor { floor } else { x });
-        finite(&volume, 1)?;
-        let train_s = start.elapsed().as_secs_f64();
-        let mm = job.scan.unit.mm as f32;
+        let (scan, place) = (job.scan, job.backend.place());
+        let run = Backprojection { settings: self, scan, orbit: &orbit, upright, geometry: &geometry, measured };
+        let space = Space::new(scan.header(), place.clone());
+        let mut volume = run.all(&space, start, observer)?;
+        if self.nonnegative {
+            place.map(&FLOOR, [0.0; 2], &mut volume, &[])?;
+        }
         let monitor = VolumeMonitor::new(job);
+        let mut train_s = start.elapsed().as_secs_f64();
+        let held_out = monitor.held_out(place.as_ref(), &Joseph {}, &volume)?;
+        let taken = Instant::now();
+        let mut volume = place.take(volume)?;
+        finite(&volume, 1)?;
+        train_s += taken.elapsed().as_secs_f64();
+        let mm = job.scan.unit.mm as f32;
         let psnr = monitor.psnr(&volume, mm);
-        let held_out = match job.held_out {
-            Some(_) => monitor.held_out(job.backend.place(Box::new(Joseph {}))?.operator(), &volume)?,
-            None => None,
-        };
         observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
         volume.par_mapv_inplace(|x| x * mm);
         let volume = Volume { data: volume, grid: geometry.volume, affine: None };
@@ -145,7 +145,7 @@ impl Plan for Fdk {
     fn needs(&self, header: &ScanHeader) -> Needs {
         let space = Space::tally(*header);
         let at_once = views_at_once(header.detector, held(header));
-        images(&space, header.detector, at_once);
+        let _ = images(&space, header.detector, at_once);
         space.pass(column_major_bytes::<f32>(header.detector, at_once.min(header.views)));
         let [surround, subtracted] = surround::bytes(self.scene.surround, header);
         Needs { surround, subtracted, working: space.bytes(), volume: true, ..Needs::default() }
@@ -153,7 +153,7 @@ impl Plan for Fdk {
 }
 
 /// Buffer for the filtered images of at most `views` views.
-fn images(space: &Space, [rows, columns]: [usize; 2], views: usize) -> Array3<f32> {
+fn images(space: &Space, [rows, columns]: [usize; 2], views: usize) -> Result<Array> {
     space.array([views.min(space.header().views), rows, columns])
 }
 
@@ -161,7 +161,6 @@ fn images(space: &Space, [rows, columns]: [usize; 2], views: usize) -> Array3<f3
 struct Backprojection<'a> {
     settings: &'a Fdk,
     scan: &'a Scan,
-    backend: &'a dyn Backend,
     orbit: &'a FdkOrbit,
     /// Like [`geometry`](Self::geometry), rotated so that the orbit's axis is z.
     upright: &'a Geometry,
@@ -173,18 +172,18 @@ struct Backprojection<'a> {
 
 impl Backprojection<'_> {
     /// Back-projects all views, in batches. Reports progress since `start`.
-    fn all(&self, start: Instant, observer: &mut dyn Observer) -> Result<Array3<f32>> {
-        let space = Space::new(self.scan.header());
-        let mut volume = space.volume();
+    fn all(&self, space: &Space, start: Instant, observer: &mut dyn Observer) -> Result<Array> {
+        let mut volume = space.volume()?;
         let at_once = views_at_once(self.geometry.detector, held(space.header()));
-        let mut images = images(&space, self.geometry.detector, at_once);
+        let mut images = images(space, self.geometry.detector, at_once)?;
         let all: Vec<usize> = (0..self.geometry.views.len()).collect();
         let mut done = 0;
         for views in all.chunks(at_once) {
             if observer.cancelled() {
                 return Err(Error::Interrupted { step: done as u64 });
             }
-            self.some(views, images.slice_mut(s![..views.len(), .., ..]), &mut volume)?;
+            self.load(space, views, &mut images)?;
+            space.place().filtered(self, views, &mut images, &mut volume)?;
             done += views.len();
             let share = done as f64 / all.len() as f64;
             let spent = start.elapsed().as_secs_f64();
@@ -193,35 +192,48 @@ impl Backprojection<'_> {
         Ok(volume)
     }
 
-    /// Adds the consecutive views `views` to `volume`; `images` is their buffer.
-    fn some(&self, views: &[usize], mut images: ArrayViewMut3<'_, f32>, volume: &mut Array3<f32>) -> Result<()> {
-        let g = self.geometry;
+    /// Overwrites the first of `images` with the measured images of the consecutive views `views`.
+    fn load(&self, space: &Space, views: &[usize], images: &mut Array) -> Result<()> {
         let measured = self.scan.projections.slice_axis(Axis(0), (views[0]..views[0] + views.len()).into());
-        images.fill(0.0);
-        images.slice_axis_mut(Axis(2), self.measured.clone().into()).assign(&measured);
-        images.axis_iter_mut(Axis(0)).into_par_iter().zip(views).for_each(|(mut image, &view)| {
-            let pixels = image.as_slice_mut().unwrap_or_else(|| unreachable!("images follow each other"));
-            self.filter(view, pixels);
-        });
-        let scales: Vec<f64> = views.iter().map(|&v| self.orbit.steps[v] * self.orbit.radius[v].powi(2)).collect();
-        let seen = views.iter().zip(&scales).map(|(&v, &scale)| Pinhole::of(g, v).voxels(&g.volume, scale));
-        let seen: Vec<VoxelView> = seen.collect();
-        if !self.backend.backproject(&seen, images.view(), volume.view_mut())? {
-            let pixels = ColumnMajor::new(g, views, images.view(), |_, _, _, x| x);
-            backproject(g, views, &pixels, &scales, volume.view_mut());
+        let [rows, columns] = self.geometry.detector;
+        if self.measured == (0..columns) {
+            return space.place().load(measured, images, 0);
+        }
+        let mut wide = Array3::zeros((1, rows, columns));
+        for (i, image) in measured.outer_iter().enumerate() {
+            wide.slice_mut(s![0, .., self.measured.clone()]).assign(&image);
+            space.place().load(wide.view(), images, i)?;
         }
         Ok(())
     }
 
-    /// Weights and filters the image of a view.
+    /// Length of a row's pixel at the axis, mm.
+    fn pitch(&self, view: usize) -> f64 {
+        let v = &self.upright.views[view];
+        norm(v.u) * self.orbit.radius[view] / v.normal().1
+    }
+
+    /// The weight of each column.
+    fn counts(&self, view: usize) -> impl Iterator<Item = f64> {
+        let (g, radius) = (self.upright, self.orbit.radius[view]);
+        let count =
+            move |c| self.orbit.weight(view, place(g, view, c as f64, radius)) * lean(g, view, c as f64, radius);
+        (0..g.detector[1]).map(count)
+    }
+
+    /// The factor of a view in mm².
+    fn scale(&self, view: usize) -> f64 {
+        self.orbit.steps[view] * self.orbit.radius[view].powi(2)
+    }
+}
+
+impl FilteredViews for Backprojection<'_> {
     fn filter(&self, view: usize, pixels: &mut [f32]) {
         let (g, v) = (self.upright, &self.upright.views[view]);
         let columns = g.detector[1];
-        let (normal, distance) = v.normal();
-        let radius = self.orbit.radius[view];
-        let ramp = Ramp::new(columns, norm(v.u) * radius / distance, self.settings.window, self.settings.cutoff);
-        let count = |c| self.orbit.weight(view, place(g, view, c as f64, radius)) * lean(g, view, c as f64, radius);
-        let counts: Vec<f64> = (0..columns).map(count).collect();
+        let (normal, _) = v.normal();
+        let ramp = Ramp::new(columns, self.pitch(view), self.settings.window, self.settings.cutoff);
+        let counts: Vec<f64> = self.counts(view).collect();
         pixels.par_chunks_mut(16 * columns).enumerate().for_each(|(n, strip)| {
             for (r, line) in strip.chunks_mut(columns).enumerate() {
                 for (c, x) in line.iter_mut().enumerate() {
@@ -231,6 +243,34 @@ impl Backprojection<'_> {
             }
             ramp.filter(strip, columns);
         });
+    }
+
+    fn backproject(&self, views: &[usize], images: ArrayView3<'_, f32>, volume: ArrayViewMut3<'_, f32>) {
+        let scales: Vec<f64> = views.iter().map(|&v| self.scale(v)).collect();
+        let pixels = ColumnMajor::new(self.geometry, views, images, |_, _, _, x| x);
+        backproject(self.geometry, views, &pixels, &scales, volume);
+    }
+
+    fn weights(&self, view: usize) -> RowWeights {
+        let (g, v) = (self.upright, &self.upright.views[view]);
+        // The ramp of a row is inversely proportional to its pitch.
+        let pitch = self.pitch(view);
+        RowWeights {
+            columns: self.counts(view).map(|count| (count / pitch) as f32).collect(),
+            corner: sub(v.pixel(g.detector, 0.0, 0.0), v.source),
+            u: v.u,
+            v: v.v,
+            normal: v.normal().0,
+        }
+    }
+
+    fn taps(&self) -> Vec<f32> {
+        let columns = self.upright.detector[1];
+        Ramp::new(columns, 1.0, self.settings.window, self.settings.cutoff).taps(columns)
+    }
+
+    fn seen(&self, view: usize) -> VoxelView {
+        Pinhole::of(self.geometry, view).voxels(&self.geometry.volume, self.scale(view))
     }
 }
 

@@ -5,21 +5,22 @@ use super::noise::{self, Noise};
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, summary};
 use super::plan::{Iterative, IterativePlan};
+use super::problem::copy;
 use super::sart::{Sweep, Updates};
 use super::shared::Shared;
 use super::tv::{anisotropy, descend};
-use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
+use super::{Iteration, Pass, Problem, Stop, drive::drive};
 use conefield_core::error::Result;
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
+use conefield_core::place::{Array, State};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
 use conefield_core::spec::stage;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
-use ndarray::Array3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -111,13 +112,14 @@ impl Iterative for Built {
         let begun = Instant::now();
         let opened = self.shared.open(&self.describe(), job, observer)?;
         let job = &opened.job(job);
-        let problem = opened.problem(job);
+        let mut problem = opened.problem(job);
         let sigma = Noise::of(job.scan.projections.view(), false).sigma;
-        let space = Space::new(job.scan.header());
-        let mut iterate = Iterate::new(self, &space, self.shared.start(job, &problem, &space)?);
+        let space = opened.space(job.scan.header());
+        let mut iterate = Iterate::new(self, &space, self.shared.start(job, &problem, &space)?)?;
         iterate.target = sigma * (job.scan.projections.len() as f64).sqrt();
-        iterate.sweep.prepare(&problem);
-        drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
+        iterate.sweep.prepare(&problem)?;
+        problem.settle()?;
+        drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
     }
 
     fn found(&self, scan: &Scan) -> Vec<String> {
@@ -128,7 +130,7 @@ impl Iterative for Built {
     fn bytes(&self, header: &ScanHeader) -> u64 {
         let space = Space::tally(*header);
         space.pass(noise::scratch(header));
-        Iterate::new(self, &space, space.volume());
+        let _ = space.volume().and_then(|x| Iterate::new(self, &space, x));
         self.shared.price(&space, self.updates.subsets)
     }
 
@@ -145,57 +147,56 @@ struct Iterate {
     /// Length of a descent step.
     length: f64,
     /// The volume before a pass.
-    before: Array3<f32>,
+    before: Array,
     /// The volume after the data pass.
-    fitted: Array3<f32>,
+    fitted: Array,
 }
 
 impl Iterate {
-    fn new(built: &Built, space: &Space, x: Array3<f32>) -> Self {
-        Self {
+    fn new(built: &Built, space: &Space, x: Array) -> Result<Self> {
+        Ok(Self {
             descents: built.descents,
-            sweep: Sweep::new(built.updates, space, x),
+            sweep: Sweep::new(built.updates, space, x)?,
             target: 0.0,
             length: 0.0,
-            before: space.volume(),
-            fitted: space.volume(),
-        }
+            before: space.volume()?,
+            fitted: space.volume()?,
+        })
     }
 }
 
 impl Iteration for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
-        let grid = &problem.scan.geometry.volume;
-        self.before.assign(&self.sweep.x);
-        let residual = self.sweep.sweep(problem, pass);
-        let data = distance(&self.sweep.x, &self.before);
+        let (grid, place) = (&problem.scan.geometry.volume, problem.place);
+        copy(place, &self.sweep.x, &mut self.before)?;
+        let residual = self.sweep.sweep(problem, pass)?;
+        let data = distance(place, &self.sweep.x, &self.before)?;
         if pass == 0 {
             self.length = ALPHA * data / self.descents.max(1) as f64;
         }
-        self.fitted.assign(&self.sweep.x);
-        let mean = (norm2(&self.fitted) / self.fitted.len() as f64).sqrt();
+        copy(place, &self.sweep.x, &mut self.fitted)?;
+        let mean = (norm2(place, &self.fitted)? / self.fitted.len() as f64).sqrt();
         for _ in 0..self.descents {
-            let (x, work) = (flat_mut(&mut self.sweep.x), flat_mut(&mut self.sweep.work));
-            descend(x, grid.shape, anisotropy(grid), self.length, 1e-3 * mean as f32, work);
-            problem.outside(&mut self.sweep.x, 0.0);
+            descend(place, &mut self.sweep.x, anisotropy(grid), self.length, 1e-3 * mean as f32, &mut self.sweep.work)?;
+            problem.outside(&mut self.sweep.x, 0.0)?;
         }
-        let prior = distance(&self.sweep.x, &self.fitted);
+        let prior = distance(place, &self.sweep.x, &self.fitted)?;
         if prior > RATIO * data && residual.sqrt() > self.target {
             self.length *= ALPHA_DECAY;
         }
-        Ok(Pass { residual, change: Some(change(&self.sweep.x, &self.before)), prior: None })
+        Ok(Pass { residual, change: Some(change(place, &self.sweep.x, &self.before)?), prior: None })
     }
 
-    fn volume(&mut self, _: &Problem<'_>) -> &Array3<f32> {
-        &self.sweep.x
+    fn volume(&mut self, _: &Problem<'_>) -> Result<&Array> {
+        Ok(&self.sweep.x)
     }
 
-    fn take(&mut self, _: &Problem<'_>) -> Array3<f32> {
-        std::mem::take(&mut self.sweep.x)
+    fn take(self: Box<Self>, _: &Problem<'_>) -> Result<Array> {
+        Ok(self.sweep.x)
     }
 
-    fn state(&mut self) -> Result<Vec<(String, &mut [f32])>> {
-        Ok(vec![("x".into(), flat_mut(&mut self.sweep.x))])
+    fn state(&mut self) -> Vec<(String, State<'_>)> {
+        vec![("x".into(), State::Placed(&mut self.sweep.x))]
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

@@ -4,19 +4,20 @@
 use super::norms::norm2;
 use super::order::Subsets;
 use super::plan::{Iterative, IterativePlan};
+use super::problem::copy;
 use super::shared::Shared;
-use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
+use super::{Iteration, Pass, Problem, Stop, drive::drive};
 use conefield_core::error::Result;
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Reconstruction, Solution};
+use conefield_core::place::{ADD, Array, State};
 use conefield_core::scan::ScanHeader;
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
 use conefield_core::spec::stage;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
-use ndarray::{Array3, Zip};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -80,11 +81,12 @@ impl Iterative for Built {
         let begun = Instant::now();
         let opened = self.shared.open(&self.describe(), job, observer)?;
         let job = &opened.job(job);
-        let problem = opened.problem(job);
-        let space = Space::new(job.scan.header());
-        let mut iterate = Iterate::new(&space, self.shared.start(job, &problem, &space)?);
-        iterate.prepare(&problem);
-        let mut solution = drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)?;
+        let mut problem = opened.problem(job);
+        let space = opened.space(job.scan.header());
+        let mut iterate = Iterate::new(&space, self.shared.start(job, &problem, &space)?)?;
+        problem.settle()?;
+        iterate.prepare(&problem)?;
+        let mut solution = drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)?;
         if let (true, Reconstruction::Volume(volume)) = (self.nonnegative, &mut solution.result) {
             volume.data.par_mapv_inplace(|x| x.max(0.0));
         }
@@ -93,7 +95,7 @@ impl Iterative for Built {
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
         let space = Space::tally(*header);
-        Iterate::new(&space, space.volume());
+        let _ = space.volume().and_then(|x| Iterate::new(&space, x));
         self.shared.price(&space, Subsets::Count(1))
     }
 
@@ -103,75 +105,75 @@ impl Iterative for Built {
 }
 
 struct Iterate {
-    x: Array3<f32>,
+    x: Array,
     /// `p − A·x`.
-    residual: Array3<f32>,
+    residual: Array,
     /// The search direction.
-    direction: Array3<f32>,
+    direction: Array,
     /// `A·direction`.
-    ahead: Array3<f32>,
+    ahead: Array,
     /// `Aᵀ·residual`.
-    gradient: Array3<f32>,
+    gradient: Array,
     /// `‖gradient‖²`.
     gamma: f64,
 }
 
 impl Iterate {
-    fn new(space: &Space, x: Array3<f32>) -> Self {
+    fn new(space: &Space, x: Array) -> Result<Self> {
         let views = space.header().views;
-        Self {
+        Ok(Self {
             x,
-            residual: space.projections(views),
-            direction: space.volume(),
-            ahead: space.projections(views),
-            gradient: space.volume(),
+            residual: space.projections(views)?,
+            direction: space.volume()?,
+            ahead: space.projections(views)?,
+            gradient: space.volume()?,
             gamma: 0.0,
-        }
+        })
     }
 
-    fn prepare(&mut self, problem: &Problem<'_>) {
+    fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
         let views = problem.views();
-        problem.residual(&views, &self.x, &mut self.residual);
-        problem.back(&views, &self.residual, &mut self.gradient);
-        self.direction.assign(&self.gradient);
-        self.gamma = norm2(&self.gradient);
+        problem.residual(&views, &self.x, None, &mut self.residual)?;
+        problem.back(&views, &self.residual, &mut self.gradient)?;
+        copy(problem.place, &self.gradient, &mut self.direction)?;
+        self.gamma = norm2(problem.place, &self.gradient)?;
+        Ok(())
     }
 }
 
 impl Iteration for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, _: u64) -> Result<Pass> {
-        let views = problem.views();
-        problem.forward(&views, &self.direction, &mut self.ahead);
-        let square = norm2(&self.ahead);
+        let (views, place) = (problem.views(), problem.place);
+        let Self { x, residual, direction, ahead, gradient, gamma } = self;
+        problem.forward(&views, direction, ahead)?;
+        let square = norm2(place, ahead)?;
         if square == 0.0 {
-            return Ok(Pass { residual: norm2(&self.residual), change: Some(0.0), prior: None });
+            return Ok(Pass { residual: norm2(place, residual)?, change: Some(0.0), prior: None });
         }
-        let alpha = (self.gamma / square) as f32;
-        Zip::from(&mut self.x).and(&self.direction).par_for_each(|x, d| *x += alpha * d);
-        Zip::from(&mut self.residual).and(&self.ahead).par_for_each(|r, q| *r -= alpha * q);
-        problem.back(&views, &self.residual, &mut self.gradient);
-        let gamma = norm2(&self.gradient);
-        let beta = (gamma / self.gamma) as f32;
-        self.gamma = gamma;
-        let change = f64::from(alpha) * (norm2(&self.direction) / norm2(&self.x).max(1e-300)).sqrt();
-        Zip::from(&mut self.direction).and(&self.gradient).par_for_each(|d, s| *d = s + beta * *d);
-        Ok(Pass { residual: norm2(&self.residual), change: Some(change), prior: None })
+        let alpha = f64::from((*gamma / square) as f32);
+        place.map(&ADD, [alpha, 1.0], x, &[direction])?;
+        place.map(&ADD, [-alpha, 1.0], residual, &[ahead])?;
+        problem.back(&views, residual, gradient)?;
+        let next = norm2(place, gradient)?;
+        let beta = next / *gamma;
+        *gamma = next;
+        let change = alpha * (norm2(place, direction)? / norm2(place, x)?.max(1e-300)).sqrt();
+        place.map(&ADD, [1.0, beta], direction, &[gradient])?;
+        Ok(Pass { residual: norm2(place, residual)?, change: Some(change), prior: None })
     }
 
-    fn volume(&mut self, _: &Problem<'_>) -> &Array3<f32> {
-        &self.x
+    fn volume(&mut self, _: &Problem<'_>) -> Result<&Array> {
+        Ok(&self.x)
     }
 
-    fn take(&mut self, _: &Problem<'_>) -> Array3<f32> {
-        std::mem::take(&mut self.x)
+    fn take(self: Box<Self>, _: &Problem<'_>) -> Result<Array> {
+        Ok(self.x)
     }
 
-    fn state(&mut self) -> Result<Vec<(String, &mut [f32])>> {
-        Ok(vec![
-            ("x".into(), flat_mut(&mut self.x)),
-            ("residual".into(), flat_mut(&mut self.residual)),
-            ("direction".into(), flat_mut(&mut self.direction)),
-        ])
+    fn state(&mut self) -> Vec<(String, State<'_>)> {
+        let Self { x, residual, direction, .. } = self;
+        let all = [("x", x), ("residual", residual), ("direction", direction)];
+        all.map(|(name, x)| (name.to_owned(), State::Placed(x))).into()
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

@@ -1,9 +1,7 @@
 //! The driver of iterative methods: passes, records, checkpoints, stopping criteria.
 
-use super::flat_mut;
 use super::monitor::VolumeMonitor;
-use super::norms::square_sum;
-use super::problem::Problem;
+use super::problem::{Problem, copy};
 use super::stop::Stop;
 use crate::schedule::{Clock, Ends};
 use conefield_core::Error;
@@ -11,6 +9,7 @@ use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::finite::stray;
 use conefield_core::method::{Best, Job, Observer, Reconstruction, Record, Solution};
+use conefield_core::place::{Array, Place, State, squares};
 use conefield_core::scan::Volume;
 use conefield_core::space::Space;
 use ndarray::Array3;
@@ -34,13 +33,13 @@ pub trait Iteration {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass>;
 
     /// The current volume, in 1/mm.
-    fn volume(&mut self, problem: &Problem<'_>) -> &Array3<f32>;
+    fn volume(&mut self, problem: &Problem<'_>) -> Result<&Array>;
 
     /// The final volume; ends the method.
-    fn take(&mut self, problem: &Problem<'_>) -> Array3<f32>;
+    fn take(self: Box<Self>, problem: &Problem<'_>) -> Result<Array>;
 
     /// The complete state for the next pass, by name, for checkpoints.
-    fn state(&mut self) -> Result<Vec<(String, &mut [f32])>>;
+    fn state(&mut self) -> Vec<(String, State<'_>)>;
 
     /// An error of a stage since the last call.
     fn fault(&self) -> Result<()> {
@@ -65,8 +64,8 @@ struct Kept {
 }
 
 /// Buffer for the best volume, if `stop` has `patience`.
-pub(super) fn best(stop: &Stop, space: &Space) -> Option<Array3<f32>> {
-    stop.patience.map(|_| space.volume())
+pub(super) fn best(stop: &Stop, space: &Space) -> Result<Option<Array>> {
+    stop.patience.map(|_| space.volume()).transpose()
 }
 
 /// Runs `method` on `job` until `stop` or the job's limits end it. The time since `begun` counts.
@@ -76,14 +75,14 @@ pub(super) fn drive(
     begun: Instant,
     problem: &Problem<'_>,
     space: &Space,
-    method: &mut dyn Iteration,
+    mut method: Box<dyn Iteration + '_>,
     observer: &mut dyn Observer,
 ) -> Result<Solution> {
-    let mut run = Run::begin(job, stop, begun, problem, best(stop, space), method, observer)?;
+    let mut run = Run::begin(job, stop, begun, problem, best(stop, space)?, method.as_mut(), observer)?;
     loop {
         let cancelled = observer.cancelled();
         if run.step > run.started && (cancelled || observer.checkpoint_due()) {
-            run.checkpoint(method, observer)?;
+            run.checkpoint(method.as_mut(), observer)?;
         }
         if cancelled {
             return Err(Error::Interrupted { step: run.step });
@@ -91,7 +90,7 @@ pub(super) fn drive(
         if run.over {
             return run.finish(method);
         }
-        run.pass(method, observer)?;
+        run.pass(method.as_mut(), observer)?;
     }
 }
 
@@ -104,7 +103,7 @@ struct Run<'a> {
     clock: Clock,
     kept: Kept,
     /// The volume that predicted held-out views best, see [`Kept::best`].
-    best: Option<Array3<f32>>,
+    best: Option<Array>,
     /// The step at which this process started.
     started: u64,
     step: u64,
@@ -120,13 +119,13 @@ impl<'a> Run<'a> {
         stop: &'a Stop,
         begun: Instant,
         problem: &'a Problem<'a>,
-        mut best: Option<Array3<f32>>,
+        mut best: Option<Array>,
         method: &mut dyn Iteration,
         observer: &mut dyn Observer,
     ) -> Result<Self> {
         let (mut kept, mut step, mut seconds) = (Kept::default(), 0, 0.0);
         if let Some(resume) = job.resume {
-            kept = restore(resume, method, best.as_mut())?;
+            kept = restore(resume, problem.place, method, best.as_mut())?;
             (step, seconds) = (resume.standing.step, resume.standing.seconds);
             observer.note(&format!("resumed after pass {step}"));
         }
@@ -137,7 +136,7 @@ impl<'a> Run<'a> {
         let mut clock = Clock::new(ends, job.limits, seconds + begun.elapsed().as_secs_f64());
         clock.resume();
         let monitor = VolumeMonitor::new(job);
-        let empty = problem.scan.projections.as_slice().map_or(f64::MAX, square_sum);
+        let empty = problem.scan.projections.as_slice().map_or(f64::MAX, squares);
         let (started, residual, over) = (step, None, false);
         let mut run = Self { job, stop, problem, monitor, clock, kept, best, started, step, residual, empty, over };
         // Time alone does not end a run before its first pass.
@@ -153,7 +152,6 @@ impl<'a> Run<'a> {
     fn pass(&mut self, method: &mut dyn Iteration, observer: &mut dyn Observer) -> Result<()> {
         let begun = Instant::now();
         let pass = method.pass(self.problem, self.step)?;
-        self.problem.operator.fault()?;
         method.fault()?;
         self.step += 1;
         self.check(&pass)?;
@@ -185,11 +183,13 @@ impl<'a> Run<'a> {
     fn look(&mut self, pass: &Pass, method: &mut dyn Iteration) -> Result<Record> {
         let pixels = self.job.scan.projections.len() as f64;
         // A method may have to compute its volume first.
-        let volume = if self.monitor.looks() { Some(method.volume(self.problem)) } else { None };
+        let volume = if self.monitor.looks() { Some(method.volume(self.problem)?) } else { None };
         let (mut held_out, mut psnr) = (None, None);
         if let Some(volume) = volume {
-            held_out = self.monitor.held_out(self.problem.operator, volume)?;
-            psnr = self.monitor.psnr(volume, self.job.scan.unit.mm as f32);
+            held_out = self.monitor.held_out(self.problem.place, self.problem.projector, volume)?;
+            if self.monitor.has_reference() {
+                psnr = self.monitor.psnr(&self.problem.place.read(volume)?, self.job.scan.unit.mm as f32);
+            }
         }
         let mut record = Record {
             step: self.step,
@@ -208,7 +208,7 @@ impl<'a> Run<'a> {
             if kept.best.is_none_or(|b| error < b) {
                 kept.best = Some(error);
                 kept.since_best = 0;
-                best.assign(volume);
+                copy(self.problem.place, volume, best)?;
             } else {
                 kept.since_best += 1;
                 kept.settled |= kept.since_best >= patience;
@@ -229,23 +229,26 @@ impl<'a> Run<'a> {
         let (step, seconds) = (self.step, self.clock.seconds());
         let kept = serde_json::json!(self.kept);
         let standing = Standing { step, recorded: step, seconds, method: kept, ..Standing::default() };
-        let mut state = method.state()?;
+        let mut state = method.state();
         if let (Some(best), Some(_)) = (&mut self.best, self.kept.best) {
-            state.push((BEST.into(), flat_mut(best)));
+            state.push((BEST.into(), State::Placed(best)));
         }
-        let sizes: Vec<[usize; 1]> = state.iter().map(|(_, x)| [x.len()]).collect();
-        let tensors = state.iter().zip(&sizes).map(|((n, x), size)| (n.clone(), &size[..], &**x)).collect();
+        let read = state.iter().map(|(n, x)| Ok((n, [x.count()], x.read(self.problem.place)?)));
+        let read = read.collect::<Result<Vec<_>>>()?;
+        let tensors = read.iter().map(|(n, size, x)| ((*n).clone(), &size[..], &**x)).collect();
         observer.checkpoint(&Checkpoint { tensors, standing })?;
         self.clock.resume();
         Ok(())
     }
 
-    fn finish(mut self, method: &mut dyn Iteration) -> Result<Solution> {
+    fn finish(mut self, method: Box<dyn Iteration + '_>) -> Result<Solution> {
         self.clock.pause();
         let Self { kept, step, job, .. } = self;
-        let best = self.best.filter(|_| kept.best.is_some());
-        let mut data = best.unwrap_or_else(|| method.take(self.problem));
-        method.fault()?;
+        let volume = match self.best.filter(|_| kept.best.is_some()) {
+            Some(best) => best,
+            None => method.take(self.problem)?,
+        };
+        let mut data = self.problem.place.take(volume)?;
         let mm = job.scan.unit.mm as f32;
         data.par_mapv_inplace(|x| x * mm);
         finite(&data, step)?;
@@ -274,18 +277,18 @@ pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
 }
 
 /// Restores method, best volume and driver from a checkpoint.
-fn restore(resume: &Resume, method: &mut dyn Iteration, best: Option<&mut Array3<f32>>) -> Result<Kept> {
+fn restore(resume: &Resume, place: &dyn Place, method: &mut dyn Iteration, best: Option<&mut Array>) -> Result<Kept> {
     let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.method.clone());
     let kept = kept.map_err(|e| Error::invalid(&resume.place, "method", e, "the state of this method"))?;
-    let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), flat_mut(best)));
-    for (name, values) in method.state()?.into_iter().chain(best) {
+    let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), State::Placed(best)));
+    for (name, mut values) in method.state().into_iter().chain(best) {
         let found = resume.tensor(&name).map(|t| &t.1);
-        let fits = found.filter(|t| t.len() == values.len());
+        let fits = found.filter(|t| t.len() == values.count());
         let said = found.map_or("nothing".into(), |t| format!("{} numbers", t.len()));
         let fits = fits.ok_or_else(|| {
-            Error::invalid(&resume.place, name, said, format!("{} numbers, as this run needs", values.len()))
+            Error::invalid(&resume.place, name, said, format!("{} numbers, as this run needs", values.count()))
         })?;
-        values.copy_from_slice(fits);
+        values.load(place, fits)?;
     }
     let numbers = method.numbers();
     let (found, want) = (kept.numbers.len(), numbers.len());

@@ -1,8 +1,11 @@
 //! Edges of a volume, and their normals.
 
-use super::flat_mut;
+use super::on_host_mut;
+use conefield_core::error::Result;
+use conefield_core::place::Array;
+use conefield_core::regularizer::Guide;
 use conefield_core::space::Space;
-use ndarray::{Array3, ArrayView3};
+use ndarray::ArrayView3;
 use rayon::prelude::*;
 
 /// A vector `n` per voxel, normal to the edge there, with a length from 0 (no edge) to 1 (a clear edge).
@@ -10,7 +13,7 @@ use rayon::prelude::*;
 /// `n = √γ·s/√(|s|² + η²)`, where the slope s is a central difference, smoothed by 1-2-1 along the other two axes
 /// (Sobel), and η is a multiple of the root mean square of all |s|.
 pub struct Edges {
-    n: [Array3<f32>; 3],
+    n: [Array; 3],
     /// γ, below 1.
     strength: f32,
     /// η relative to the root mean square of the slopes.
@@ -19,16 +22,22 @@ pub struct Edges {
 
 impl Edges {
     /// Edges that are 0 until [`Self::find`].
-    pub fn new(shape: [usize; 3], strength: f32, scale: f64, space: &Space) -> Self {
-        Self { n: std::array::from_fn(|_| space.array(shape)), strength, scale }
+    pub fn new(shape: [usize; 3], strength: f32, scale: f64, space: &Space) -> Result<Self> {
+        let n = || space.array(shape);
+        Ok(Self { n: [n()?, n()?, n()?], strength, scale })
     }
 
-    /// The components along x, y and z.
+    /// The components along x, y and z, on the host.
     pub fn vectors(&self) -> [&[f32]; 3] {
-        self.n.each_ref().map(super::flat)
+        self.n.each_ref().map(super::on_host)
     }
 
-    /// Finds the edges of `x`, whose differences are weighted by `g` along x, y, z. The result does not depend on the
+    /// The same edges for a place with kernels.
+    pub fn guide(&mut self) -> Guide<'_> {
+        Guide { vectors: self.n.each_mut(), strength: self.strength, scale: self.scale as f32 }
+    }
+
+    /// Finds the edges of `x` on the host, whose differences are weighted by `g` along x, y, z. The result does not depend on the
     /// number of threads.
     pub fn find(&mut self, x: ArrayView3<'_, f32>, g: [f32; 3]) {
         let (nx, ny, nz) = x.dim();
@@ -39,7 +48,7 @@ impl Edges {
         let x = x.as_standard_layout();
         let Some(all) = x.as_slice() else { return };
         let at = |i: usize| &all[i * plane..(i + 1) * plane];
-        let [a, b, c] = self.n.each_mut().map(flat_mut);
+        let [a, b, c] = self.n.each_mut().map(on_host_mut);
         let planes = a.par_chunks_mut(plane).zip(b.par_chunks_mut(plane)).zip(c.par_chunks_mut(plane));
         let squares: Vec<f64> = planes
             .enumerate()
@@ -121,12 +130,15 @@ fn differences(line: &[f32], out: &mut [f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::place::Host;
     use conefield_core::scan::ScanHeader;
+    use ndarray::Array3;
+    use std::sync::Arc;
 
     fn edges(x: &Array3<f32>, g: [f32; 3], scale: f64) -> Edges {
         let shape = x.dim().into();
-        let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape });
-        let mut edges = Edges::new(shape, 0.81, scale, &space);
+        let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape }, Arc::new(Host));
+        let mut edges = Edges::new(shape, 0.81, scale, &space).unwrap();
         edges.find(x.view(), g);
         edges
     }
@@ -137,7 +149,7 @@ mod tests {
         let found = edges(&ramp, [1.0, 1.0, 2.0], 1e-4);
         // Along (2, -1, 0.5·2), of length 0.9.
         let want = [2.0f32, -1.0, 1.0].map(|x| 0.9 * x / 6f32.sqrt());
-        for (n, want) in found.n.iter().zip(want) {
+        for (n, want) in found.n.iter().map(|n| n.on_host().unwrap()).zip(want) {
             assert!((n[[3, 3, 4]] - want).abs() < 1e-4, "{} and {want}", n[[3, 3, 4]]);
         }
     }
@@ -145,12 +157,13 @@ mod tests {
     #[test]
     fn what_is_flat_has_no_edges_and_weak_slopes_count_little() {
         let flat = edges(&Array3::from_elem([3, 1, 4], 0.7), [1.0; 3], 1.0);
-        assert!(flat.n.iter().all(|n| n.iter().all(|x| *x == 0.0)));
+        assert!(flat.vectors().iter().all(|n| n.iter().all(|x| *x == 0.0)));
         let mut step = Array3::from_shape_fn([16, 8, 8], |(x, _, _)| f32::from(u8::from(x >= 8)));
         step.slice_mut(ndarray::s![3.., .., ..]).mapv_inplace(|x| x + 0.01);
         let found = edges(&step, [1.0; 3], 1.0);
-        assert!(found.n[0][[8, 4, 4]] > 0.6 && found.n[0][[3, 4, 4]] < 0.03, "{}", found.n[0]);
-        assert!(found.n[0].iter().all(|x| x.abs() <= 0.9));
+        let n = found.n[0].on_host().unwrap();
+        assert!(n[[8, 4, 4]] > 0.6 && n[[3, 4, 4]] < 0.03, "{n}");
+        assert!(n.iter().all(|x| x.abs() <= 0.9));
     }
 
     #[test]
@@ -158,7 +171,7 @@ mod tests {
         let x = Array3::from_shape_fn([23, 5, 7], |(x, y, z)| ((x * 31 + y * 17 + z * 7) % 11) as f32);
         let on = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| edges(&x, [1.0, 0.7, 1.3], 0.7).n)
+            pool.install(|| edges(&x, [1.0, 0.7, 1.3], 0.7).vectors().map(<[f32]>::to_vec))
         };
         assert!(on(1) == on(5));
     }

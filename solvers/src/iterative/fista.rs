@@ -16,10 +16,10 @@ use super::model::{Model, projected};
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, split, summary};
 use super::plan::{Iterative, IterativePlan};
-use super::problem::{images, images_mut, room};
+use super::problem::{copy, room};
 use super::regularizers::Nonnegative;
 use super::shared::Shared;
-use super::{Iteration, Pass, Problem, Stop, drive::drive, flat, flat_mut};
+use super::{Iteration, Pass, Problem, Stop, drive::drive};
 use conefield_core::Error;
 use conefield_core::basis::{Basis, BasisSpec, Expansion};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
@@ -28,16 +28,16 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
+use conefield_core::place::{Array, DIVIDE, Reduction, State, Step};
 use conefield_core::random::stream;
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Update};
-use conefield_core::resident::{Factors, Resident, Volumes};
+use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
 use conefield_core::spec::stage;
-use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
+use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
-use ndarray::{Array3, Axis, Zip};
+use ndarray::Array3;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -200,19 +200,23 @@ impl Iterative for Built {
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
         if self.air {
-            problem.clear_air();
-            let air = 100.0 * problem.air_share();
+            let air = 100.0 * problem.clear_air()?;
             observer.note(&format!("{air:.0} % of the pixels are air (views binned by {})", self.bin));
         }
         let data = self.data.of(problem.scan.projections.view()).map_err(|e| e.within("data"))?;
-        let space = Space::new(job.scan.header().binned(self.bin));
+        let space = opened.space(job.scan.header().binned(self.bin));
         let start = self.shared.known(job, &space)?;
         let mut arrays = Arrays::new(self, expansion, &voxels, &space, start)?;
-        arrays.begin(&problem);
-        let mut iterate = Iterate::new(self, &problem, data, arrays, opened.projector())?;
+        arrays.begin(&problem)?;
+        problem.settle()?;
+        let mut iterate = Iterate::new(self, &problem, data, arrays)?;
         observer.note(&iterate.description());
-        iterate.settle(&problem, observer);
-        drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
+        if problem.place.device().is_some() {
+            iterate.elsewhere().into_iter().for_each(|what| {
+                observer.note(&format!("{what} runs on the CPU: what it works on is moved in every pass"));
+            });
+        }
+        drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
     }
 
     fn found(&self, scan: &Scan) -> Vec<String> {
@@ -250,7 +254,7 @@ impl Iterative for Built {
         space.pass(self.data.scratch(header));
         // If a stage refuses the grid, the run is refused and needs no memory.
         if let Some((expansion, grid)) = self.expansion(header.volume) {
-            let _ = Arrays::new(self, expansion, &grid, &space, space.volume());
+            let _ = space.volume().and_then(|start| Arrays::new(self, expansion, &grid, &space, start));
         }
         self.shared.price(&space, self.subsets)
     }
@@ -265,22 +269,20 @@ impl Iterative for Built {
 struct Arrays {
     model: Model,
     penalty: Box<dyn Penalty>,
-    x: Array3<f32>,
+    x: Array,
     /// The extrapolated point, at which the next gradient is computed.
-    ahead: Array3<f32>,
-    gradient: Array3<f32>,
+    ahead: Array,
+    gradient: Array,
     /// The coefficients before a pass.
-    before: Array3<f32>,
+    before: Array,
     /// The target of the pull, if there is one.
-    towards: Option<Array3<f32>>,
+    towards: Option<Array>,
     /// The pixels of a subset. After subsets have been merged, their views are processed in parts.
-    pixels: Array3<f32>,
-    /// The volumes on a device, which are then newer than `ahead` and the penalty's state here.
-    resident: Option<Box<dyn Resident>>,
+    pixels: Array,
 }
 
 /// The callback of [`Arrays::part_by_part`]: computes images of some views for back-projection.
-type Images<'a> = &'a mut dyn FnMut(&mut Model, &[usize], &mut Array3<f32>);
+type Images<'a> = &'a mut dyn FnMut(&mut Model, &[usize], &mut Array) -> Result<()>;
 
 impl Arrays {
     /// Arrays for a volume on the grid `voxels`, initially `start`.
@@ -289,176 +291,134 @@ impl Arrays {
         expansion: Box<dyn Expansion>,
         voxels: &VoxelGrid,
         space: &Space,
-        start: Array3<f32>,
+        start: Array,
     ) -> Result<Self> {
-        let (model, x) = Model::new(expansion, voxels, space, start);
+        let (model, x) = Model::new(expansion, voxels, space, start)?;
         let grid = model.grid();
         let coefficients = || space.array(grid.shape);
         Ok(Self {
             model,
             penalty: settings.prior.on(&grid, space).map_err(|e| e.within("prior"))?,
             x,
-            ahead: coefficients(),
-            gradient: coefficients(),
-            before: coefficients(),
-            towards: (settings.pull > 0.0).then(coefficients),
-            pixels: room(space, settings.subsets.count(space.header().views)),
-            resident: None,
+            ahead: coefficients()?,
+            gradient: coefficients()?,
+            before: coefficients()?,
+            towards: (settings.pull > 0.0).then(coefficients).transpose()?,
+            pixels: room(space, settings.subsets.count(space.header().views))?,
         })
-    }
-
-    /// Takes the volumes to the projector's device, if it has one.
-    fn settle(&mut self, problem: &Problem<'_>, projector: &dyn VoxelProjector) -> Option<Result<()>> {
-        if !self.model.projects_coefficients() {
-            return None;
-        }
-        let Self { model, penalty, x, ahead, towards, .. } = self;
-        let shape = x.dim().into();
-        let (inside, towards) = (model.inside(problem), towards.as_ref().map(flat));
-        let volumes = Volumes { shape, x: flat(x), ahead: flat(ahead), towards, inside, dual: penalty.dual() };
-        let placed = projector.resident(volumes)?;
-        Some(placed.map(|resident| self.resident = Some(resident)))
     }
 
     /// Overwrites the gradient with that of the data term at `ahead`. Returns `‖p − A·x‖²` and the data term.
     fn differentiate(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) -> Result<[f64; 2]> {
-        let (mut residual, mut misfit) = (0.0, 0.0);
-        let mut differentiate = |views: &[usize], pixels: &mut Array3<f32>| {
-            residual += problem.subtract(views, pixels);
-            let misfits = problem.each_image(views, pixels, |view, measured, r| data.differentiate(view, measured, r));
-            misfit += misfits.iter().sum::<f64>();
-        };
-        if let Some(resident) = &mut self.resident {
-            for part in views.chunks(self.pixels.len_of(Axis(0)).max(1)) {
-                resident.forward(problem.geometry, part, images_mut(&mut self.pixels, part.len()))?;
-                differentiate(part, &mut self.pixels);
-                resident.adjoint(problem.geometry, part, images(&self.pixels, part.len()))?;
-            }
-            return Ok([residual, misfit]);
-        }
-        let ahead = std::mem::take(&mut self.ahead);
-        self.part_by_part(problem, views, &mut |model, views, pixels| {
-            model.forward(problem, views, &ahead, pixels);
-            differentiate(views, pixels);
+        let ahead = std::mem::replace(&mut self.ahead, Array::nothing());
+        let mut sums = [0.0; 2];
+        let done = self.part_by_part(problem, views, &mut |model, views, pixels| {
+            model.forward(problem, views, &ahead, pixels)?;
+            let found = problem.place.compare(&problem.by(Some(data), None), views, pixels)?;
+            sums = std::array::from_fn(|k| sums[k] + found[k]);
+            Ok(())
         });
         self.ahead = ahead;
-        Ok([residual, misfit])
+        done.map(|()| sums)
     }
 
     /// Makes an update with the gradient.
     fn update(&mut self, problem: &Problem<'_>, factors: Factors) -> Result<()> {
-        if let Some(resident) = &mut self.resident {
-            return resident.update(factors);
-        }
         let Self { model, penalty, x, ahead, gradient, towards, .. } = self;
-        let update = Update {
-            gradient: flat_mut(gradient),
-            ahead: flat_mut(ahead),
-            x: flat_mut(x),
-            step: factors.step,
-            momentum: factors.momentum,
-            towards: towards.as_ref().map(|towards| (flat(towards), factors.pull)),
-            inside: model.inside(problem),
-        };
-        penalty.update(update, factors.tau);
-        Ok(())
-    }
-
-    /// Adapts the penalty to the coefficients before a pass. Returns its value if it changed.
-    fn adapt(&mut self) -> Result<Option<f64>> {
-        let value = self.penalty.adapt(self.x.view());
-        if let (Some(_), Some(resident)) = (value, &mut self.resident)
-            && let Some(guide) = self.penalty.dual().and_then(|dual| dual.guide)
-        {
-            resident.guide(guide)?;
-        }
-        Ok(value)
-    }
-
-    /// Brings the state here up to date, and gives up the volumes on the device.
-    fn unsettle(&mut self) -> Result<()> {
-        match (self.resident.take(), self.penalty.dual()) {
-            (Some(mut resident), Some(dual)) => resident.rest(flat_mut(&mut self.ahead), dual.p),
-            _ => Ok(()),
-        }
+        let Factors { step, momentum, pull, tau } = factors;
+        let towards = towards.as_ref().map(|towards| (towards, pull));
+        let inside = model.inside(problem);
+        problem.place.update(Step { gradient, ahead, x, step, momentum, towards, inside, tau }, penalty.as_mut())
     }
 
     /// Clears coefficients outside the object's support and restarts from the rest.
-    fn begin(&mut self, problem: &Problem<'_>) {
-        self.model.prepare(problem, &mut self.gradient);
-        self.model.outside(problem, &mut self.x, 0.0);
-        for copy in [Some(&mut self.ahead), self.towards.as_mut()].into_iter().flatten() {
-            copy.assign(&self.x);
+    fn begin(&mut self, problem: &Problem<'_>) -> Result<()> {
+        self.model.prepare(problem, &mut self.gradient)?;
+        self.model.outside(problem, &mut self.x, 0.0)?;
+        for to in [Some(&mut self.ahead), self.towards.as_mut()].into_iter().flatten() {
+            copy(problem.place, &self.x, to)?;
         }
+        Ok(())
     }
 
     /// Overwrites `gradient` with the adjoint of the images that `images` computes for `views`, in parts that fit the
     /// buffer.
-    fn part_by_part(&mut self, problem: &Problem<'_>, views: &[usize], images: Images<'_>) {
+    fn part_by_part(&mut self, problem: &Problem<'_>, views: &[usize], images: Images<'_>) -> Result<()> {
         let Self { model, gradient, pixels, .. } = self;
-        gradient.par_mapv_inplace(|_| 0.0);
-        for part in views.chunks(pixels.len_of(Axis(0)).max(1)) {
-            images(model, part, pixels);
-            model.back(problem, part, pixels, gradient);
+        problem.place.fill(gradient, 0.0)?;
+        for part in views.chunks(pixels.shape()[0].max(1)) {
+            images(model, part, pixels)?;
+            model.back(problem, part, pixels, gradient)?;
         }
-        model.outside(problem, gradient, 0.0);
+        model.outside(problem, gradient, 0.0)
     }
 
     /// Root mean square of `(A·B)ᵀ·n` over the coefficients that rays meet, for noise n as `data` spreads it; computed
     /// from `views` and scaled to all views.
-    fn noise_gain(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) -> f64 {
+    fn noise_gain(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) -> Result<f64> {
         let mut rng = stream(problem.seed ^ 0x0000_7e57_0015_e000, 0);
+        let [rows, columns] = problem.scan.geometry.detector;
+        let place = problem.place;
         self.part_by_part(problem, views, &mut |_, views, pixels| {
-            let mut signs = images_mut(pixels, views.len());
-            signs.iter_mut().for_each(|sign| *sign = if rng.random::<bool>() { 1.0 } else { -1.0 });
-            problem.each_image(views, pixels, |view, measured, signs| data.spread(view, measured, signs));
-        });
-        let met = self.gradient.iter().filter(|x| **x != 0.0).count();
+            for i in 0..views.len() {
+                let mut sign = || if rng.random::<bool>() { 1.0 } else { -1.0 };
+                place.load(Array3::from_shape_simple_fn((1, rows, columns), &mut sign).view(), pixels, i)?;
+            }
+            place.weigh(&problem.by(Some(data), None), true, views, pixels)
+        })?;
+        let met = place.reduce(Reduction::Nonzero, &self.gradient, &self.gradient)?;
         let all = problem.geometry.views.len() as f64 / views.len().max(1) as f64;
-        (all * norm2(&self.gradient) / met.max(1) as f64).sqrt()
+        Ok((all * norm2(place, &self.gradient)? / met.max(1.0)).sqrt())
     }
 
     /// An upper bound for the largest eigenvalue of `n·(A_s·B)ᵀW(A_s·B)` over n subsets, W the curvature of `data`.
     /// Uses `before` as working memory.
-    fn largest_eigenvalue(&mut self, problem: &Problem<'_>, data: &dyn Misfit, subsets: &[Vec<usize>]) -> f64 {
-        let Some(first) = subsets.first() else { return 0.0 };
-        self.before.fill(1.0);
-        self.model.outside(problem, &mut self.before, 0.0);
-        self.curved(problem, data, first);
+    fn largest_eigenvalue(&mut self, problem: &Problem<'_>, data: &dyn Misfit, subsets: &[Vec<usize>]) -> Result<f64> {
+        let Some(first) = subsets.first() else { return Ok(0.0) };
+        let place = problem.place;
+        place.fill(&mut self.before, 1.0)?;
+        self.model.outside(problem, &mut self.before, 0.0)?;
+        self.curved(problem, data, first)?;
         let mut worst = 0.0f64;
         for probe in 0..PROBES {
-            let size = norm2(&self.gradient).sqrt();
+            let size = norm2(place, &self.gradient)?.sqrt();
             if size == 0.0 {
-                return 0.0;
+                return Ok(0.0);
             }
-            Zip::from(&mut self.before).and(&self.gradient).par_for_each(|v, g| *v = (f64::from(*g) / size) as f32);
-            self.model.outside(problem, &mut self.before, 0.0);
-            self.curved(problem, data, &subsets[probe * subsets.len() / PROBES]);
-            worst = worst.max(norm2(&self.gradient).sqrt());
+            place.map(&DIVIDE, [size, 0.0], &mut self.before, &[&self.gradient])?;
+            self.model.outside(problem, &mut self.before, 0.0)?;
+            self.curved(problem, data, &subsets[probe * subsets.len() / PROBES])?;
+            worst = worst.max(norm2(place, &self.gradient)?.sqrt());
         }
-        SAFETY * subsets.len() as f64 * worst
+        Ok(SAFETY * subsets.len() as f64 * worst)
     }
 
     /// Overwrites `gradient` with `(A_s·B)ᵀW(A_s·B)·v`, v in `before`.
-    fn curved(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) {
-        let v = std::mem::take(&mut self.before);
-        self.part_by_part(problem, views, &mut |model, views, pixels| {
-            model.forward(problem, views, &v, pixels);
-            problem.each_image(views, pixels, |view, measured, values| data.curve(view, measured, values));
+    fn curved(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) -> Result<()> {
+        let v = std::mem::replace(&mut self.before, Array::nothing());
+        let done = self.part_by_part(problem, views, &mut |model, views, pixels| {
+            model.forward(problem, views, &v, pixels)?;
+            problem.place.weigh(&problem.by(Some(data), None), false, views, pixels)
         });
         self.before = v;
+        done
     }
+}
+
+/// Factors of an update; see [`Step`].
+struct Factors {
+    step: f32,
+    momentum: f32,
+    pull: f32,
+    tau: f32,
 }
 
 /// Number of subsets for the power iteration, and the safety factor on the eigenvalue found.
 const PROBES: usize = 3;
 const SAFETY: f64 = 1.15;
 
-struct Iterate<'a> {
+struct Iterate {
     arrays: Arrays,
-    projector: &'a dyn VoxelProjector,
-    /// Whether the volumes stay on a device.
-    resides: bool,
     data: Box<dyn Misfit>,
     views: usize,
     /// Current number of subsets.
@@ -479,29 +439,24 @@ struct Iterate<'a> {
     misfit: f64,
 }
 
-impl<'a> Iterate<'a> {
-    fn new(
-        settings: &Built,
-        problem: &Problem<'_>,
-        data: Box<dyn Misfit>,
-        mut arrays: Arrays,
-        projector: &'a dyn VoxelProjector,
-    ) -> Result<Self> {
+impl Iterate {
+    fn new(settings: &Built, problem: &Problem<'_>, data: Box<dyn Misfit>, mut arrays: Arrays) -> Result<Self> {
         let views = problem.scan.geometry.views.len();
         let subsets = settings.subsets.of(views);
         let grid = arrays.model.grid();
-        let lambda = settings
-            .prior
-            .weight(&grid, &mut |k| k * data.noise() * arrays.noise_gain(problem, data.as_ref(), &subsets[0]))
-            .map_err(|e| e.within("prior"))?;
-        let lipschitz = arrays.largest_eigenvalue(problem, data.as_ref(), &subsets);
+        let mut gain = Ok(0.0);
+        let noise = &mut |k: f64| {
+            gain = arrays.noise_gain(problem, data.as_ref(), &subsets[0]);
+            k * data.noise() * gain.as_ref().map_or(0.0, |gain| *gain)
+        };
+        let lambda = settings.prior.weight(&grid, noise).map_err(|e| e.within("prior"))?;
+        gain?;
+        let lipschitz = arrays.largest_eigenvalue(problem, data.as_ref(), &subsets)?;
         arrays.model.fault()?;
         data.fault()?;
         ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
         Ok(Self {
             arrays,
-            projector,
-            resides: false,
             data,
             views,
             subsets: subsets.len() as f64,
@@ -522,18 +477,15 @@ impl<'a> Iterate<'a> {
         format!("{}: the prior's weight is {:.3e}", self.data.describe(), self.lambda / side)
     }
 
-    /// Takes the volumes to the projector's device, if it has one; otherwise they travel to it for each projection.
-    fn settle(&mut self, problem: &Problem<'_>, observer: &mut dyn Observer) {
-        match self.arrays.settle(problem, self.projector) {
-            None => {}
-            Some(Ok(())) => {
-                self.resides = true;
-                observer.note("the volumes stay on the device");
-            }
-            Some(Err(why)) => {
-                observer.note(&format!("the volumes are copied to the device for each projection: {why}"))
-            }
-        }
+    /// The stages that run on the host in every pass, wherever the arrays are.
+    fn elsewhere(&mut self) -> Vec<&'static str> {
+        let Arrays { model, penalty, .. } = &mut self.arrays;
+        let stages = [
+            ("the basis", model.expands()),
+            ("the prior", penalty.kernels().is_none()),
+            ("the data term", self.data.wgsl().is_none()),
+        ];
+        stages.into_iter().filter(|(_, here)| *here).map(|(name, _)| name).collect()
     }
 
     /// Processes one subset: a gradient step and the prior's proximal map. Returns `‖p − A·x‖²` and the data term.
@@ -546,18 +498,27 @@ impl<'a> Iterate<'a> {
         self.arrays.update(problem, Factors { step, momentum, pull: self.pull, tau })?;
         Ok(misfits)
     }
+
+    /// Merges pairs of subsets.
+    fn merge(&mut self, problem: &Problem<'_>) -> Result<()> {
+        let fewer = (0.5 * self.subsets).ceil();
+        // For unions of the previous subsets their bound still holds.
+        if self.subsets % fewer != 0.0 {
+            let fewer = split(self.views, fewer as usize);
+            self.lipschitz = self.pulled * self.arrays.largest_eigenvalue(problem, self.data.as_ref(), &fewer)?;
+        }
+        self.subsets = fewer;
+        Ok(())
+    }
 }
 
-impl Iteration for Iterate<'_> {
+impl Iteration for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
-        Zip::from(&mut self.arrays.before).and(&self.arrays.x).par_for_each(|before, x| *before = *x);
+        let place = problem.place;
+        copy(place, &self.arrays.x, &mut self.arrays.before)?;
         // A changed penalty must not count as progress or regress.
-        if let Some(value) = self.arrays.adapt()? {
+        if let Some(value) = place.adapt(self.arrays.penalty.as_mut(), &self.arrays.x)? {
             self.objective = self.misfit + self.lambda * value;
-        }
-        // After a checkpoint.
-        if self.resides && self.arrays.resident.is_none() {
-            self.arrays.settle(problem, self.projector).transpose()?;
         }
         let (mut residual, mut misfit) = (0.0, 0.0);
         let subsets = split(self.views, self.subsets as usize);
@@ -566,35 +527,26 @@ impl Iteration for Iterate<'_> {
             residual += r;
             misfit += m;
         }
-        if let Some(resident) = &mut self.arrays.resident {
-            resident.coefficients(flat_mut(&mut self.arrays.x))?;
-        }
-        let Arrays { penalty, x, before, towards, .. } = &self.arrays;
-        let change = change(x, before);
-        let prior = self.lambda * penalty.value(x.view());
-        let held = |towards: &Array3<f32>| 0.5 * f64::from(self.pull) * self.lipschitz * distance(x, towards).powi(2);
-        self.misfit = misfit + towards.as_ref().map_or(0.0, held);
+        let Arrays { penalty, x, before, towards, .. } = &mut self.arrays;
+        let change = change(place, x, before)?;
+        let prior = self.lambda * place.penalty(penalty.as_mut(), x)?;
+        let away = towards.as_ref().map(|towards| distance(place, x, towards)).transpose()?;
+        self.misfit = misfit + away.map_or(0.0, |d| 0.5 * f64::from(self.pull) * self.lipschitz * d.powi(2));
         let objective = self.misfit + prior;
         if objective > self.objective {
-            let fewer = (0.5 * self.subsets).ceil();
-            // For unions of the previous subsets their bound still holds.
-            if self.subsets % fewer != 0.0 {
-                let fewer = split(self.views, fewer as usize);
-                self.lipschitz = self.pulled * self.arrays.largest_eigenvalue(problem, self.data.as_ref(), &fewer);
-            }
-            self.subsets = fewer;
+            self.merge(problem)?;
         }
         self.objective = objective;
         Ok(Pass { residual, change: Some(change), prior: Some(prior) })
     }
 
-    fn volume(&mut self, problem: &Problem<'_>) -> &Array3<f32> {
+    fn volume(&mut self, problem: &Problem<'_>) -> Result<&Array> {
         self.arrays.model.volume(problem, &self.arrays.x)
     }
 
-    fn take(&mut self, problem: &Problem<'_>) -> Array3<f32> {
-        let x = std::mem::take(&mut self.arrays.x);
-        self.arrays.model.take(problem, x)
+    fn take(self: Box<Self>, problem: &Problem<'_>) -> Result<Array> {
+        let Arrays { model, x, .. } = self.arrays;
+        model.take(problem, x)
     }
 
     fn fault(&self) -> Result<()> {
@@ -603,12 +555,11 @@ impl Iteration for Iterate<'_> {
         self.data.fault()
     }
 
-    fn state(&mut self) -> Result<Vec<(String, &mut [f32])>> {
-        self.arrays.unsettle()?;
-        let own = [("x", &mut self.arrays.x), ("ahead", &mut self.arrays.ahead)];
-        let own = own.map(|(name, x)| (name.to_owned(), flat_mut(x)));
-        let prior = self.arrays.penalty.state().into_iter().map(|(name, x)| (format!("prior.{name}"), x));
-        Ok(own.into_iter().chain(prior).collect())
+    fn state(&mut self) -> Vec<(String, State<'_>)> {
+        let Arrays { x, ahead, penalty, .. } = &mut self.arrays;
+        let own = [("x", x), ("ahead", ahead)].map(|(name, x)| (name.to_owned(), State::Placed(x)));
+        let prior = penalty.state().into_iter().map(|(name, x)| (format!("prior.{name}"), x));
+        own.into_iter().chain(prior).collect()
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

@@ -5,7 +5,7 @@
 //! - [`sart`], [`cgls`], [`asd_pocs`], [`fista`]: the methods. [`shared`]: their common settings.
 //! - [`data`], [`regularizers`], [`bases`]: the parts of FISTA. [`noise`]: estimation of a scan's noise.
 //! - [`tv`], [`edges`]: total variation, and the edges that it may follow.
-//! - [`problem`]: a scan with its system matrix. [`drive`]: the passes of a run. [`monitor`]: metrics during a run.
+//! - [`problem`]: a scan with its system matrix, in a place. [`drive`]: the passes of a run. [`monitor`]: metrics during a run.
 
 pub mod asd_pocs;
 pub mod bases;
@@ -27,6 +27,7 @@ pub mod shared;
 pub mod stop;
 pub mod tv;
 
+use conefield_core::place::Array;
 use conefield_core::scan::ScanHeader;
 use conefield_core::scene::SupportRule;
 use ndarray::Array3;
@@ -49,7 +50,12 @@ pub(crate) fn flat(x: &Array3<f32>) -> &[f32] {
     x.as_slice().unwrap_or_else(|| unreachable!("arrays of this crate are contiguous"))
 }
 
-/// Mutable version of [`flat`].
-pub(crate) fn flat_mut(x: &mut Array3<f32>) -> &mut [f32] {
-    x.as_slice_mut().unwrap_or_else(|| unreachable!("arrays of this crate are contiguous"))
+/// The data of an array on the host; nothing if it lives elsewhere.
+pub(crate) fn on_host(x: &Array) -> &[f32] {
+    x.on_host().map_or(&[], flat)
+}
+
+/// Mutable version of [`on_host`].
+pub(crate) fn on_host_mut(x: &mut Array) -> &mut [f32] {
+    x.on_host_mut().and_then(|x| x.as_slice_mut()).unwrap_or_default()
 }

@@ -1,33 +1,45 @@
 //! A problem in terms of a basis: line integrals of coefficients.
 
-use super::flat_mut;
 use super::norms::norm2;
-use super::problem::Problem;
+use super::problem::{Problem, copy};
 use conefield_core::basis::Expansion;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::place::{ADD, Array, FLOOR, Mask, Place};
 use conefield_core::space::Space;
-use ndarray::{Array3, Zip};
-use rayon::prelude::*;
+use ndarray::Array3;
 
 /// Iterations that fit coefficients to a volume.
 const FIT: usize = 20;
 
 /// The matrix `A·B` of a problem's projector A and a basis B. If the coefficients are samples, it is `A` alone, on
-/// their grid. If they are the voxels, nothing is copied.
+/// their grid. If they are the voxels, nothing is copied. A basis works on the host: samples of a device are expanded
+/// only for records and at the end, the coefficients of other bases in every pass.
 pub(super) struct Model {
     expansion: Box<dyn Expansion>,
     /// The voxels of the coefficients, unless the coefficients are voxels.
-    voxels: Option<Array3<f32>>,
+    voxels: Option<Array>,
     /// The coefficients inside the object's support; `None` if all are, or if the problem's mask applies.
-    inside: Option<Array3<bool>>,
+    inside: Option<Mask>,
     /// Buffer for the adjoint on the voxels, unless the coefficients are samples.
-    adjoint: Option<Array3<f32>>,
+    adjoint: Option<Array>,
 }
 
 /// The grid of the problem's projector: that of the coefficients if they are samples, else `voxels`.
 pub(super) fn projected(expansion: &dyn Expansion, voxels: VoxelGrid) -> VoxelGrid {
     if expansion.are_samples() { expansion.coefficients() } else { voxels }
+}
+
+/// Overwrites `voxels` with `B·x`.
+fn expand(place: &dyn Place, basis: &dyn Expansion, x: &Array, voxels: &mut Array) -> Result<()> {
+    let x = place.read(x)?;
+    place.change(voxels, &mut |voxels| basis.operator().expand(x.view(), voxels.view_mut()))
+}
+
+/// Overwrites `x` with `Bᵀ·voxels`.
+fn gather(place: &dyn Place, basis: &dyn Expansion, voxels: &Array, x: &mut Array) -> Result<()> {
+    let voxels = place.read(voxels)?;
+    place.change(x, &mut |x| basis.operator().adjoint(voxels.view(), x.view_mut()))
 }
 
 impl Model {
@@ -36,29 +48,31 @@ impl Model {
         expansion: Box<dyn Expansion>,
         voxels: &VoxelGrid,
         space: &Space,
-        start: Array3<f32>,
-    ) -> (Self, Array3<f32>) {
+        start: Array,
+    ) -> Result<(Self, Array)> {
         if expansion.coefficients() == *voxels && expansion.are_samples() {
-            return (Self { expansion, voxels: None, inside: None, adjoint: None }, start);
+            return Ok((Self { expansion, voxels: None, inside: None, adjoint: None }, start));
         }
         let coefficients = || space.array(expansion.coefficients().shape);
-        let (x, adjoint) = (coefficients(), (!expansion.are_samples()).then(coefficients));
+        let (x, adjoint) = (coefficients()?, (!expansion.are_samples()).then(coefficients).transpose()?);
         space.pass(expansion.scratch());
         let mut model = Self { expansion, voxels: Some(start), inside: None, adjoint };
-        let x = space.briefly(|space| model.fit(x, space));
-        (model, x)
+        let x = space.briefly(|space| model.fit(x, space))?;
+        Ok((model, x))
     }
 
     /// Determines which coefficients can be nonzero.
-    pub(super) fn prepare(&mut self, problem: &Problem<'_>, work: &mut Array3<f32>) {
+    pub(super) fn prepare(&mut self, problem: &Problem<'_>, work: &mut Array) -> Result<()> {
         if self.expansion.are_samples() {
-            return;
+            return Ok(());
         }
         if let (Some(voxels), Some(_)) = (&mut self.voxels, problem.inside) {
-            problem.ones(voxels);
-            self.expansion.operator().adjoint(voxels.view(), work.view_mut());
-            self.inside = Some(work.mapv(|reached| reached > 0.0));
+            problem.ones(voxels)?;
+            gather(problem.place, self.expansion.as_ref(), voxels, work)?;
+            let inside: Array3<bool> = problem.place.read(work)?.mapv(|reached| reached > 0.0);
+            self.inside = Some(problem.place.mask(inside)?);
         }
+        Ok(())
     }
 
     /// An error of the basis since the last call.
@@ -66,9 +80,9 @@ impl Model {
         self.expansion.fault()
     }
 
-    /// Whether the projector takes the coefficients as they are.
-    pub(super) fn projects_coefficients(&self) -> bool {
-        self.expansion.are_samples()
+    /// Whether the basis takes part in every pass, on the host.
+    pub(super) fn expands(&self) -> bool {
+        !self.expansion.are_samples()
     }
 
     /// The grid of the coefficients.
@@ -77,85 +91,79 @@ impl Model {
     }
 
     /// The volume of coefficients: 0 where samples overshoot below 0, and outside the object's support.
-    pub(super) fn volume<'a>(&'a mut self, problem: &Problem<'_>, x: &'a Array3<f32>) -> &'a Array3<f32> {
-        let Some(voxels) = &mut self.voxels else { return x };
-        self.expansion.operator().expand(x.view(), voxels.view_mut());
+    pub(super) fn volume<'a>(&'a mut self, problem: &Problem<'_>, x: &'a Array) -> Result<&'a Array> {
+        let Some(voxels) = &mut self.voxels else { return Ok(x) };
+        expand(problem.place, self.expansion.as_ref(), x, voxels)?;
         if self.expansion.are_samples() {
-            voxels.par_mapv_inplace(|x| x.max(0.0));
+            problem.place.map(&FLOOR, [0.0; 2], voxels, &[])?;
         } else {
-            problem.outside(voxels, 0.0);
+            problem.outside(voxels, 0.0)?;
         }
-        voxels
-    }
-
-    /// The input of the problem's projector.
-    fn projected<'a>(&'a mut self, problem: &Problem<'_>, x: &'a Array3<f32>) -> &'a Array3<f32> {
-        if self.expansion.are_samples() { x } else { self.volume(problem, x) }
+        Ok(voxels)
     }
 
     /// The volume of coefficients that are no longer needed.
-    pub(super) fn take(&mut self, problem: &Problem<'_>, x: Array3<f32>) -> Array3<f32> {
-        self.volume(problem, &x);
-        self.voxels.take().unwrap_or(x)
+    pub(super) fn take(mut self, problem: &Problem<'_>, x: Array) -> Result<Array> {
+        self.volume(problem, &x)?;
+        Ok(self.voxels.unwrap_or(x))
     }
 
     /// Like [`Problem::forward`].
-    pub(super) fn forward(&mut self, problem: &Problem<'_>, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) {
-        problem.forward(views, self.projected(problem, x), out);
+    pub(super) fn forward(&mut self, problem: &Problem<'_>, views: &[usize], x: &Array, out: &mut Array) -> Result<()> {
+        // The projector takes samples as they are.
+        let x = if self.expands() { self.volume(problem, x)? } else { x };
+        problem.forward(views, x, out)
     }
 
     /// Adds `(A·B)ᵀ·y` for some views to `out`.
-    pub(super) fn back(&mut self, problem: &Problem<'_>, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
+    pub(super) fn back(&mut self, problem: &Problem<'_>, views: &[usize], y: &Array, out: &mut Array) -> Result<()> {
         let (Some(voxels), Some(adjoint)) = (&mut self.voxels, &mut self.adjoint) else {
             return problem.add_back(views, y, out);
         };
-        problem.back(views, y, voxels);
-        self.expansion.operator().adjoint(voxels.view(), adjoint.view_mut());
-        Zip::from(out).and(&*adjoint).par_for_each(|sum, x| *sum += x);
+        problem.back(views, y, voxels)?;
+        gather(problem.place, self.expansion.as_ref(), voxels, adjoint)?;
+        problem.place.map(&ADD, [1.0, 1.0], out, &[adjoint])
     }
 
     /// Which coefficients can be nonzero, if not all.
-    pub(super) fn inside<'a>(&'a self, problem: &'a Problem<'_>) -> Option<&'a [bool]> {
-        let inside = if self.expansion.are_samples() { problem.inside } else { self.inside.as_ref() };
-        inside.map(|inside| inside.as_slice().unwrap_or_else(|| unreachable!("masks are contiguous")))
+    pub(super) fn inside<'a>(&'a self, problem: &Problem<'a>) -> Option<&'a Mask> {
+        if self.expands() { self.inside.as_ref() } else { problem.inside }
     }
 
     /// Sets the coefficients that must stay 0 to `value`.
-    pub(super) fn outside(&self, problem: &Problem<'_>, x: &mut Array3<f32>, value: f32) {
-        if let Some(inside) = self.inside(problem) {
-            let all = flat_mut(x).par_iter_mut().zip(inside);
-            all.for_each(|(x, inside)| *x = if *inside { *x } else { value });
-        }
+    pub(super) fn outside(&self, problem: &Problem<'_>, x: &mut Array, value: f32) -> Result<()> {
+        let inside = if self.expands() { self.inside.as_ref() } else { problem.inside };
+        inside.map_or(Ok(()), |inside| problem.place.keep(x, inside, value))
     }
 
     /// The coefficients whose volume is closest to `voxels`, from `x = 0` by a few conjugate gradient steps.
-    fn fit(&mut self, mut x: Array3<f32>, space: &Space) -> Array3<f32> {
-        let Some(residual) = &mut self.voxels else { return x };
-        let operator = self.expansion.operator();
-        let shape = self.expansion.coefficients().shape;
-        let (mut gradient, mut direction) = (space.array(shape), space.array(shape));
-        let mut ahead = space.volume();
-        if norm2(residual) == 0.0 {
-            return x;
+    fn fit(&mut self, mut x: Array, space: &Space) -> Result<Array> {
+        let Some(residual) = &mut self.voxels else { return Ok(x) };
+        let (basis, place) = (self.expansion.as_ref(), space.place().as_ref());
+        let shape = basis.coefficients().shape;
+        let (mut gradient, mut direction) = (space.array(shape)?, space.array(shape)?);
+        let mut ahead = space.volume()?;
+        if norm2(place, residual)? == 0.0 {
+            return Ok(x);
         }
-        operator.adjoint(residual.view(), gradient.view_mut());
-        direction.assign(&gradient);
-        let mut gamma = norm2(&gradient);
+        gather(place, basis, residual, &mut gradient)?;
+        copy(place, &gradient, &mut direction)?;
+        let mut gamma = norm2(place, &gradient)?;
         let enough = 1e-4 * gamma;
         for _ in 0..FIT {
-            operator.expand(direction.view(), ahead.view_mut());
-            let square = norm2(&ahead);
+            expand(place, basis, &direction, &mut ahead)?;
+            let square = norm2(place, &ahead)?;
             if gamma <= enough || square == 0.0 {
                 break;
             }
-            let alpha = (gamma / square) as f32;
-            Zip::from(&mut x).and(&direction).par_for_each(|x, d| *x += alpha * d);
-            Zip::from(&mut *residual).and(&ahead).par_for_each(|r, a| *r -= alpha * a);
-            operator.adjoint(residual.view(), gradient.view_mut());
-            let beta = (norm2(&gradient) / gamma) as f32;
-            gamma = norm2(&gradient);
-            Zip::from(&mut direction).and(&gradient).par_for_each(|d, g| *d = g + beta * *d);
+            let alpha = f64::from((gamma / square) as f32);
+            place.map(&ADD, [alpha, 1.0], &mut x, &[&direction])?;
+            place.map(&ADD, [-alpha, 1.0], residual, &[&ahead])?;
+            gather(place, basis, residual, &mut gradient)?;
+            let next = norm2(place, &gradient)?;
+            place.map(&ADD, [1.0, next / gamma], &mut direction, &[&gradient])?;
+            gamma = next;
         }
-        x
+        Ok(x)
     }
 }

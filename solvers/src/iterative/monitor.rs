@@ -4,9 +4,10 @@ use crate::watched;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
 use conefield_core::method::Job;
+use conefield_core::place::{Array, Place};
 use conefield_core::scan::Scan;
-use conefield_core::voxel::VoxelOperator;
-use ndarray::Array3;
+use conefield_core::voxel::VoxelProjector;
+use ndarray::{Array3, ArrayBase, Data, Ix3};
 
 /// Evaluates a job's reference and held-out views; never trains on them.
 pub struct VolumeMonitor<'a> {
@@ -23,13 +24,18 @@ impl<'a> VolumeMonitor<'a> {
         Self { reference, held_out: job.held_out, peak: job.peak }
     }
 
+    /// Whether there is a volume to compare with.
+    pub fn has_reference(&self) -> bool {
+        self.reference.is_some()
+    }
+
     /// Whether there is anything to evaluate.
     pub fn looks(&self) -> bool {
         self.reference.is_some() || self.held_out.is_some()
     }
 
     /// PSNR in dB of `scale·volume` over the voxels of `watched`.
-    pub fn psnr(&self, volume: &Array3<f32>, scale: f32) -> Option<f64> {
+    pub fn psnr<S: Data<Elem = f32>>(&self, volume: &ArrayBase<S, Ix3>, scale: f32) -> Option<f64> {
         let reference = self.reference?;
         let (mut sum, mut n) = (0.0, 0usize);
         for voxel in watched::voxels(volume.dim().into()) {
@@ -41,20 +47,19 @@ impl<'a> VolumeMonitor<'a> {
     }
 
     /// Root mean square error of the held-out views' line integrals, relative to their largest value.
-    pub fn held_out(&self, operator: &dyn VoxelOperator<f32>, volume: &Array3<f32>) -> Result<Option<f64>> {
+    pub fn held_out(&self, place: &dyn Place, projector: &dyn VoxelProjector, volume: &Array) -> Result<Option<f64>> {
         let Some(scan) = self.held_out else { return Ok(None) };
         let geometry: &Geometry = &scan.geometry;
         let [rows, columns] = geometry.detector;
-        let mut found = Array3::zeros((1, rows, columns));
+        let mut found = place.zeros([1, rows, columns])?;
         let (mut square, mut top) = (0.0, 0.0f32);
         for view in 0..geometry.views.len() {
-            operator.forward(geometry, &[view], volume.view(), found.view_mut());
-            for (a, &b) in found.iter().zip(scan.view(view)) {
+            place.forward(projector, geometry, &[view], volume, &mut found)?;
+            for (a, &b) in place.read(&found)?.iter().zip(scan.view(view)) {
                 square += f64::from(a - b).powi(2);
                 top = top.max(b);
             }
         }
-        operator.fault()?;
         Ok(Some((square / scan.projections.len() as f64).sqrt() / f64::from(top).max(1e-300)))
     }
 }

@@ -2,6 +2,7 @@
 
 use conefield_core::data_term::Misfit;
 use conefield_core::scan::ScanHeader;
+use conefield_core::wgsl::Fragment;
 use ndarray::{ArrayView3, Axis};
 use rayon::prelude::*;
 
@@ -84,6 +85,13 @@ impl Misfit for Noise {
     /// Noise of the variance `sigma²/w` has the standard deviation `sigma·√w` after weighting.
     fn spread(&self, _: usize, measured: &[f32], values: &mut [f32]) {
         self.weigh(0.5, measured, values);
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        Some(Fragment::new(&[
+            &format!("const stage_growth: f32 = {:?};", self.growth as f32),
+            include_str!("noise.wgsl"),
+        ]))
     }
 
     fn noise(&self) -> f64 {

@@ -1,12 +1,14 @@
-//! A scan with its system matrix.
+//! A scan with its system matrix, in a place.
 
-use super::norms::square_sum;
 use crate::shadow::{air_level, shadow};
+use conefield_core::data_term::Misfit;
+use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
+use conefield_core::place::{ADD, Array, INVERT, Mask, Place, Reduction, Views, Weighing};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::space::Space;
-use conefield_core::voxel::VoxelOperator;
-use ndarray::{Array2, Array3, ArrayView3, ArrayViewMut3, Axis, Zip, s};
+use conefield_core::voxel::VoxelProjector;
+use ndarray::{Array3, Axis};
 use rayon::prelude::*;
 
 /// Pixels by which the object's shadow is dilated; pixels outside count as air.
@@ -19,108 +21,83 @@ pub struct Problem<'a> {
     pub scan: &'a Scan,
     /// Its geometry, with the grid of the unknowns as the volume.
     pub geometry: &'a Geometry,
+    /// Where the arrays live.
+    pub place: &'a dyn Place,
     /// The system matrix.
-    pub operator: &'a dyn VoxelOperator<f32>,
+    pub projector: &'a dyn VoxelProjector,
     /// Seed of all randomness.
     pub seed: u64,
     /// The voxels that may be nonzero, if not all.
-    pub(super) inside: Option<&'a Array3<bool>>,
-    /// The object's shadow in each view, if the other pixels count as 0.
-    pub(super) shadow: Option<Vec<Array2<bool>>>,
+    pub(super) inside: Option<&'a Mask>,
+    /// The object's shadow, if the other pixels count as 0.
+    pub(super) shadow: Option<Mask>,
+    /// The measured images.
+    pub(super) views: Views<'a>,
 }
 
 impl Problem<'_> {
-    /// Makes pixels outside the object's shadow count as 0.
-    pub fn clear_air(&mut self) {
+    /// Makes pixels outside the object's shadow count as 0. Returns their share.
+    pub fn clear_air(&mut self) -> Result<f64> {
         let level = air_level(self.scan);
-        let views = self.scan.projections.outer_iter().into_par_iter();
-        self.shadow = Some(views.map(|view| shadow(view, level, MARGIN)).collect());
+        let mut inside = Array3::from_elem(self.scan.projections.raw_dim(), false);
+        let views = inside.axis_iter_mut(Axis(0)).into_par_iter().zip(self.scan.projections.outer_iter());
+        views.for_each(|(mut inside, view)| inside.assign(&shadow(view, level, MARGIN)));
+        let seen = inside.iter().filter(|x| **x).count();
+        let share = 1.0 - seen as f64 / inside.len().max(1) as f64;
+        self.shadow = Some(self.place.mask(inside)?);
+        Ok(share)
     }
 
-    /// Bytes of the masks of [`Problem::clear_air`].
+    /// Bytes of the mask of [`Problem::clear_air`].
     pub fn air_bytes(header: &ScanHeader) -> u64 {
         header.pixels()
     }
 
-    /// Share of the pixels outside the shadow, after [`Problem::clear_air`].
-    pub fn air_share(&self) -> f64 {
-        let Some(shadows) = &self.shadow else { return 0.0 };
-        let inside: usize = shadows.iter().map(|s| s.iter().filter(|x| **x).count()).sum();
-        1.0 - inside as f64 / self.scan.projections.len().max(1) as f64
+    /// Takes the measured images to the place, if they fit beside what is there.
+    pub fn settle(&mut self) -> Result<()> {
+        self.views = self.place.views(&self.scan.projections)?;
+        Ok(())
+    }
+
+    /// How line integrals are compared with the measured ones.
+    pub(super) fn by<'a>(&'a self, term: Option<&'a dyn Misfit>, weights: Option<&'a Array>) -> Weighing<'a> {
+        Weighing { views: &self.views, shadow: self.shadow.as_ref(), weights, term }
     }
 
     /// Overwrites the first images of `out` with `A·x` for some views.
-    pub fn forward(&self, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) {
-        self.operator.forward(self.geometry, views, x.view(), images_mut(out, views.len()));
+    pub fn forward(&self, views: &[usize], x: &Array, out: &mut Array) -> Result<()> {
+        self.place.forward(self.projector, self.geometry, views, x, out)
     }
 
-    /// Overwrites the first images of `out` with `p − A·x` for some views, with p = 0 in air if requested. Returns
-    /// `‖p − A·x‖²`.
-    pub fn residual(&self, views: &[usize], x: &Array3<f32>, out: &mut Array3<f32>) -> f64 {
-        self.forward(views, x, out);
-        self.subtract(views, out)
-    }
-
-    /// Overwrites the first images of `out`, `A·x` for some views, with `p − A·x`; see [`Problem::residual`].
-    pub(super) fn subtract(&self, views: &[usize], out: &mut Array3<f32>) -> f64 {
-        for (mut image, &v) in out.axis_iter_mut(Axis(0)).zip(views) {
-            let both = Zip::from(&mut image).and(self.scan.view(v));
-            match &self.shadow {
-                None => both.par_for_each(|a, p| *a = p - *a),
-                Some(shadow) => {
-                    both.and(&shadow[v]).par_for_each(|a, p, inside| *a = if *inside { p - *a } else { -*a });
-                }
-            }
-        }
-        pixel_norm2(out, views.len())
+    /// Overwrites the first images of `out` with `W·(p − A·x)` for some views, with p = 0 in air if requested; W is 1 or
+    /// `weights`. Returns `‖p − A·x‖²`.
+    pub fn residual(&self, views: &[usize], x: &Array, weights: Option<&Array>, out: &mut Array) -> Result<f64> {
+        self.forward(views, x, out)?;
+        Ok(self.place.compare(&self.by(None, weights), views, out)?[0])
     }
 
     /// Overwrites `out` with `Aᵀ·y` for some views, whose images are the first of `y`. `out` is 0 outside the object's
     /// support, so that zeros there stay.
-    pub fn back(&self, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
-        out.par_mapv_inplace(|_| 0.0);
-        self.add_back(views, y, out);
-        self.outside(out, 0.0);
+    pub fn back(&self, views: &[usize], y: &Array, out: &mut Array) -> Result<()> {
+        self.place.fill(out, 0.0)?;
+        self.add_back(views, y, out)?;
+        self.outside(out, 0.0)
     }
 
     /// Adds `Aᵀ·y` for some views, whose images are the first of `y`, to `out`.
-    pub(super) fn add_back(&self, views: &[usize], y: &Array3<f32>, out: &mut Array3<f32>) {
-        self.operator.adjoint(self.geometry, views, images(y, views.len()), out.view_mut());
-    }
-
-    /// Calls `work` with each of the first images of `pixels`, its view and its measurement. Returns the results in the
-    /// order of the views.
-    pub fn each_image<T: Send>(
-        &self,
-        views: &[usize],
-        pixels: &mut Array3<f32>,
-        work: impl Fn(usize, &[f32], &mut [f32]) -> T + Sync,
-    ) -> Vec<T> {
-        let mut images = images_mut(pixels, views.len());
-        let images = images.axis_iter_mut(Axis(0)).into_par_iter().zip(views);
-        images
-            .map(|(image, &view)| {
-                let measured = self.scan.view(view);
-                let measured = measured.as_standard_layout();
-                match (measured.as_slice(), image.into_slice()) {
-                    (Some(measured), Some(image)) => work(view, measured, image),
-                    _ => unreachable!("images are contiguous"),
-                }
-            })
-            .collect()
+    pub(super) fn add_back(&self, views: &[usize], y: &Array, out: &mut Array) -> Result<()> {
+        self.place.adjoint(self.projector, self.geometry, views, y, out)
     }
 
     /// Sets the voxels outside the object's support to `value`.
-    pub fn outside(&self, x: &mut Array3<f32>, value: f32) {
-        if let Some(inside) = self.inside {
-            Zip::from(x).and(inside).par_for_each(|x, inside| *x = if *inside { *x } else { value });
-        }
+    pub fn outside(&self, x: &mut Array, value: f32) -> Result<()> {
+        self.inside.map_or(Ok(()), |inside| self.place.keep(x, inside, value))
     }
 
     /// Sets the voxels inside the object's support to 1 and the others to 0.
-    pub fn ones(&self, x: &mut Array3<f32>) {
-        x.fill(1.0);
-        self.outside(x, 0.0);
+    pub fn ones(&self, x: &mut Array) -> Result<()> {
+        self.place.fill(x, 1.0)?;
+        self.outside(x, 0.0)
     }
 
     /// All views.
@@ -129,29 +106,19 @@ impl Problem<'_> {
     }
 }
 
-/// The first `n` images of `pixels`.
-pub(super) fn images(pixels: &Array3<f32>, n: usize) -> ArrayView3<'_, f32> {
-    pixels.slice(s![..n, .., ..])
-}
-
-/// Mutable version of [`images`].
-pub(super) fn images_mut(pixels: &mut Array3<f32>, n: usize) -> ArrayViewMut3<'_, f32> {
-    pixels.slice_mut(s![..n, .., ..])
-}
-
-/// Sum of squares of the first `n` images.
-pub(super) fn pixel_norm2(pixels: &Array3<f32>, n: usize) -> f64 {
-    images(pixels, n).as_slice().map_or_else(|| unreachable!("images follow each other"), square_sum)
+/// Overwrites `to` with `from`.
+pub(super) fn copy(place: &dyn Place, from: &Array, to: &mut Array) -> Result<()> {
+    place.map(&ADD, [1.0, 0.0], to, &[from])
 }
 
 /// Buffer for the pixels of the largest of `parts` parts of the views.
-pub(super) fn room(space: &Space, parts: usize) -> Array3<f32> {
+pub(super) fn room(space: &Space, parts: usize) -> Result<Array> {
     space.projections(space.header().views.div_ceil(parts.max(1)))
 }
 
 /// Replaces x by `1/x` if it is above a millionth of the largest value, else by 0: excludes rays that miss the volume
 /// and voxels that no ray meets.
-pub fn invert(x: &mut Array3<f32>) {
-    let least = 1e-6 * x.iter().fold(0.0f32, |m, &v| m.max(v));
-    x.par_mapv_inplace(|v| if v > least { 1.0 / v } else { 0.0 });
+pub(super) fn invert(place: &dyn Place, x: &mut Array) -> Result<()> {
+    let largest = place.reduce(Reduction::Maximum, x, x)?;
+    place.map(&INVERT, [f64::from(1e-6 * largest as f32), 0.0], x, &[])
 }

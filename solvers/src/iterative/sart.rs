@@ -5,20 +5,20 @@
 use super::norms::change;
 use super::order::{Order, Subsets, summary};
 use super::plan::{Iterative, IterativePlan};
-use super::problem::{images_mut, invert, room};
+use super::problem::{copy, invert, room};
 use super::shared::Shared;
-use super::{Iteration, Pass, Problem, Stop, drive::drive, flat_mut};
+use super::{Iteration, Pass, Problem, Stop, drive::drive};
 use conefield_core::error::{Result, ensure};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
+use conefield_core::place::{Array, RELAX, State};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
 use conefield_core::spec::stage;
 use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
-use ndarray::{Array3, Axis, Zip};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -120,9 +120,9 @@ struct Built {
 }
 
 impl Built {
-    fn iterate(&self, space: &Space, x: Array3<f32>) -> Iterate {
-        let before = self.shared.stop.change.map(|_| space.volume());
-        Iterate { before, sweep: Sweep::new(self.updates, space, x) }
+    fn iterate(&self, space: &Space, x: Array) -> Result<Iterate> {
+        let before = self.shared.stop.change.map(|_| space.volume()).transpose()?;
+        Ok(Iterate { before, sweep: Sweep::new(self.updates, space, x)? })
     }
 }
 
@@ -139,11 +139,12 @@ impl Iterative for Built {
         let begun = Instant::now();
         let opened = self.shared.open(&self.describe(), job, observer)?;
         let job = &opened.job(job);
-        let problem = opened.problem(job);
-        let space = Space::new(job.scan.header());
-        let mut iterate = self.iterate(&space, self.shared.start(job, &problem, &space)?);
-        iterate.sweep.prepare(&problem);
-        drive(job, &self.shared.stop, begun, &problem, &space, &mut iterate, observer)
+        let mut problem = opened.problem(job);
+        let space = opened.space(job.scan.header());
+        let mut iterate = self.iterate(&space, self.shared.start(job, &problem, &space)?)?;
+        iterate.sweep.prepare(&problem)?;
+        problem.settle()?;
+        drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
     }
 
     fn found(&self, scan: &Scan) -> Vec<String> {
@@ -152,7 +153,7 @@ impl Iterative for Built {
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
         let space = Space::tally(*header);
-        self.iterate(&space, space.volume());
+        let _ = space.volume().and_then(|x| self.iterate(&space, x));
         self.shared.price(&space, self.updates.subsets)
     }
 
@@ -166,105 +167,98 @@ impl Iterative for Built {
 pub(super) struct Sweep {
     updates: Updates,
     subsets: Vec<Vec<usize>>,
-    pub(super) x: Array3<f32>,
+    pub(super) x: Array,
     /// Inverse row sums, `[view, row, column]`.
-    rows: Array3<f32>,
+    rows: Array,
     /// Inverse column sums of the current subset.
-    columns: Array3<f32>,
+    columns: Array,
     /// Working memory, free between sweeps.
-    pub(super) work: Array3<f32>,
+    pub(super) work: Array,
     /// The pixels of a subset.
-    pixels: Array3<f32>,
+    pixels: Array,
 }
 
 impl Sweep {
     /// The buffers of a sweep that starts from `x`.
-    pub(super) fn new(updates: Updates, space: &Space, x: Array3<f32>) -> Self {
+    pub(super) fn new(updates: Updates, space: &Space, x: Array) -> Result<Self> {
         let views = space.header().views;
-        Self {
+        Ok(Self {
             updates,
             subsets: updates.subsets.of(views),
             x,
-            rows: space.projections(views),
-            columns: space.volume(),
-            work: space.volume(),
-            pixels: room(space, updates.subsets.count(views)),
-        }
+            rows: space.projections(views)?,
+            columns: space.volume()?,
+            work: space.volume()?,
+            pixels: room(space, updates.subsets.count(views))?,
+        })
     }
 
     /// Computes the sums that do not change.
-    pub(super) fn prepare(&mut self, problem: &Problem<'_>) {
-        problem.ones(&mut self.work);
+    pub(super) fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
+        problem.ones(&mut self.work)?;
         // One subset at a time, as in every pass.
         for views in &self.subsets {
-            problem.forward(views, &self.work, &mut self.pixels);
-            for (image, &v) in self.pixels.outer_iter().zip(views) {
-                self.rows.index_axis_mut(Axis(0), v).assign(&image);
-            }
+            problem.forward(views, &self.work, &mut self.pixels)?;
+            problem.place.scatter(&self.pixels, &mut self.rows, views)?;
         }
-        invert(&mut self.rows);
+        invert(problem.place, &mut self.rows)?;
         if let [all] = &self.subsets[..] {
-            column_sums(problem, all, &mut self.pixels, &mut self.columns);
+            column_sums(problem, all, &mut self.pixels, &mut self.columns)?;
         }
+        Ok(())
     }
 
     /// Makes pass `pass`, counted from 0; returns `‖p − A·x‖²`.
-    pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64) -> f64 {
+    pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64) -> Result<f64> {
         let Updates { relaxation, decay, order, nonnegative, .. } = self.updates;
-        let relaxation = (relaxation * decay.powi(pass.min(1 << 20) as i32)) as f32;
-        let floor = if nonnegative { 0.0 } else { f32::NEG_INFINITY };
+        let relaxation = f64::from((relaxation * decay.powi(pass.min(1 << 20) as i32)) as f32);
+        let floor = f64::from(if nonnegative { 0.0 } else { f32::MIN });
         let mut square = 0.0;
         for s in order.of(self.subsets.len(), problem.seed, pass) {
             let views = &self.subsets[s];
-            square += problem.residual(views, &self.x, &mut self.pixels);
-            for (mut image, &v) in self.pixels.axis_iter_mut(Axis(0)).zip(views) {
-                image.zip_mut_with(&self.rows.index_axis(Axis(0), v), |r, w| *r *= w);
-            }
-            problem.back(views, &self.pixels, &mut self.work);
+            square += problem.residual(views, &self.x, Some(&self.rows), &mut self.pixels)?;
+            problem.back(views, &self.pixels, &mut self.work)?;
             if self.subsets.len() > 1 {
-                column_sums(problem, views, &mut self.pixels, &mut self.columns);
+                column_sums(problem, views, &mut self.pixels, &mut self.columns)?;
             }
-            Zip::from(&mut self.x)
-                .and(&self.work)
-                .and(&self.columns)
-                .par_for_each(|x, u, d| *x = (*x + relaxation * d * u).max(floor));
+            problem.place.map(&RELAX, [relaxation, floor], &mut self.x, &[&self.columns, &self.work])?;
         }
-        square
+        Ok(square)
     }
 }
 
 /// Overwrites `sums` with the inverse column sums of some views; `pixels` is a buffer for their images.
-fn column_sums(problem: &Problem<'_>, views: &[usize], pixels: &mut Array3<f32>, sums: &mut Array3<f32>) {
-    images_mut(pixels, views.len()).fill(1.0);
-    problem.back(views, pixels, sums);
-    invert(sums);
+fn column_sums(problem: &Problem<'_>, views: &[usize], pixels: &mut Array, sums: &mut Array) -> Result<()> {
+    problem.place.fill(pixels, 1.0)?;
+    problem.back(views, pixels, sums)?;
+    invert(problem.place, sums)
 }
 
 struct Iterate {
     sweep: Sweep,
     /// The volume before a pass, if its change is needed.
-    before: Option<Array3<f32>>,
+    before: Option<Array>,
 }
 
 impl Iteration for Iterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         if let Some(before) = &mut self.before {
-            before.assign(&self.sweep.x);
+            copy(problem.place, &self.sweep.x, before)?;
         }
-        let residual = self.sweep.sweep(problem, pass);
-        let change = self.before.as_ref().map(|before| change(&self.sweep.x, before));
+        let residual = self.sweep.sweep(problem, pass)?;
+        let change = self.before.as_ref().map(|before| change(problem.place, &self.sweep.x, before)).transpose()?;
         Ok(Pass { residual, change, prior: None })
     }
 
-    fn volume(&mut self, _: &Problem<'_>) -> &Array3<f32> {
-        &self.sweep.x
+    fn volume(&mut self, _: &Problem<'_>) -> Result<&Array> {
+        Ok(&self.sweep.x)
     }
 
-    fn take(&mut self, _: &Problem<'_>) -> Array3<f32> {
-        std::mem::take(&mut self.sweep.x)
+    fn take(self: Box<Self>, _: &Problem<'_>) -> Result<Array> {
+        Ok(self.sweep.x)
     }
 
-    fn state(&mut self) -> Result<Vec<(String, &mut [f32])>> {
-        Ok(vec![("x".into(), flat_mut(&mut self.sweep.x))])
+    fn state(&mut self) -> Vec<(String, State<'_>)> {
+        vec![("x".into(), State::Placed(&mut self.sweep.x))]
     }
 }

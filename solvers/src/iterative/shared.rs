@@ -11,7 +11,8 @@ use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::{Job, Observer};
-use conefield_core::scan::{Scan, Volume};
+use conefield_core::place::{Array, Mask, Place, Views};
+use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::VoxelScene;
 use conefield_core::settings::KnownVolume;
 use conefield_core::space::Space;
@@ -51,22 +52,21 @@ impl Shared {
     }
 
     /// The start volume, in 1/mm; 0 if there is none, and outside the object's support.
-    pub(super) fn start(&self, job: &Job<'_>, problem: &Problem<'_>, space: &Space) -> Result<Array3<f32>> {
+    pub(super) fn start(&self, job: &Job<'_>, problem: &Problem<'_>, space: &Space) -> Result<Array> {
         let mut x = self.known(job, space)?;
-        problem.outside(&mut x, 0.0);
+        problem.outside(&mut x, 0.0)?;
         Ok(x)
     }
 
     /// The known volume, in 1/mm; 0 if there is none.
-    pub(super) fn known(&self, job: &Job<'_>, space: &Space) -> Result<Array3<f32>> {
+    pub(super) fn known(&self, job: &Job<'_>, space: &Space) -> Result<Array> {
         let volume = match (job.start, &self.start) {
             (Some(given), _) => in_mm(job, "start", given.clone())?,
             (None, Some(path)) => start_volume(job, path)?,
-            (None, None) => return Ok(space.volume()),
+            (None, None) => return space.volume(),
         };
         space.hold(4 * space.header().voxels());
-        let data = volume.data;
-        Ok(if data.is_standard_layout() { data } else { data.as_standard_layout().into_owned() })
+        space.place().adopt(volume.data)
     }
 
     /// Validates the scan, logs `method` and its projector, and finds the object's support.
@@ -89,27 +89,30 @@ impl Shared {
         let meets = |v, p: usize| g.ray(v, p / columns, p % columns).clip(bounds).is_some();
         let met = (0..g.views.len()).any(|v| (0..rows * columns).any(|p| meets(v, p)));
         ensure(met, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
-        let projector = job.backend.place(Box::new(self.projector.clone()))?;
-        observer.note(&format!("{method}; {}", projector.describe()));
+        let place = job.backend.place();
+        place.admits(self.projector.as_ref())?;
+        let on = place.device().map(|device| format!(", on {device}")).unwrap_or_default();
+        observer.note(&format!("{method}; {}{on}", self.projector.describe()));
         // Uses the views as measured: the attenuation subtracted later is too coarse for carving.
         let (support, said) = support(job.scan, self.scene.support);
         said.iter().for_each(|line| observer.note(line));
         let inside = support.map(|support| {
             let mut inside = Array3::from_elem(grid.shape, false);
             Zip::indexed(&mut inside).par_for_each(|(x, y, z), i| *i = support.holds(grid.voxel([x, y, z])));
-            inside
+            place.mask(inside)
         });
+        let inside = inside.transpose()?;
         let within = Within::of(job, self.scene.surround, observer)?;
         let binned = (bin > 1).then(|| Within::job(within.as_ref(), job).scan.binned(bin));
         let seen = binned.as_ref().map_or(g, |scan| &scan.geometry);
         let geometry = Geometry { volume: grid, ..seen.clone() };
-        Ok(Opened { projector, inside, within, binned, geometry })
+        Ok(Opened { place, projector: self.projector.clone(), inside, within, binned, geometry })
     }
 
     /// Adds the memory of the driver and of the projector for a subset to the method's own arrays in `space`; returns
     /// all bytes except the resulting volume.
     pub(super) fn price(&self, space: &Space, subsets: Subsets) -> u64 {
-        super::drive::best(&self.stop, space);
+        let _ = super::drive::best(&self.stop, space);
         let header = space.header();
         space.pass(self.projector.scratch(header, header.views.div_ceil(subsets.count(header.views))));
         space.bytes().saturating_sub(4 * space.header().voxels())
@@ -118,9 +121,10 @@ impl Shared {
 
 /// The inputs of a voxel reconstruction.
 pub(super) struct Opened {
-    projector: Box<dyn VoxelProjector>,
+    place: Arc<dyn Place>,
+    projector: Arc<dyn VoxelProjector>,
     /// The object's support, if known.
-    inside: Option<Array3<bool>>,
+    inside: Option<Mask>,
     /// The scan without attenuation beyond the volume.
     within: Option<Within>,
     /// The binned scan, if requested.
@@ -135,16 +139,24 @@ impl Opened {
         Within::job(self.within.as_ref(), job)
     }
 
-    /// The projector, where the backend works.
-    pub(super) fn projector(&self) -> &dyn VoxelProjector {
-        self.projector.as_ref()
+    /// A space in the problem's place.
+    pub(super) fn space(&self, header: ScanHeader) -> Space {
+        Space::new(header, self.place.clone())
     }
 
     /// Its problem, with every pixel as measured or binned.
     pub(super) fn problem<'a>(&'a self, job: &Job<'a>) -> Problem<'a> {
-        let (operator, inside) = (self.projector.operator(), self.inside.as_ref());
         let scan = self.binned.as_ref().unwrap_or(job.scan);
-        Problem { scan, geometry: &self.geometry, operator, seed: job.seed, inside, shadow: None }
+        Problem {
+            scan,
+            geometry: &self.geometry,
+            place: self.place.as_ref(),
+            projector: self.projector.as_ref(),
+            seed: job.seed,
+            inside: self.inside.as_ref(),
+            shadow: None,
+            views: Views { measured: &scan.projections, here: None },
+        }
     }
 }
 

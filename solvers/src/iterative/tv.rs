@@ -6,13 +6,15 @@
 //! slopes along them (Ehrhardt and Betcke, SIAM J. Imaging Sci. 9(3), 2016, whose edges come from another image).
 
 use super::edges::Edges;
-use super::flat_mut;
+use super::on_host_mut;
+use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::place::{ADD, Array, Place, Slope};
 use conefield_core::regularizer::{Dual, Update};
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
 use conefield_core::space::Space;
 use conefield_core::wgsl::Fragment;
-use ndarray::{Array3, ArrayView3};
+use ndarray::ArrayView3;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -99,20 +101,21 @@ pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
     /// The dual variable along x, y and z; with edges it is `D·p`.
-    dual: [Array3<f32>; 3],
+    dual: [Array; 3],
     /// Edges across which slopes cost less.
     edges: Option<Edges>,
 }
 
 impl TvProx {
     /// For volumes of `shape`, starting with a dual of 0.
-    pub fn new(shape: [usize; 3], g: [f32; 3], space: &Space) -> Self {
+    pub fn new(shape: [usize; 3], g: [f32; 3], space: &Space) -> Result<Self> {
         let split = Split::new(shape[0], REACH, rayon::current_num_threads());
         space.briefly(|space| {
             let planes = (split.slabs - 1) * 4 * split.halo() + split.slabs * 2 * split.reach;
             space.hold((planes * (shape[1] + 1) * (shape[2] + 1) * size_of::<f32>()) as u64);
         });
-        Self { shape, g, dual: std::array::from_fn(|_| space.array(shape)), edges: None }
+        let dual = || space.array(shape);
+        Ok(Self { shape, g, dual: [dual()?, dual()?, dual()?], edges: None })
     }
 
     /// Reduces the cost of slopes across `edges`, which are initially 0.
@@ -131,21 +134,21 @@ impl TvProx {
         total_variation(x, self.g, self.edges.as_ref())
     }
 
-    /// The proximal map for a GPU.
-    pub fn on_device(&mut self, steps: usize) -> Dual<'_> {
-        let ascend = if self.edges.is_some() { ASCEND_ALONG_EDGES } else { ASCEND };
-        Dual {
-            fragment: Fragment::new(&[ascend]),
-            weights: self.g,
-            steps,
-            p: self.dual.each_mut().map(flat_mut),
-            guide: self.edges.as_ref().map(Edges::vectors),
-        }
+    /// Whether there are edges to update.
+    pub fn adapts(&self) -> bool {
+        self.edges.is_some()
+    }
+
+    /// The penalty and its proximal map for a place with kernels.
+    pub fn kernels(&mut self, steps: usize) -> Dual<'_> {
+        let fragment = Fragment::new(&[if self.edges.is_some() { ALONG_EDGES } else { PLAIN }]);
+        let guide = self.edges.as_mut().map(Edges::guide);
+        Dual { fragment, weights: self.g, steps, p: self.dual.each_mut(), guide }
     }
 
     /// The dual along x, y and z, for a checkpoint.
-    pub fn state(&mut self) -> [&mut [f32]; 3] {
-        self.dual.each_mut().map(flat_mut)
+    pub fn state(&mut self) -> [&mut Array; 3] {
+        self.dual.each_mut()
     }
 
     /// Overwrites `u` with the proximal map of `v` after `steps` dual steps. With a weight of 0, only clips negative
@@ -183,7 +186,7 @@ impl TvProx {
         let plane = ny * nz;
         let bounds = split.bounds(nx);
         let edges = self.edges.as_ref().map(Edges::vectors);
-        let dual = self.dual.each_mut().map(flat_mut);
+        let dual = self.dual.each_mut().map(on_host_mut);
         // Copies of the neighbour's planes on both sides of every inner bound.
         let mut halos: Vec<([Vec<f32>; 3], Vec<f32>)> = bounds[1..bounds.len() - 1]
             .iter()
@@ -547,17 +550,9 @@ fn ascent<S: Simd>(
     std::array::from_fn(|k| (p[k] - n[k] * inner) * shrink)
 }
 
-/// [`ascent`] in WGSL, without edges and with them.
-const ASCEND: &str = "fn stage_ascend(p: vec3<f32>, d: vec3<f32>, n: vec3<f32>) -> vec3<f32> {
-    let q = p + d;
-    return q / max(1.0, length(q));
-}
-";
-const ASCEND_ALONG_EDGES: &str = "fn stage_ascend(p: vec3<f32>, d: vec3<f32>, n: vec3<f32>) -> vec3<f32> {
-    let q = p + d + n * (dot(n, p) / (1.0 - dot(n, n)) - dot(n, d));
-    return (q - n * dot(n, q)) / max(1.0, length(q));
-}
-";
+/// [`ascent`] and [`Variation`] in WGSL, without edges and with them.
+const PLAIN: &str = include_str!("tv.wgsl");
+const ALONG_EDGES: &str = include_str!("tv_edges.wgsl");
 
 #[inline(always)]
 fn dot<T: Copy + std::ops::Add<Output = T> + std::ops::Mul<Output = T>>(a: [T; 3], b: [T; 3]) -> T {
@@ -565,16 +560,32 @@ fn dot<T: Copy + std::ops::Add<Output = T> + std::ops::Mul<Output = T>>(a: [T; 3
 }
 
 /// Adds `−step·∇TV/‖∇TV‖` of the smoothed total variation to `x`: a step of ASD-POCS. `work` is scratch of `x`'s
-/// length. Differences are divided by `smoothing`, so that their squares are of order one whatever the unit of `x`.
-pub fn descend(x: &mut [f32], shape: [usize; 3], g: [f32; 3], step: f64, smoothing: f32, work: &mut [f32]) {
-    let [nx, ny, nz] = shape;
+/// shape. Differences are divided by `smoothing`, so that their squares are of order one whatever the unit of `x`.
+pub fn descend(
+    place: &dyn Place,
+    x: &mut Array,
+    g: [f32; 3],
+    step: f64,
+    smoothing: f32,
+    work: &mut Array,
+) -> Result<()> {
     if !smoothing.is_normal() {
-        return;
+        return Ok(());
     }
-    let unit = 1.0 / smoothing;
-    let plane = ny * nz;
-    let squares: Vec<f64> = work
-        .par_chunks_mut(plane)
+    let (unit, shape) = (1.0 / smoothing, x.shape());
+    let host = |x: &[f32], out: &mut [f32]| slopes(x, shape, g, unit, out);
+    let norm = place.slope(&Slope { weights: g, unit, host: &host }, x, work)?.sqrt();
+    if norm > 0.0 {
+        place.map(&ADD, [-f64::from((step / norm) as f32), 1.0], x, &[work])?;
+    }
+    Ok(())
+}
+
+/// Overwrites `out` with the slope at every voxel; returns the sum of squares.
+fn slopes(x: &[f32], shape: [usize; 3], g: [f32; 3], unit: f32, out: &mut [f32]) -> f64 {
+    let [_, ny, nz] = shape;
+    let squares: Vec<f64> = out
+        .par_chunks_mut(ny * nz)
         .enumerate()
         .map(|(i, out)| {
             let mut sum = 0.0;
@@ -588,14 +599,7 @@ pub fn descend(x: &mut [f32], shape: [usize; 3], g: [f32; 3], step: f64, smoothi
             sum
         })
         .collect();
-    let norm = squares.iter().sum::<f64>().sqrt();
-    if norm > 0.0 {
-        let factor = (step / norm) as f32;
-        x.par_chunks_mut(plane).zip(work.par_chunks(plane)).for_each(|(x, d)| {
-            x.iter_mut().zip(d).for_each(|(x, d)| *x -= factor * d);
-        });
-    }
-    debug_assert_eq!(nx * plane, x.len());
+    squares.iter().sum()
 }
 
 /// Derivative of the smoothed total variation with respect to one voxel; differences times `unit` are compared with 1.

@@ -3,12 +3,14 @@
 use crate::call::{differing, settle};
 use crate::{Outcome, Report};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::place::Host;
 use conefield_core::random::{mix, unit};
 use conefield_core::regularizer::{Penalty, Regularizer};
 use conefield_core::scan::ScanHeader;
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use rayon::ThreadPoolBuilder;
+use std::sync::Arc;
 
 /// Calls after which an iterative proximal map must have converged.
 const CALLS: usize = 400;
@@ -51,7 +53,7 @@ fn header(grid: &VoxelGrid) -> ScanHeader {
 }
 
 fn on(regularizer: &dyn Regularizer, grid: &VoxelGrid) -> Box<dyn Penalty> {
-    regularizer.on(grid, &Space::new(header(grid))).unwrap_or_else(|e| panic!("{e}"))
+    regularizer.on(grid, &Space::new(header(grid), Arc::new(Host))).unwrap_or_else(|e| panic!("{e}"))
 }
 
 fn value_of(penalty: &dyn Penalty, grid: &VoxelGrid, x: &[f32]) -> f64 {
@@ -225,8 +227,9 @@ fn state(regularizer: &dyn Regularizer) -> Outcome {
         if names.len() != from.len() {
             return Some("two of a name".into());
         }
-        for ((_, from), (_, to)) in from.into_iter().zip(to) {
-            to.copy_from_slice(from);
+        for ((_, from), (_, mut to)) in from.into_iter().zip(to) {
+            let moved = from.read(&Host).and_then(|from| to.load(&Host, &from));
+            moved.unwrap_or_else(|e| panic!("{e}"));
         }
         first.prox(&v, 0.1, &mut a);
         second.prox(&v, 0.1, &mut b);
@@ -238,11 +241,11 @@ fn state(regularizer: &dyn Regularizer) -> Outcome {
 /// A tally counts exactly what is allocated.
 fn tally(regularizer: &dyn Regularizer) -> Outcome {
     let complaint = grids().iter().find_map(|grid| {
-        let [real, tally] = [Space::new(header(grid)), Space::tally(header(grid))].map(|space| {
+        let [real, tally] = [Space::new(header(grid), Arc::new(Host)), Space::tally(header(grid))].map(|space| {
             // The penalty's memory counts as long as it exists.
             regularizer.on(grid, &space).map_or(u64::MAX, |_| space.bytes())
         });
-        let state = on(regularizer, grid).state().iter().map(|s| 4 * s.1.len() as u64).sum::<u64>();
+        let state = on(regularizer, grid).state().iter().map(|s| 4 * s.1.count() as u64).sum::<u64>();
         (real != tally || tally < state).then(|| format!("{tally} bytes, {real} allocated, {state} of state"))
     });
     settle(complaint, "counts what is allocated")

@@ -18,5 +18,5 @@ mod live;
 mod masks;
 mod patience;
 mod pipeline;
+mod places;
 mod wgpu;
-mod wgpu_voxels;

@@ -6,6 +6,14 @@ struct SeenView {
     scale: f32,
 }
 
+// Geometry of a view's pixels, mm.
+struct RowWeights {
+    corner: vec3<f32>,
+    u: vec3<f32>,
+    v: vec3<f32>,
+    normal: vec3<f32>,
+}
+
 struct Back {
     shape: vec3<u32>,
     views: u32,
@@ -15,4 +23,6 @@ struct Back {
     end: u32,
     rows: u32,
     columns: u32,
+    // First view among the images.
+    first: u32,
 }

@@ -2,9 +2,9 @@
 // lanes have neighbouring z and so neighbouring rows of a view, which `padded` holds one after the other.
 
 fn share(v: u32, at: vec4<f32>) -> f32 {
-    let depth = dot(views[v].depth, at);
+    let depth = dot(seen_views[v].depth, at);
     let near = 1.0 / depth;
-    let seen = vec2<f32>(dot(views[v].row, at), dot(views[v].column, at)) * near;
+    let seen = vec2<f32>(dot(seen_views[v].row, at), dot(seen_views[v].column, at)) * near;
     let size = vec2<f32>(f32(back.rows), f32(back.columns));
     let inside = depth > 0.0 && all(seen > vec2<f32>(-1.0)) && all(seen < size);
     // The rim of zeros is row and column -1.
@@ -16,7 +16,7 @@ fn share(v: u32, at: vec4<f32>) -> f32 {
     let i = (v * (back.columns + 2u) + corner.y) * column + corner.x;
     let left = mix(padded[i], padded[i + 1u], f.x);
     let right = mix(padded[i + column], padded[i + column + 1u], f.x);
-    return select(0.0, views[v].scale * near * near * mix(left, right, f.y), inside);
+    return select(0.0, seen_views[v].scale * near * near * mix(left, right, f.y), inside);
 }
 
 fn voxel(i: u32) -> vec4<f32> {

@@ -5,7 +5,9 @@ use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::{Limits, Wgpu};
 use conefield_benches::{rays, spread};
 use conefield_core::backend::{Adam, Backend, Executable, TrainRay, Work};
+use conefield_core::method::{Context, Job, Method, Silent};
 use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::place::Array;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
@@ -13,7 +15,7 @@ use conefield_fields::normalizers::layer_norm::LayerNorm;
 use conefield_projectors::ray_march::{RayMarch, Sampling};
 use conefield_projectors::simulate::{Protocol, phantom, simulate};
 use conefield_projectors::voxel::Joseph;
-use conefield_projectors::voxel::layout::Pinhole;
+use conefield_solvers::fdk::Fdk;
 use conefield_solvers::losses::L1;
 use ndarray::Array3;
 use serde_json::{Value, json};
@@ -189,8 +191,8 @@ fn repeated(mut run: impl FnMut() -> Result<()>) -> Result<[f64; 3]> {
     Ok(spread(&mut times))
 }
 
-/// FDK's back-projection, forward projection and its adjoint, in voxel updates a second (a voxel and a view each). Transfers of
-/// volume and views count.
+/// Forward projection and its adjoint on arrays that stay on the device, and FDK from host to host, in voxel updates a second (a
+/// voxel and a view each).
 pub fn voxels(asked: &Asked) -> Result<()> {
     let backend = open(asked, Limits::default())?;
     let (side, views) = if asked.software { (48, 12) } else { (256, 50) };
@@ -198,27 +200,28 @@ pub fn voxels(asked: &Asked) -> Result<()> {
     let protocol = Protocol::r2(&truth.grid).with_views(views);
     let scan = simulate(&truth, &protocol.with_detector([side, side]))?;
     let g = &scan.geometry;
-    let seen: Vec<_> = (0..views).map(|v| Pinhole::of(g, v).voxels(&g.volume, 1.0)).collect();
     let all: Vec<usize> = (0..views).collect();
-    let joseph = backend.place(Box::new(Joseph {}))?;
-    let operator = joseph.operator();
+    let place = backend.place();
+    let (x, mut lines) = (place.adopt(truth.data.clone())?, place.zeros(scan.projections.dim().into())?);
+    let mut volume = place.zeros(g.volume.shape)?;
+    // Reading one number waits for all work.
+    let done = |x: &Array| place.store(x, 0, Array3::zeros((1, side, side)).view_mut());
     let updates = (side * side * side * views) as f64;
     let report = |what: &str, time| say(&json!({ "work": what, "voxel_updates_per_s": rates(updates, time) }));
 
-    let mut volume = Array3::<f32>::zeros(g.volume.shape);
-    let time = repeated(|| Ok(backend.backproject(&seen, scan.projections.view(), volume.view_mut()).map(drop)?))?;
-    report("FDK back-projection", time);
-    let mut lines = scan.projections.clone();
     let time = repeated(|| {
-        operator.forward(g, &all, truth.data.view(), lines.view_mut());
-        Ok(operator.fault()?)
+        place.forward(&Joseph {}, g, &all, &x, &mut lines)?;
+        Ok(done(&lines)?)
     })?;
     report("forward projection", time);
     let time = repeated(|| {
-        operator.adjoint(g, &all, scan.projections.view(), volume.view_mut());
-        Ok(operator.fault()?)
+        place.adjoint(&Joseph {}, g, &all, &lines, &mut volume)?;
+        Ok(done(&volume)?)
     })?;
     report("its adjoint", time);
+    let mut fdk = Fdk::default().plan(&Context::without_weights(&backend))?;
+    let time = repeated(|| Ok(fdk.run(&Job::new(&scan, &backend), &mut Silent).map(drop)?))?;
+    report("FDK from host to host", time);
     Ok(())
 }
 

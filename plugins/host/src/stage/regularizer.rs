@@ -7,6 +7,7 @@ use crate::library::{Handle, text};
 use crate::trial;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::place::State;
 use conefield_core::regularizer::{Penalty, Regularizer};
 use conefield_core::space::Space;
 use conefield_plugin_abi::*;
@@ -140,6 +141,10 @@ impl Penalty for PenaltyOn {
         self.own.noted(self.try_value(x.as_slice().unwrap_or_default()), f64::NAN)
     }
 
+    fn adapts(&self) -> bool {
+        self.own.functions.adapt.is_some()
+    }
+
     fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
         let adapt = self.own.functions.adapt?;
         let x = x.as_standard_layout();
@@ -158,13 +163,13 @@ impl Penalty for PenaltyOn {
         }
     }
 
-    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
+    fn state(&mut self) -> Vec<(&str, State<'_>)> {
         let mut all = vec![];
         for (i, (name, length)) in self.state.iter().enumerate() {
             if let Some(found) = self.entry(i).ok().flatten().filter(|e| e.length == *length) {
                 // SAFETY: the plugin guarantees that this many numbers are valid while the penalty lives; entries do
                 // not overlap.
-                all.push((name.as_str(), unsafe { slice::from_raw_parts_mut(found.data, *length) }));
+                all.push((name.as_str(), State::Host(unsafe { slice::from_raw_parts_mut(found.data, *length) })));
             }
         }
         all

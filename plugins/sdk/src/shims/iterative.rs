@@ -5,6 +5,7 @@ use crate::built::Built;
 use conefield_core::basis::{BasisOperator, Expansion};
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::place::{Host, State};
 use conefield_core::regularizer::Penalty;
 use conefield_core::scan::ScanHeader;
 use conefield_core::simd::Real;
@@ -13,6 +14,7 @@ use conefield_plugin_abi::*;
 use ndarray::{ArrayView3, ArrayViewMut3};
 use std::ffi::c_void;
 use std::ptr;
+use std::sync::Arc;
 
 pub static REGULARIZER: ConefieldRegularizer = ConefieldRegularizer {
     size: size_of::<ConefieldRegularizer>(),
@@ -79,7 +81,7 @@ shims! {
 
     fn penalty_on(regularizer: regularizer, on: *const ConefieldGrid, penalty: *mut *mut c_void; error) {
         let grid = grid(on);
-        let space = Space::new(header(grid.shape, [0; 3]));
+        let space = Space::new(header(grid.shape, [0; 3]), Arc::new(Host));
         *penalty = hand_over_on(grid.shape, regularizer.on(&grid, &space)?);
     }
 
@@ -145,6 +147,10 @@ unsafe extern "C" fn state(stage: *mut c_void, index: usize, out: *mut Conefield
         let all = unsafe { penalty(stage)? }.state();
         let entry = all.into_iter().nth(index);
         let (name, values) = entry.ok_or_else(|| Error::unsupported("state", "the index is too large"))?;
+        let values = match values {
+            State::Host(values) => values,
+            State::Placed(array) => array.on_host_mut().and_then(|x| x.as_slice_mut()).unwrap_or_default(),
+        };
         let name = ConefieldStr { data: name.as_ptr(), length: name.len() };
         // SAFETY: see `shims/mod.rs`.
         unsafe { *out = ConefieldState { name, data: values.as_mut_ptr(), length: values.len() } };

@@ -56,8 +56,8 @@ impl RegularizerSpec for DirectionalTotalVariation {
 impl Regularizer for DirectionalTotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         let g = anisotropy(grid);
-        let edges = Edges::new(grid.shape, self.strength as f32, self.edge, space);
-        Ok(Box::new(On { prox: TvProx::new(grid.shape, g, space).with_edges(edges), inner: self.inner }))
+        let edges = Edges::new(grid.shape, self.strength as f32, self.edge, space)?;
+        Ok(Box::new(On { prox: TvProx::new(grid.shape, g, space)?.with_edges(edges), inner: self.inner }))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {

@@ -2,7 +2,7 @@
 
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
+use conefield_core::regularizer::{Kernels, Penalty, Regularizer, RegularizerSpec};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use rayon::prelude::*;
@@ -44,5 +44,9 @@ impl Penalty for Nonnegative {
 
     fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
         u.par_iter_mut().zip(v).for_each(|(u, v)| *u = v.max(0.0));
+    }
+
+    fn kernels(&mut self) -> Option<Kernels<'_>> {
+        Some(Kernels::Clip)
     }
 }

@@ -3,7 +3,8 @@
 use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::{Dual, Penalty, Regularizer, RegularizerSpec, Update, Weight};
+use conefield_core::place::State;
+use conefield_core::regularizer::{Kernels, Penalty, Regularizer, RegularizerSpec, Update, Weight};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use schemars::JsonSchema;
@@ -48,7 +49,7 @@ impl RegularizerSpec for TotalVariation {
 
 impl Regularizer for TotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
-        Ok(Box::new(On { prox: TvProx::new(grid.shape, anisotropy(grid), space), inner: self.inner }))
+        Ok(Box::new(On { prox: TvProx::new(grid.shape, anisotropy(grid), space)?, inner: self.inner }))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
@@ -71,6 +72,10 @@ impl Penalty for On {
         self.prox.value(x)
     }
 
+    fn adapts(&self) -> bool {
+        self.prox.adapts()
+    }
+
     fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
         self.prox.adapt(x)
     }
@@ -85,12 +90,12 @@ impl Penalty for On {
         }
     }
 
-    fn dual(&mut self) -> Option<Dual<'_>> {
-        Some(self.prox.on_device(self.inner))
+    fn kernels(&mut self) -> Option<Kernels<'_>> {
+        Some(Kernels::Dual(self.prox.kernels(self.inner)))
     }
 
-    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
-        let [x, y, z] = self.prox.state();
+    fn state(&mut self) -> Vec<(&str, State<'_>)> {
+        let [x, y, z] = self.prox.state().map(State::Placed);
         vec![("dual.x", x), ("dual.y", y), ("dual.z", z)]
     }
 }

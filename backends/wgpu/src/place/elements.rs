@@ -1,0 +1,132 @@
+//! Elementwise maps, masks and reductions.
+
+use super::launch::{Room, Task, each, summing};
+use super::{Array, Mask, parts, plane};
+use crate::Shared;
+use crate::source::{Access, Source};
+use conefield_core::error::Result;
+use conefield_core::place::{Map, Reduction};
+use ndarray::ArrayView3;
+
+/// `Elements` in `kernels/elements.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, bytemuck::Pod, bytemuck::Zeroable)]
+struct Elements {
+    begin: u32,
+    end: u32,
+    a: f32,
+    b: f32,
+}
+
+/// A source with the uniform buffer `elements`.
+fn begun() -> Source {
+    let mut source = Source::default();
+    source.add("elements", include_str!("../kernels/elements.wgsl"));
+    source.bind("elements", Access::Uniform, "Elements");
+    source
+}
+
+/// Flags as bits.
+pub(super) fn words(flags: &ArrayView3<'_, bool>) -> Vec<u32> {
+    let flags = flags.as_standard_layout();
+    let word = |part: &[bool]| part.iter().rev().fold(0u32, |word, inside| word << 1 | u32::from(*inside));
+    flags.as_slice().unwrap_or_default().chunks(32).map(word).collect()
+}
+
+/// Factors for a kernel: -∞ becomes the lowest number.
+fn uniform([a, b]: [f64; 2]) -> (&'static str, impl Fn(u32, u32) -> Elements) {
+    let [a, b] = [a, b].map(|x| (x as f32).max(f32::MIN));
+    ("elements", move |begin, end| Elements { begin, end, a, b })
+}
+
+pub(super) fn fill(shared: &Shared, room: &mut Room, x: &mut Array, value: f32) -> Result<()> {
+    let plane = plane(x.shape());
+    if value == 0.0 {
+        let mut encoder = shared.gpu.device.create_command_encoder(&Default::default());
+        parts(x).iter().for_each(|part| encoder.clear_buffer(&part.buffer, 0, None));
+        shared.gpu.submit(encoder);
+        return Ok(());
+    }
+    let mut source = begun();
+    source.bind("out", Access::Write, "array<f32>");
+    source.add("fill", &each("elements", "out[i] = elements.a;"));
+    for part in parts(x) {
+        let task = Task { label: "fill", source: &source, bind: &[("out", &part.buffer)] };
+        room.run(shared, task, uniform([f64::from(value), 0.0]), (part.planes.len() * plane) as u32)?;
+    }
+    Ok(())
+}
+
+pub(super) fn scatter(shared: &Shared, from: &Array, out: &mut Array, at: &[usize]) {
+    let plane = 4 * plane(out.shape()) as u64;
+    let mut encoder = shared.gpu.device.create_command_encoder(&Default::default());
+    for (from_plane, &to_plane) in at.iter().enumerate() {
+        let of = |x: &Array, i: usize| {
+            let part = parts(x).iter().find(|part| part.planes.contains(&i))?;
+            Some((part.buffer.clone(), (i - part.planes.start) as u64 * plane))
+        };
+        if let (Some((from, a)), Some((to, b))) = (of(from, from_plane), of(out, to_plane)) {
+            encoder.copy_buffer_to_buffer(&from, a, &to, b, plane);
+        }
+    }
+    shared.gpu.submit(encoder);
+}
+
+pub(super) fn keep(shared: &Shared, room: &mut Room, x: &mut Array, inside: &Mask, value: f32) -> Result<()> {
+    let mut source = begun();
+    source.bind("out", Access::Write, "array<f32>");
+    source.bind("inside", Access::Read, "array<u32>");
+    let body = "if ((inside[i / 32u] >> (i % 32u)) & 1u) == 0u { out[i] = elements.a; }";
+    source.add("mask", &each("elements", body));
+    let plane = plane(x.shape());
+    for (part, inside) in parts(x).iter().zip(parts(inside)) {
+        let bind = [("out", &part.buffer), ("inside", &inside.buffer)];
+        let task = Task { label: "mask", source: &source, bind: &bind };
+        room.run(shared, task, uniform([f64::from(value), 0.0]), (part.planes.len() * plane) as u32)?;
+    }
+    Ok(())
+}
+
+pub(super) fn map(
+    shared: &Shared,
+    room: &mut Room,
+    map: &Map,
+    factors: [f64; 2],
+    out: &mut Array,
+    inputs: &[&Array],
+) -> Result<()> {
+    let mut source = begun();
+    source.bind("out", Access::Write, "array<f32>");
+    let names = &["first", "second"][..map.inputs];
+    names.iter().for_each(|name| source.bind(name, Access::Read, "array<f32>"));
+    let number = |k: usize| names.get(k).map_or("0.0".to_owned(), |name| format!("{name}[i]"));
+    let body = include_str!("../kernels/map.wgsl").replace("FIRST", &number(0)).replace("SECOND", &number(1));
+    source.add(map.name, &each("elements", &body.replace("VALUE", map.wgsl)));
+    let plane = plane(out.shape());
+    for (k, part) in parts(out).iter().enumerate() {
+        let others = names.iter().zip(inputs).filter_map(|(name, x)| Some((*name, &parts(x).get(k)?.buffer)));
+        let bind: Vec<_> = [("out", &part.buffer)].into_iter().chain(others).collect();
+        let task = Task { label: map.name, source: &source, bind: &bind };
+        room.run(shared, task, uniform(factors), (part.planes.len() * plane) as u32)?;
+    }
+    Ok(())
+}
+
+pub(super) fn reduce(shared: &Shared, room: &mut Room, kind: Reduction, x: &Array, y: &Array) -> Result<f64> {
+    let largest = kind == Reduction::Maximum;
+    let mut source = begun();
+    source.bind("first", Access::Read, "array<f32>");
+    source.bind("second", Access::Read, "array<f32>");
+    let body =
+        format!("let x = first[i];\n        let y = second[i];\n        let v = vec2<f32>({}, 0.0);", kind.wgsl());
+    summing(&mut source, "elements", &body, largest);
+    let mut total = 0.0f64;
+    for (x_part, y_part) in parts(x).iter().zip(parts(y)) {
+        let bind = [("first", &x_part.buffer), ("second", &y_part.buffer)];
+        let task = Task { label: "reduction", source: &source, bind: &bind };
+        let count = (x_part.planes.len() * plane(x.shape())) as u32;
+        let [found, _] = room.sum(shared, task, uniform([0.0; 2]), count, largest)?;
+        total = if largest { total.max(found) } else { total + found };
+    }
+    Ok(total)
+}

@@ -1,0 +1,192 @@
+//! Launches of kernels on the arrays of a place.
+
+use crate::Shared;
+use crate::compose::GROUP;
+use crate::device::Gpu;
+use crate::kernel::Buffers;
+use crate::pace::Pace;
+use crate::source::{Access, Source};
+use crate::wave::MOST_GROUPS;
+use conefield_core::error::Result;
+use std::collections::{HashMap, VecDeque};
+use std::time::Instant;
+use wgpu::BufferUsages as U;
+
+/// Usage of arrays by kernels and the host.
+pub(super) const ARRAY: U = U::STORAGE.union(U::COPY_SRC).union(U::COPY_DST);
+/// Elements of a launch at first, on a software device and on others, at least and at most.
+const FIRST: [u32; 2] = [1 << 15, 1 << 20];
+const LEAST: u32 = 1 << 10;
+const MOST: u32 = 1 << 26;
+/// Batches of launches on the device at once: one runs while the next one is prepared.
+const AHEAD: usize = 2;
+/// Elements per partial sum, and most partial sums of a launch.
+const SUMMED: u32 = 4096;
+const SUMS: u32 = 1024;
+
+/// A kernel that runs `body` for each i of a launch, from `begin` to `end` of the uniform buffer `launch`.
+pub(super) fn each(launch: &str, body: &str) -> String {
+    include_str!("../kernels/each.wgsl").replace("LAUNCH", launch).replace("BODY", body)
+}
+
+/// A kernel that adds up the pairs `v` that `body` computes for each i of a launch, or finds the largest, and writes a
+/// pair per group into `sums`.
+pub(super) fn summing(source: &mut Source, launch: &str, body: &str, largest: bool) {
+    source.bind("sums", Access::Write, "array<vec2<f32>>");
+    let [add, merge] = if largest {
+        ["    total = max(total, v);", "partial[lane] = max(partial[lane], partial[lane + half]);"]
+    } else {
+        [include_str!("../kernels/add.wgsl"), "partial[lane] += partial[lane + half];"]
+    };
+    let text = include_str!("../kernels/summing.wgsl").replace("LAUNCH", launch).replace("BODY", body);
+    source.add("sums", &text.replace("ADD", add).replace("MERGE", merge));
+}
+
+/// A kernel with its name for messages.
+pub(super) struct Task<'a> {
+    pub(super) label: &'a str,
+    pub(super) source: &'a Source,
+    /// Its storage buffers by name.
+    pub(super) bind: &'a [(&'a str, &'a wgpu::Buffer)],
+}
+
+/// A batch of launches on the device.
+struct Batch {
+    label: String,
+    index: wgpu::SubmissionIndex,
+    submitted: Instant,
+    launches: usize,
+    largest: u32,
+}
+
+/// Buffers that launches share, and the size of launches.
+pub(super) struct Room {
+    pub(super) buffers: Buffers,
+    paces: HashMap<String, Pace>,
+    batches: VecDeque<Batch>,
+    finished: Option<Instant>,
+}
+
+impl Room {
+    pub(super) fn new() -> Self {
+        Self { buffers: Buffers::default(), paces: HashMap::new(), batches: VecDeque::new(), finished: None }
+    }
+
+    /// Runs `task` over `0..count` in launches; `uniform` returns the buffer that says where a launch begins and ends.
+    /// Does not wait for the device.
+    pub(super) fn run<T: bytemuck::Pod>(
+        &mut self,
+        shared: &Shared,
+        task: Task<'_>,
+        (name, uniform): (&str, impl Fn(u32, u32) -> T),
+        count: u32,
+    ) -> Result<()> {
+        let first = FIRST[usize::from(!shared.gpu.adapter.software)];
+        let size = self.paces.entry(task.label.into()).or_insert_with(|| Pace::new(first, LEAST, MOST)).size();
+        let parts = (0..count).step_by(size as usize).map(|at| (at, count.min(at.saturating_add(size))));
+        let parts: Vec<_> = parts.map(|(at, end)| (uniform(at, end), (end - at).div_ceil(GROUP))).collect();
+        self.launch(shared, task, name, &parts, count.min(size))
+    }
+
+    /// Runs `task`, made by [`summing`], over `0..count`. Returns the two sums, or the largest pair.
+    pub(super) fn sum<T: bytemuck::Pod>(
+        &mut self,
+        shared: &Shared,
+        task: Task<'_>,
+        (name, uniform): (&str, impl Fn(u32, u32) -> T),
+        count: u32,
+        largest: bool,
+    ) -> Result<[f64; 2]> {
+        let groups = count.div_ceil(SUMMED).clamp(1, SUMS);
+        self.buffers.reserve(&shared.gpu, "sums", 8 * u64::from(groups), ARRAY)?;
+        let sums = self.buffers.get("sums").cloned();
+        let bind: Vec<_> = task.bind.iter().copied().chain(sums.as_ref().map(|sums| ("sums", sums))).collect();
+        self.launch(shared, Task { bind: &bind, ..task }, name, &[(uniform(0, count), groups)], 0)?;
+        let Some(sums) = sums else { return Ok([0.0; 2]) };
+        let mut total = [0.0f64; 2];
+        self.read(&shared.gpu, &sums, 0, 2 * groups as usize, |found| {
+            for pair in found.chunks_exact(2) {
+                let merge = |k: usize| {
+                    let (a, b) = (total[k], f64::from(pair[k]));
+                    if largest { a.max(b) } else { a + b }
+                };
+                total = [merge(0), merge(1)];
+            }
+        })?;
+        Ok(total)
+    }
+
+    fn launch<T: bytemuck::Pod>(
+        &mut self,
+        shared: &Shared,
+        Task { label, source, bind }: Task<'_>,
+        uniform: &str,
+        parts: &[(T, u32)],
+        largest: u32,
+    ) -> Result<()> {
+        let gpu = &shared.gpu;
+        while self.batches.len() >= AHEAD {
+            self.finish_one(gpu)?;
+        }
+        self.buffers.reserve(gpu, uniform, size_of::<T>() as u64, U::UNIFORM | U::COPY_DST)?;
+        let kernel = shared.kernels.get(gpu, label, source)?;
+        let find = |name: &str| {
+            let given = bind.iter().find(|(n, _)| *n == name).map(|(_, buffer)| *buffer);
+            given.or_else(|| self.buffers.get(name))
+        };
+        let bound = kernel.bind_as(gpu, find)?;
+        let submitted = Instant::now();
+        let mut last = None;
+        for (value, groups) in parts {
+            self.buffers.get(uniform).inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(value)));
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let groups = (*groups).min(MOST_GROUPS as u32);
+            kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, groups);
+            last = Some(gpu.submit(encoder));
+        }
+        if let Some(index) = last {
+            self.batches.push_back(Batch { label: label.into(), index, submitted, launches: parts.len(), largest });
+        }
+        Ok(())
+    }
+
+    /// Waits for the oldest batch, and adapts the size of such launches.
+    fn finish_one(&mut self, gpu: &Gpu) -> Result<()> {
+        let Some(batch) = self.batches.pop_front() else { return Ok(()) };
+        gpu.wait_for(batch.index)?;
+        let now = Instant::now();
+        let begun = self.finished.map_or(batch.submitted, |finished| finished.max(batch.submitted));
+        self.finished = Some(now);
+        if let (Some(pace), 1..) = (self.paces.get_mut(&batch.label), batch.largest) {
+            pace.heard((now - begun).as_secs_f64(), batch.launches, batch.largest);
+        }
+        Ok(())
+    }
+
+    /// Overwrites the first numbers of the room's buffer `name`.
+    pub(super) fn write<T: bytemuck::Pod>(&mut self, gpu: &Gpu, name: &str, data: &[T]) -> Result<()> {
+        self.buffers.reserve(gpu, name, size_of_val(data) as u64, ARRAY)?;
+        self.buffers.get(name).inspect(|b| gpu.write(b, 0, bytemuck::cast_slice(data)));
+        Ok(())
+    }
+
+    /// Calls `take` with `count` numbers of `from`, from number `first` on.
+    pub(super) fn read(
+        &mut self,
+        gpu: &Gpu,
+        from: &wgpu::Buffer,
+        first: usize,
+        count: usize,
+        take: impl FnOnce(&[f32]),
+    ) -> Result<()> {
+        let bytes = 4 * count as u64;
+        let staging = self.buffers.staging(gpu, bytes)?;
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        encoder.copy_buffer_to_buffer(from, 4 * first as u64, &staging, 0, bytes);
+        gpu.submit(encoder);
+        while !self.batches.is_empty() {
+            self.finish_one(gpu)?;
+        }
+        gpu.read(&staging, bytes, |found| take(bytemuck::cast_slice(found)))
+    }
+}

@@ -1,0 +1,284 @@
+//! The device as a place: arrays in its memory, and kernels that combine them; see [`conefield_core::place`].
+//!
+//! - `launch`: launches of kernels. Up to two batches are on the device, so that it computes while the next views come.
+//! - `elements`: elementwise maps, masks, reductions.
+//! - `rays`: projection and its adjoint. `pixels`: data terms. `filtered`: FDK.
+//! - `stencils`: total variation.
+//!
+//! An array larger than a buffer is split along its first axis. The adjoint adds to voxels atomically, so its sums have
+//! no fixed order.
+
+mod elements;
+mod filtered;
+mod launch;
+mod pixels;
+mod rays;
+mod stencils;
+
+use crate::Shared;
+use crate::compose::fragment_of;
+use conefield_core::error::Result;
+use conefield_core::geometry::Geometry;
+use conefield_core::place::{Array, FilteredViews, Map, Mask, Place, Reduction, Slope, Step, Views, Weighing};
+use conefield_core::regularizer::{Kernels, Penalty};
+use conefield_core::voxel::VoxelProjector;
+use launch::{ARRAY, Room};
+use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, Zip, s};
+use std::ops::Range;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// A part of an array: planes along its first axis, in a buffer.
+pub(crate) struct Part {
+    planes: Range<usize>,
+    buffer: wgpu::Buffer,
+}
+
+/// An array on the device. Arrays of one shape have the same parts.
+pub(crate) struct Parts(Vec<Part>);
+
+/// The arrays of a device.
+pub struct DevicePlace {
+    shared: Arc<Shared>,
+    room: Mutex<Room>,
+}
+
+/// The parts of an array of this place.
+fn parts<T>(x: &conefield_core::place::Held<T>) -> &[Part] {
+    x.get::<Parts>().map_or(&[], |parts| &parts.0)
+}
+
+impl DevicePlace {
+    pub(crate) fn new(shared: Arc<Shared>) -> Self {
+        Self { shared, room: Mutex::new(Room::new()) }
+    }
+
+    fn room(&self) -> MutexGuard<'_, Room> {
+        self.room.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Planes along the first axis that one buffer holds, of elements of `bits`.
+    fn split(&self, shape: [usize; 3]) -> Result<Vec<Range<usize>>> {
+        let plane = 4 * (shape[1] * shape[2]) as u64;
+        let bytes = self.shared.gpu.adapter.bound_bytes();
+        let most = bytes.checked_div(plane).unwrap_or(bytes) as usize;
+        if most == 0 {
+            let what = format!("a plane or view of {plane} bytes is larger than a buffer of {bytes} bytes");
+            return Err(self.shared.gpu.error(what));
+        }
+        // Parts of nearly the same size.
+        let parts = shape[0].div_ceil(most).max(1);
+        let each = shape[0].div_ceil(parts).max(1);
+        Ok((0..shape[0]).step_by(each).map(|at| at..(at + each).min(shape[0])).collect())
+    }
+}
+
+/// Numbers per plane.
+fn plane(shape: [usize; 3]) -> usize {
+    shape[1] * shape[2]
+}
+
+impl Place for DevicePlace {
+    fn device(&self) -> Option<String> {
+        Some(self.shared.gpu.adapter.to_string())
+    }
+
+    fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
+        rays::Walks::new(&self.shared, projector)?.validate()
+    }
+
+    fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
+        let parts = self.split(shape)?.into_iter().map(|planes| {
+            let bytes = 4 * (planes.len() * plane(shape)) as u64;
+            Ok(Part { planes, buffer: self.shared.gpu.buffer("an array", bytes, ARRAY)? })
+        });
+        Ok(Array::there(shape, Parts(parts.collect::<Result<_>>()?)))
+    }
+
+    fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()> {
+        let (n, plane) = (from.len_of(Axis(0)), plane(to.shape()));
+        for part in parts(to) {
+            let planes = part.planes.start.max(first)..part.planes.end.min(first + n);
+            if planes.is_empty() {
+                continue;
+            }
+            let data = from.slice(s![planes.start - first..planes.end - first, .., ..]);
+            let data = data.as_standard_layout();
+            let at = 4 * ((planes.start - part.planes.start) * plane) as u64;
+            self.shared.gpu.write(&part.buffer, at, bytemuck::cast_slice(data.as_slice().unwrap_or_default()));
+        }
+        Ok(())
+    }
+
+    fn store(&self, from: &Array, first: usize, mut to: ArrayViewMut3<'_, f32>) -> Result<()> {
+        let (n, plane) = (to.len_of(Axis(0)), plane(from.shape()));
+        let mut room = self.room();
+        for part in parts(from) {
+            let planes = part.planes.start.max(first)..part.planes.end.min(first + n);
+            if planes.is_empty() {
+                continue;
+            }
+            let mut to = to.slice_mut(s![planes.start - first..planes.end - first, .., ..]);
+            let at = (planes.start - part.planes.start) * plane;
+            let shape = to.raw_dim();
+            room.read(&self.shared.gpu, &part.buffer, at, planes.len() * plane, |found| {
+                let found = ArrayView3::from_shape(shape, found);
+                let found = found.unwrap_or_else(|e| unreachable!("as many numbers as asked for: {e}"));
+                Zip::from(&mut to).and(found).par_for_each(|to, found| *to = *found);
+            })?;
+        }
+        Ok(())
+    }
+
+    fn mask(&self, flags: Array3<bool>) -> Result<Mask> {
+        let shape: [usize; 3] = flags.dim().into();
+        let parts = self.split(shape)?.into_iter().map(|planes| {
+            let flags = flags.slice(s![planes.clone(), .., ..]);
+            let words = elements::words(&flags);
+            let buffer = self.shared.gpu.buffer("a mask", 4 * words.len() as u64, ARRAY)?;
+            self.shared.gpu.write(&buffer, 0, bytemuck::cast_slice(&words));
+            Ok(Part { planes, buffer })
+        });
+        Ok(Mask::there(shape, Parts(parts.collect::<Result<_>>()?)))
+    }
+
+    fn views<'a>(&self, measured: &'a Array3<f32>) -> Result<Views<'a>> {
+        // Views that do not fit are loaded in every pass.
+        let here = match self.zeros(measured.dim().into()) {
+            Ok(mut here) => {
+                self.load(measured.view(), &mut here, 0)?;
+                Some(here)
+            }
+            Err(e) => {
+                tracing::info!(
+                    "the views do not fit on the device beside the arrays and are loaded in every pass: {e}"
+                );
+                None
+            }
+        };
+        Ok(Views { measured, here })
+    }
+
+    fn fill(&self, x: &mut Array, value: f32) -> Result<()> {
+        elements::fill(&self.shared, &mut self.room(), x, value)
+    }
+
+    fn scatter(&self, from: &Array, out: &mut Array, at: &[usize]) -> Result<()> {
+        elements::scatter(&self.shared, from, out, at);
+        Ok(())
+    }
+
+    fn keep(&self, x: &mut Array, inside: &Mask, value: f32) -> Result<()> {
+        elements::keep(&self.shared, &mut self.room(), x, inside, value)
+    }
+
+    fn map(&self, map: &Map, factors: [f64; 2], out: &mut Array, inputs: &[&Array]) -> Result<()> {
+        elements::map(&self.shared, &mut self.room(), map, factors, out, inputs)
+    }
+
+    fn reduce(&self, kind: Reduction, x: &Array, y: &Array) -> Result<f64> {
+        elements::reduce(&self.shared, &mut self.room(), kind, x, y)
+    }
+
+    fn forward(
+        &self,
+        projector: &dyn VoxelProjector,
+        geometry: &Geometry,
+        views: &[usize],
+        volume: &Array,
+        images: &mut Array,
+    ) -> Result<()> {
+        let walks = rays::Walks::new(&self.shared, projector)?;
+        walks.forward(&mut self.room(), geometry, views, volume, images)
+    }
+
+    fn adjoint(
+        &self,
+        projector: &dyn VoxelProjector,
+        geometry: &Geometry,
+        views: &[usize],
+        images: &Array,
+        volume: &mut Array,
+    ) -> Result<()> {
+        let walks = rays::Walks::new(&self.shared, projector)?;
+        walks.adjoint(&mut self.room(), geometry, views, images, volume)
+    }
+
+    fn compare(&self, by: &Weighing<'_>, views: &[usize], images: &mut Array) -> Result<[f64; 2]> {
+        match by.term.map(|term| term.wgsl()) {
+            Some(None) => {
+                // The data term runs on the host, on residuals.
+                let residual = Weighing { term: None, ..*by };
+                let sums = pixels::compare(self, &residual, None, views, images)?;
+                let mut misfit = 0.0;
+                self.change(images, &mut |images| misfit = by.differentiate(views, images))?;
+                by.fault()?;
+                Ok([sums[0], misfit])
+            }
+            term => pixels::compare(self, by, term.flatten().as_ref(), views, images),
+        }
+    }
+
+    fn weigh(&self, by: &Weighing<'_>, spread: bool, views: &[usize], images: &mut Array) -> Result<()> {
+        match by.term.and_then(|term| term.wgsl()) {
+            Some(term) => pixels::weigh(self, by, &term, spread, views, images),
+            None => {
+                self.change(images, &mut |images| by.weigh(spread, views, images))?;
+                by.fault()
+            }
+        }
+    }
+
+    fn filtered(
+        &self,
+        work: &dyn FilteredViews,
+        views: &[usize],
+        images: &mut Array,
+        volume: &mut Array,
+    ) -> Result<()> {
+        filtered::backproject(&self.shared, &mut self.room(), work, views, images, volume)
+    }
+
+    fn update(&self, step: Step<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+        if penalty.kernels().is_some() {
+            return stencils::update(&self.shared, &mut self.room(), step, penalty);
+        }
+        // The proximal map runs on the host.
+        stencils::argument(&self.shared, &mut self.room(), &step)?;
+        self.change(step.gradient, &mut |v| {
+            let mut u = Array3::zeros(v.raw_dim());
+            penalty.prox(v.as_slice().unwrap_or_default(), step.tau, u.as_slice_mut().unwrap_or_default());
+            *v = u;
+        })?;
+        penalty.fault()?;
+        stencils::finish(&self.shared, &mut self.room(), step)
+    }
+
+    fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {
+        match penalty.kernels() {
+            Some(Kernels::Clip) => Ok(0.0),
+            Some(Kernels::Dual(dual)) => stencils::value(&self.shared, &mut self.room(), &dual, x),
+            None => Ok(penalty.value(self.read(x)?.view())),
+        }
+    }
+
+    fn adapt(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<Option<f64>> {
+        if !penalty.adapts() {
+            return Ok(None);
+        }
+        match penalty.kernels() {
+            Some(Kernels::Dual(dual)) => stencils::adapt(&self.shared, &mut self.room(), dual, x).map(Some),
+            _ => Ok(penalty.adapt(self.read(x)?.view())),
+        }
+    }
+
+    fn slope(&self, slope: &Slope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
+        stencils::slope(&self.shared, &mut self.room(), slope, x, out)
+    }
+}
+
+/// The fragment of a projector.
+fn projector_fragment(projector: &dyn VoxelProjector) -> Result<(String, conefield_core::wgsl::Fragment)> {
+    let name = format!("projector ({})", projector.describe());
+    let fragment = fragment_of(&name, projector.wgsl())?;
+    Ok((name, fragment))
+}

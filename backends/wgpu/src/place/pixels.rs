@@ -1,0 +1,160 @@
+//! Data terms: computed line integrals against measured ones.
+
+use super::launch::{Room, Task, each, summing};
+use super::{Array, DevicePlace, Part, parts, plane};
+use crate::compose::fragment_of;
+use crate::source::{Access, Source};
+use conefield_core::error::Result;
+use conefield_core::place::{Place, Weighing};
+use conefield_core::wgsl::Fragment;
+use ndarray::s;
+
+/// `Pixels` in `kernels/pixels.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, bytemuck::Pod, bytemuck::Zeroable)]
+struct Pixels {
+    begin: u32,
+    end: u32,
+    /// Pixels of a view.
+    pixels: u32,
+    pad: u32,
+}
+
+/// In place of the index of an image that a part does not hold.
+const NONE: u32 = u32::MAX;
+
+/// The index in `part` of each of `wanted`; `None` if it holds none of them.
+fn indices(part: &Part, wanted: &[usize]) -> Option<Vec<u32>> {
+    let at = |i: &usize| if part.planes.contains(i) { (i - part.planes.start) as u32 } else { NONE };
+    let all: Vec<u32> = wanted.iter().map(at).collect();
+    all.iter().any(|i| *i != NONE).then_some(all)
+}
+
+/// Images with the measured ones, and what has a value for every pixel of the scan: shadow and weights.
+struct Sources<'a> {
+    place: &'a DevicePlace,
+    by: &'a Weighing<'a>,
+    source: Source,
+    label: &'a str,
+}
+
+impl Sources<'_> {
+    /// Calls `launch` for each part of the images with its task and number of pixels.
+    fn run(
+        &self,
+        views: &[usize],
+        images: &Array,
+        launch: &mut dyn FnMut(&mut Room, Task<'_>, u32) -> Result<()>,
+    ) -> Result<()> {
+        let (place, by) = (self.place, self.by);
+        let pixels = plane(images.shape());
+        for part in parts(images) {
+            let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
+            // Measured views that are not on the device come for each use.
+            let loaded = match &by.views.here {
+                Some(_) => None,
+                None => {
+                    let mut loaded = place.zeros([some.len(), images.shape()[1], images.shape()[2]])?;
+                    for (i, &view) in some.iter().enumerate() {
+                        let view = by.views.measured.slice(s![view..view + 1, .., ..]);
+                        place.load(view, &mut loaded, i)?;
+                    }
+                    Some(loaded)
+                }
+            };
+            let (measured, wanted): (_, Vec<usize>) = match (&by.views.here, &loaded) {
+                (Some(here), _) => (parts(here), some.to_vec()),
+                (None, Some(loaded)) => (parts(loaded), (0..some.len()).collect()),
+                (None, None) => (&[][..], vec![]),
+            };
+            let of_all = by.shadow.map(parts).or_else(|| by.weights.map(parts));
+            for held in measured {
+                let Some(at) = indices(held, &wanted) else { continue };
+                for k in 0..of_all.map_or(1, <[Part]>::len) {
+                    let at_all = match of_all {
+                        Some(all) => indices(&all[k], some),
+                        None => Some(at.clone()),
+                    };
+                    let Some(at_all) = at_all else { continue };
+                    let index: Vec<[u32; 2]> = at.iter().zip(at_all).map(|(&a, b)| [a, b]).collect();
+                    let mut bind = vec![("images", &part.buffer), ("measured", &held.buffer)];
+                    bind.extend(by.shadow.map(|shadow| ("shadow", &parts(shadow)[k].buffer)));
+                    bind.extend(by.weights.map(|weights| ("weights", &parts(weights)[k].buffer)));
+                    let mut room = place.room();
+                    room.write(&place.shared.gpu, "index", &index)?;
+                    let task = Task { label: self.label, source: &self.source, bind: &bind };
+                    launch(&mut room, task, (some.len() * pixels) as u32)?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A source with the bindings of pixels.
+fn begun(by: &Weighing<'_>, term: Option<&Fragment>) -> Result<Source> {
+    let mut source = Source::default();
+    source.add("pixels", include_str!("../kernels/pixels.wgsl"));
+    source.bind("pixels", Access::Uniform, "Pixels");
+    source.bind("index", Access::Read, "array<vec2<u32>>");
+    source.bind("images", Access::Write, "array<f32>");
+    source.bind("measured", Access::Read, "array<f32>");
+    if by.shadow.is_some() {
+        source.bind("shadow", Access::Read, "array<u32>");
+    }
+    if by.weights.is_some() {
+        source.bind("weights", Access::Read, "array<f32>");
+    }
+    if let Some(term) = term {
+        source.add("data term", &fragment_of("the data term", Some(term.clone()))?.named("term_"));
+    }
+    Ok(source)
+}
+
+fn uniform(pixels: usize) -> (&'static str, impl Fn(u32, u32) -> Pixels) {
+    ("pixels", move |begin, end| Pixels { begin, end, pixels: pixels as u32, pad: 0 })
+}
+
+/// [`Place::compare`] with the data term `term`, or least squares.
+pub(super) fn compare(
+    place: &DevicePlace,
+    by: &Weighing<'_>,
+    term: Option<&Fragment>,
+    views: &[usize],
+    images: &mut Array,
+) -> Result<[f64; 2]> {
+    let mut source = begun(by, term)?;
+    let inside = if by.shadow.is_some() { "((shadow[all / 32u] >> (all % 32u)) & 1u) == 1u" } else { "true" };
+    let weight = if by.weights.is_some() { "weights[all]" } else { "1.0" };
+    let derivative = if term.is_some() { "term_differentiate(p, r)" } else { "vec2<f32>(0.5 * r * r, r)" };
+    let body = include_str!("../kernels/compare.wgsl").replace("INSIDE", inside).replace("WEIGHT", weight);
+    summing(&mut source, "pixels", &body.replace("DERIVATIVE", derivative), false);
+    let pixels = plane(images.shape());
+    let mut sums = [0.0; 2];
+    let sources = Sources { place, by, source, label: "data term" };
+    sources.run(views, images, &mut |room, task, count| {
+        let found = room.sum(&place.shared, task, uniform(pixels), count, false)?;
+        sums = std::array::from_fn(|k| sums[k] + found[k]);
+        Ok(())
+    })?;
+    Ok(sums)
+}
+
+/// [`Place::weigh`].
+pub(super) fn weigh(
+    place: &DevicePlace,
+    by: &Weighing<'_>,
+    term: &Fragment,
+    spread: bool,
+    views: &[usize],
+    images: &mut Array,
+) -> Result<()> {
+    let by = &Weighing { shadow: None, weights: None, ..*by };
+    let mut source = begun(by, Some(term))?;
+    let value = if spread { "term_spread" } else { "term_curve" };
+    source.add("weights", &each("pixels", &include_str!("../kernels/weigh.wgsl").replace("VALUE", value)));
+    let pixels = plane(images.shape());
+    let label = if spread { "noise" } else { "curvature" };
+    let sources = Sources { place, by, source, label };
+    sources.run(views, images, &mut |room, task, count| room.run(&place.shared, task, uniform(pixels), count))
+}

@@ -1,0 +1,143 @@
+//! Line integrals of voxel volumes and their adjoint.
+
+use super::launch::{Room, Task, each};
+use super::{Array, parts, plane};
+use crate::Shared;
+use crate::device::Atomics;
+use crate::source::{Access, Source};
+use conefield_core::error::Result;
+use conefield_core::geometry::{Geometry, sub};
+use conefield_core::voxel::VoxelProjector;
+use conefield_core::wgsl::Fragment;
+
+/// `Projection` in `kernels/project.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, bytemuck::Pod, bytemuck::Zeroable)]
+struct Projection {
+    shape: [u32; 3],
+    count: u32,
+    spacing: [f32; 3],
+    columns: u32,
+    held: u32,
+    held_end: u32,
+    pixels: u32,
+    begin: u32,
+    end: u32,
+    pad: [u32; 3],
+}
+
+/// `ProjectedView` in `kernels/project.wgsl`.
+fn projected(geometry: &Geometry, view: usize) -> [[f32; 4]; 4] {
+    let (w, grid) = (&geometry.views[view], &geometry.volume);
+    let lower = grid.voxel([0; 3]);
+    let voxels = |d: [f64; 3]| {
+        let v: [f32; 3] = std::array::from_fn(|k| (d[k] / grid.spacing[k]) as f32);
+        [v[0], v[1], v[2], 0.0]
+    };
+    let corner = sub(w.pixel(geometry.detector, 0.0, 0.0), w.source);
+    [voxels(sub(w.source, lower)), voxels(corner), voxels(w.u), voxels(w.v)]
+}
+
+fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> Source {
+    let mut source = Source::default();
+    source.add("projection", include_str!("../kernels/project.wgsl"));
+    source.bind("projection", Access::Uniform, "Projection");
+    source.bind("views", Access::Read, "array<ProjectedView>");
+    let (what, begin, end) = if forward {
+        source.bind("volume", Access::Read, "array<f32>");
+        source.bind("lines", Access::Write, "array<f32>");
+        ("value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[line] += value;")
+    } else {
+        source.bind("volume", Access::Write, &format!("array<atomic<{}>>", atomics.number()));
+        source.bind("lines", Access::Read, "array<f32>");
+        let begin = "value = lines[line];\n        if value == 0.0 { continue; }";
+        (format!("let v = weight * value;\n{}", atomics.sum("volume[i]")), begin, "")
+    };
+    source.add("visit", &include_str!("../kernels/visit.wgsl").replace("WHAT", &what));
+    source.add(name, &fragment.named("walk_"));
+    let body = format!("let line = line_of(i);\n        {begin}\n        walk_walk(projected(line));\n        {end}");
+    source.add("rays", &each("projection", &body));
+    source
+}
+
+/// A projector's kernels: they take line integrals of the buffer `volume` and add up `lines`, or the reverse.
+pub(super) struct Walks<'a> {
+    shared: &'a Shared,
+    kernels: [Source; 2],
+}
+
+impl<'a> Walks<'a> {
+    /// Refuses a projector without WGSL.
+    pub(super) fn new(shared: &'a Shared, projector: &dyn VoxelProjector) -> Result<Self> {
+        let (name, fragment) = super::projector_fragment(projector)?;
+        let atomics = shared.gpu.adapter.atomics;
+        Ok(Self { shared, kernels: [true, false].map(|forward| kernel(&fragment, &name, atomics, forward)) })
+    }
+
+    /// Refuses invalid WGSL.
+    pub(super) fn validate(&self) -> Result<()> {
+        self.kernels.iter().try_for_each(Source::validate)
+    }
+
+    pub(super) fn forward(
+        &self,
+        room: &mut Room,
+        geometry: &Geometry,
+        views: &[usize],
+        volume: &Array,
+        images: &mut Array,
+    ) -> Result<()> {
+        // Line integrals are added up part by part of the volume.
+        let mut encoder = self.shared.gpu.device.create_command_encoder(&Default::default());
+        parts(images).iter().for_each(|part| encoder.clear_buffer(&part.buffer, 0, None));
+        self.shared.gpu.submit(encoder);
+        self.walk(room, true, geometry, views, volume, images)
+    }
+
+    pub(super) fn adjoint(
+        &self,
+        room: &mut Room,
+        geometry: &Geometry,
+        views: &[usize],
+        images: &Array,
+        volume: &mut Array,
+    ) -> Result<()> {
+        self.walk(room, false, geometry, views, volume, images)
+    }
+
+    fn walk(
+        &self,
+        room: &mut Room,
+        forward: bool,
+        geometry: &Geometry,
+        views: &[usize],
+        volume: &Array,
+        images: &Array,
+    ) -> Result<()> {
+        let pixels = plane(images.shape());
+        let label = if forward { "forward projection" } else { "adjoint of projection" };
+        let source = &self.kernels[usize::from(!forward)];
+        for part in parts(images) {
+            let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
+            let data: Vec<f32> = some.iter().flat_map(|&v| projected(geometry, v)).flatten().collect();
+            room.write(&self.shared.gpu, "views", &data)?;
+            let count = (some.len() * pixels) as u32;
+            for held in parts(volume) {
+                let whole = Projection {
+                    shape: geometry.volume.shape.map(|n| n as u32),
+                    count,
+                    spacing: geometry.volume.spacing.map(|h| h as f32),
+                    columns: geometry.detector[1] as u32,
+                    pixels: pixels as u32,
+                    held: held.planes.start as u32,
+                    held_end: held.planes.end as u32,
+                    ..Projection::default()
+                };
+                let bind = [("volume", &held.buffer), ("lines", &part.buffer)];
+                let uniform = ("projection", |begin, end| Projection { begin, end, ..whole });
+                room.run(self.shared, Task { label, source, bind: &bind }, uniform, count)?;
+            }
+        }
+        Ok(())
+    }
+}

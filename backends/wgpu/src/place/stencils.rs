@@ -1,0 +1,277 @@
+//! Total variation: proximal gradient updates, the penalty's value, edges, and slopes.
+//!
+//! A proximal gradient update overwrites the gradient with the argument `v` of the proximal map, makes the dual steps,
+//! each with a kernel for the primal and one for the dual, and extrapolates. Where a volume has several parts, a kernel
+//! also reads the planes beside a part, which are copied on the device.
+
+use super::launch::{ARRAY, Room, Task, each, summing};
+use super::{Array, Part, parts, plane};
+use crate::Shared;
+use crate::compose::fragment_of;
+use crate::source::{Access, Source};
+use Access::{Read, Write};
+use conefield_core::error::Result;
+use conefield_core::place::{Slope, Step};
+use conefield_core::regularizer::{Dual, Guide, Kernels, Penalty};
+
+/// `Stencil` in `kernels/stencil.wgsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, bytemuck::Pod, bytemuck::Zeroable)]
+struct Stencil {
+    shape: [u32; 3],
+    begin: u32,
+    down: [f32; 3],
+    end: u32,
+    up: [f32; 3],
+    held: u32,
+    planes: u32,
+    step: f32,
+    momentum: f32,
+    pull: f32,
+}
+
+/// Names of the dual variables and of the vectors that guide the penalty, along x, y and z.
+const DUAL: [&str; 3] = ["dual_x", "dual_y", "dual_z"];
+const GUIDE: [&str; 3] = ["guide_x", "guide_y", "guide_z"];
+/// [`GUIDE`] at voxel i in WGSL.
+const GUIDED: &str = "vec3<f32>(guide_x[i], guide_y[i], guide_z[i])";
+const PRIMAL: (&str, &str) = ("primal", include_str!("../kernels/primal.wgsl"));
+const VALUES: (&str, &str) = ("values", include_str!("../kernels/values.wgsl"));
+/// Bindings of [`VALUES`].
+const BESIDE: [(&str, Access); 3] = [("values", Read), ("before", Read), ("after", Read)];
+
+/// A source with bindings and functions.
+fn begun(bindings: &[(&str, Access)], functions: &[(&str, &str)]) -> Source {
+    let mut source = Source::default();
+    source.add("stencil", include_str!("../kernels/stencil.wgsl"));
+    source.bind("stencil", Access::Uniform, "Stencil");
+    for (name, access) in bindings {
+        source.bind(name, *access, if *name == "inside" { "array<u32>" } else { "array<f32>" });
+    }
+    for (name, text) in functions {
+        source.add(name, text);
+    }
+    source
+}
+
+/// A kernel that runs `body` for every voxel i.
+fn kernel(bindings: &[(&str, Access)], functions: &[(&str, &str)], body: &str) -> Source {
+    let mut source = begun(bindings, functions);
+    source.add("voxels", &each("stencil", body));
+    source
+}
+
+/// Work on the parts of a volume.
+struct Volume<'a> {
+    shared: &'a Shared,
+    shape: [usize; 3],
+    whole: Stencil,
+}
+
+impl<'a> Volume<'a> {
+    fn new(shared: &'a Shared, x: &Array) -> Self {
+        let shape = x.shape();
+        Self { shared, shape, whole: Stencil { shape: shape.map(|n| n as u32), ..Stencil::default() } }
+    }
+
+    fn uniform(&self, part: &Part) -> (&'static str, impl Fn(u32, u32) -> Stencil) {
+        let (held, planes) = (part.planes.start as u32, part.planes.len() as u32);
+        let whole = self.whole;
+        ("stencil", move |begin, end| Stencil { held, planes, begin, end, ..whole })
+    }
+
+    fn count(&self, part: &Part) -> u32 {
+        (part.planes.len() * plane(self.shape)) as u32
+    }
+
+    /// The buffers of the arrays' k-th parts.
+    fn bind<'b>(k: usize, arrays: &[(&'b str, &'b Array)]) -> Vec<(&'b str, &'b wgpu::Buffer)> {
+        arrays.iter().filter_map(|(name, x)| Some((*name, &parts(x).get(k)?.buffer))).collect()
+    }
+
+    /// Copies the planes beside part k of `of` to the room's buffers `before` and `after`.
+    fn beside(&self, room: &mut Room, of: &Array, k: usize) -> Result<()> {
+        let bytes = 4 * plane(self.shape) as u64;
+        let gpu = &self.shared.gpu;
+        let all = parts(of);
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        let sides = [("before", k.checked_sub(1)), ("after", Some(k + 1))];
+        for (name, neighbour) in sides {
+            room.buffers.reserve(gpu, name, bytes, ARRAY)?;
+            let (Some(to), Some(from)) = (room.buffers.get(name), neighbour.and_then(|n| all.get(n))) else { continue };
+            let at = if name == "before" { (from.planes.len() - 1) as u64 * bytes } else { 0 };
+            encoder.copy_buffer_to_buffer(&from.buffer, at, to, 0, bytes);
+        }
+        gpu.submit(encoder);
+        Ok(())
+    }
+
+    /// Runs a kernel on every part; `beside` is the array whose neighbouring planes it reads.
+    fn run(
+        &self,
+        room: &mut Room,
+        (label, source): (&str, &Source),
+        arrays: &[(&str, &Array)],
+        beside: Option<&Array>,
+    ) -> Result<()> {
+        for (k, part) in parts(arrays[0].1).iter().enumerate() {
+            beside.map_or(Ok(()), |of| self.beside(room, of, k))?;
+            let bind = Self::bind(k, arrays);
+            room.run(self.shared, Task { label, source, bind: &bind }, self.uniform(part), self.count(part))?;
+        }
+        Ok(())
+    }
+
+    /// Adds up what a kernel computes on every part.
+    fn sum(
+        &self,
+        room: &mut Room,
+        (label, source): (&str, &Source),
+        arrays: &[(&str, &Array)],
+        beside: &Array,
+    ) -> Result<f64> {
+        let mut total = 0.0;
+        for (k, part) in parts(beside).iter().enumerate() {
+            self.beside(room, beside, k)?;
+            let bind = Self::bind(k, arrays);
+            let task = Task { label, source, bind: &bind };
+            total += room.sum(self.shared, task, self.uniform(part), self.count(part), false)?[0];
+        }
+        Ok(total)
+    }
+}
+
+/// A volume with the factors of a step.
+fn of_step<'a>(shared: &'a Shared, step: &Step<'_>) -> Volume<'a> {
+    let mut volume = Volume::new(shared, step.x);
+    let pull = step.towards.map_or(0.0, |(_, share)| share);
+    volume.whole = Stencil { step: step.step, momentum: step.momentum, pull, ..volume.whole };
+    volume
+}
+
+/// Overwrites the gradient with the argument of the proximal map.
+pub(super) fn argument(shared: &Shared, room: &mut Room, step: &Step<'_>) -> Result<()> {
+    let mut bindings = vec![("gradient", Write), ("ahead", Read)];
+    let mut v = "let z = ahead[i];\n        var v = z + stencil.step * gradient[i];\n".to_owned();
+    if step.towards.is_some() {
+        bindings.push(("towards", Read));
+        v += "        v += stencil.pull * (towards[i] - z);\n";
+    }
+    if step.inside.is_some() {
+        bindings.push(("inside", Read));
+        // Values far below 0 stay at 0, whatever their neighbours are.
+        v += "        if ((inside[i / 32u] >> (i % 32u)) & 1u) == 0u { v = -3.4e38; }\n";
+    }
+    let source = kernel(&bindings, &[], &(v + "        gradient[i] = v;"));
+    let volume = of_step(shared, step);
+    for (k, part) in parts(step.gradient).iter().enumerate() {
+        let mut bind = Volume::bind(k, &[("gradient", step.gradient), ("ahead", step.ahead)]);
+        bind.extend(step.towards.map(|(towards, _)| ("towards", &parts(towards)[k].buffer)));
+        bind.extend(step.inside.map(|inside| ("inside", &parts(inside)[k].buffer)));
+        let task = Task { label: "argument of the prior", source: &source, bind: &bind };
+        room.run(shared, task, volume.uniform(part), volume.count(part))?;
+    }
+    Ok(())
+}
+
+/// New coefficients, and the point of the next gradient, in WGSL from the result `u` of the proximal map.
+fn extrapolation(u: &str) -> String {
+    format!("let u = {u};\n        ahead[i] = u + stencil.momentum * (u - x[i]);\n        x[i] = u;")
+}
+
+/// Ends an update after a proximal map whose result is in the gradient.
+pub(super) fn finish(shared: &Shared, room: &mut Room, step: Step<'_>) -> Result<()> {
+    let flat = [("gradient", Read), ("x", Write), ("ahead", Write)];
+    let source = kernel(&flat, &[], &extrapolation("max(0.0, gradient[i])"));
+    let arrays: [(&str, &Array); 3] = [("gradient", step.gradient), ("x", step.x), ("ahead", step.ahead)];
+    of_step(shared, &step).run(room, ("extrapolation", &source), &arrays, None)
+}
+
+/// A whole update with a penalty that has kernels.
+pub(super) fn update(shared: &Shared, room: &mut Room, step: Step<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+    argument(shared, room, &step)?;
+    let Some(Kernels::Dual(dual)) = penalty.kernels() else { return finish(shared, room, step) };
+    if step.tau < f32::MIN_POSITIVE {
+        return finish(shared, room, step);
+    }
+    let mut volume = of_step(shared, &step);
+    let bound = Dual::bound(dual.weights);
+    volume.whole.down = dual.weights.map(|g| g * step.tau);
+    volume.whole.up = dual.weights.map(|g| g / (bound * step.tau));
+    let p: [(&str, &Array); 3] = std::array::from_fn(|k| (DUAL[k], &*dual.p[k]));
+    let fragment = fragment_of("the prior", Some(dual.fragment.clone()))?.named("penalty_");
+    let of_dual = |access| DUAL.map(|name| (name, access));
+    let before = [("before", Read)];
+    // The iterate of the dual steps has the memory of the next point, which is overwritten at the end.
+    let primal = [&of_dual(Read)[..], &[("gradient", Read), ("ahead", Write)], &before].concat();
+    let primal = kernel(&primal, &[PRIMAL], "ahead[i] = primal_of(i);");
+    let mut bindings = [&of_dual(Write)[..], &BESIDE].concat();
+    let mut arrays = [&p[..], &[("values", &*step.ahead)]].concat();
+    let mut guide = "vec3<f32>()";
+    if let Some(Guide { vectors, .. }) = &dual.guide {
+        bindings.extend(GUIDE.map(|name| (name, Read)));
+        arrays.extend(GUIDE.iter().zip(vectors).map(|(name, x)| (*name, &**x)));
+        guide = GUIDED;
+    }
+    let body = include_str!("../kernels/ascend.wgsl").replace("GUIDE", guide);
+    let ascend = kernel(&bindings, &[VALUES, ("penalty", &fragment)], &body);
+    let of_primal = [&p[..], &[("gradient", &*step.gradient), ("ahead", &*step.ahead)]].concat();
+    for _ in 0..dual.steps {
+        volume.run(room, ("primal of the prior", &primal), &of_primal, Some(p[0].1))?;
+        volume.run(room, ("dual of the prior", &ascend), &arrays, Some(step.ahead))?;
+    }
+    let flat = [("gradient", Read), ("x", Write), ("ahead", Write)];
+    let source = kernel(&[&of_dual(Read)[..], &flat, &before].concat(), &[PRIMAL], &extrapolation("primal_of(i)"));
+    let arrays = [&p[..], &[("gradient", &*step.gradient), ("x", &*step.x), ("ahead", &*step.ahead)]].concat();
+    volume.run(room, ("extrapolation", &source), &arrays, Some(p[0].1))
+}
+
+/// The value of a penalty of differences.
+pub(super) fn value(shared: &Shared, room: &mut Room, dual: &Dual<'_>, x: &Array) -> Result<f64> {
+    let fragment = fragment_of("the prior", Some(dual.fragment.clone()))?.named("penalty_");
+    let mut bindings = BESIDE.to_vec();
+    let mut arrays = vec![("values", x)];
+    let mut guide = "vec3<f32>()";
+    if let Some(Guide { vectors, .. }) = &dual.guide {
+        bindings.extend(GUIDE.map(|name| (name, Read)));
+        arrays.extend(GUIDE.iter().zip(vectors).map(|(name, x)| (*name, &**x)));
+        guide = GUIDED;
+    }
+    let mut source = begun(&bindings, &[VALUES, ("penalty", &fragment)]);
+    let body = format!("let v = vec2<f32>(penalty_cost(differences(place(i)), {guide}), 0.0);");
+    summing(&mut source, "stencil", &body, false);
+    let mut volume = Volume::new(shared, x);
+    volume.whole.up = dual.weights;
+    volume.sum(room, ("value of the prior", &source), &arrays, x)
+}
+
+/// Finds the edges of `x` that guide a penalty. Returns the new value.
+pub(super) fn adapt(shared: &Shared, room: &mut Room, dual: Dual<'_>, x: &Array) -> Result<f64> {
+    if let Some(Guide { vectors, strength, scale }) = &dual.guide {
+        let mut volume = Volume::new(shared, x);
+        volume.whole.up = dual.weights;
+        let n = GUIDE.map(|name| (name, Write));
+        let edges = ("edges", include_str!("../kernels/edges.wgsl"));
+        let mut slopes = begun(&[&n[..], &BESIDE].concat(), &[VALUES, edges]);
+        summing(&mut slopes, "stencil", include_str!("../kernels/edge_slopes.wgsl"), false);
+        let vectors: [(&str, &Array); 3] = std::array::from_fn(|k| (GUIDE[k], &*vectors[k]));
+        let squares = volume.sum(room, ("edges", &slopes), &[&vectors[..], &[("values", x)]].concat(), x)?;
+        volume.whole.step = *strength;
+        volume.whole.momentum = (squares / x.len() as f64) as f32 * scale * scale;
+        let lengths = kernel(&n, &[], include_str!("../kernels/edge_lengths.wgsl"));
+        volume.run(room, ("lengths of edges", &lengths), &vectors, None)?;
+    }
+    value(shared, room, &dual, x)
+}
+
+/// Overwrites `out` with the slope of the smoothed total variation of `x`. Returns its sum of squares.
+pub(super) fn slope(shared: &Shared, room: &mut Room, slope: &Slope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
+    let functions = [VALUES, ("slope", include_str!("../kernels/slope.wgsl"))];
+    let mut source = begun(&[&[("out", Write)][..], &BESIDE].concat(), &functions);
+    let body = "let s = slope_at(i);\n        out[i] = s;\n        let v = vec2<f32>(s * s, 0.0);";
+    summing(&mut source, "stencil", body, false);
+    let mut volume = Volume::new(shared, x);
+    volume.whole.up = slope.weights;
+    volume.whole.step = slope.unit;
+    volume.sum(room, ("slope of total variation", &source), &[("out", out), ("values", x)], x)
+}

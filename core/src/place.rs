@@ -1,0 +1,456 @@
+//! Places: where the arrays of a method live.
+//!
+//! Volumes and views are large, and moving them takes longer than most computations with them. A method requests
+//! [`Array`]s from a [`Place`] and combines them there. Only [`Place::load`] and [`Place::store`] move numbers between
+//! an array and the host.
+//!
+//! A place must allocate, load and store. The other methods have defaults that compute on the host: arrays that live
+//! there ([`Held::host`]) are used as they are, others are stored, changed and loaded again. A place with kernels of its
+//! own overrides them.
+
+mod map;
+mod views;
+
+pub use map::{ADD, DIVIDE, FLOOR, INVERT, Map, RELAX, Reduction, TIMES, squares};
+pub use views::{FilteredViews, RowWeights, Views, Weighing};
+
+use crate::error::Result;
+use crate::geometry::Geometry;
+use crate::regularizer::{Penalty, Update};
+use crate::voxel::VoxelProjector;
+use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, Zip, s};
+use rayon::prelude::*;
+use serde::Serialize;
+use std::any::Any;
+use std::borrow::Cow;
+
+/// Elements of an array that lives in a place.
+pub struct Held<T> {
+    shape: [usize; 3],
+    data: Data<T>,
+}
+
+/// Numbers: a volume `[x, y, z]`, or images `[view, row, column]`.
+pub type Array = Held<f32>;
+/// A flag per voxel or pixel.
+pub type Mask = Held<bool>;
+
+enum Data<T> {
+    Host(Array3<T>),
+    There(Box<dyn Any + Send + Sync>),
+}
+
+impl<T> Held<T> {
+    /// An array in the host's memory. Copies it unless it is in standard order.
+    pub fn host(array: Array3<T>) -> Self
+    where
+        T: Clone,
+    {
+        let array = if array.is_standard_layout() { array } else { array.as_standard_layout().into_owned() };
+        Self { shape: array.dim().into(), data: Data::Host(array) }
+    }
+
+    /// An array without elements.
+    pub fn nothing() -> Self {
+        Self { shape: [0; 3], data: Data::There(Box::new(())) }
+    }
+
+    /// An array that a place keeps as `data`.
+    pub fn there(shape: [usize; 3], data: impl Any + Send + Sync) -> Self {
+        Self { shape, data: Data::There(Box::new(data)) }
+    }
+
+    /// Its shape.
+    pub fn shape(&self) -> [usize; 3] {
+        self.shape
+    }
+
+    /// Number of elements.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The array in the host's memory, if it lives there.
+    pub fn on_host(&self) -> Option<&Array3<T>> {
+        match &self.data {
+            Data::Host(array) => Some(array),
+            Data::There(_) => None,
+        }
+    }
+
+    /// Mutable version of [`Held::on_host`].
+    pub fn on_host_mut(&mut self) -> Option<&mut Array3<T>> {
+        match &mut self.data {
+            Data::Host(array) => Some(array),
+            Data::There(_) => None,
+        }
+    }
+
+    /// What a place keeps of it.
+    pub fn get<D: Any>(&self) -> Option<&D> {
+        match &self.data {
+            Data::Host(_) => None,
+            Data::There(data) => data.downcast_ref(),
+        }
+    }
+}
+
+/// A part of the state that a checkpoint keeps.
+pub enum State<'a> {
+    /// An array in a place.
+    Placed(&'a mut Array),
+    /// Numbers of a stage that runs on the host.
+    Host(&'a mut [f32]),
+}
+
+impl State<'_> {
+    /// Number of elements.
+    pub fn count(&self) -> usize {
+        match self {
+            Self::Placed(x) => x.len(),
+            Self::Host(x) => x.len(),
+        }
+    }
+
+    /// Its numbers in the host's memory.
+    pub fn read(&self, place: &dyn Place) -> Result<Cow<'_, [f32]>> {
+        match self {
+            Self::Host(x) => Ok(Cow::Borrowed(x)),
+            Self::Placed(x) => match x.on_host() {
+                Some(x) => Ok(Cow::Borrowed(flat(x))),
+                None => Ok(Cow::Owned(place.read(x)?.into_owned().into_raw_vec_and_offset().0)),
+            },
+        }
+    }
+
+    /// Overwrites it with as many numbers.
+    pub fn load(&mut self, place: &dyn Place, from: &[f32]) -> Result<()> {
+        match self {
+            Self::Host(x) => x.copy_from_slice(from),
+            Self::Placed(x) => {
+                let from = ArrayView3::from_shape(x.shape(), from);
+                place.load(from.unwrap_or_else(|e| unreachable!("as many numbers: {e}")), x, 0)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Bytes that crossed between the host and a device.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Moved {
+    /// From the host to the device.
+    pub to_device: u64,
+    /// From the device to the host.
+    pub from_device: u64,
+}
+
+/// The arrays of a proximal gradient step; see [`Update`].
+pub struct Step<'a> {
+    /// Negative gradient of the data term at `ahead`; unspecified afterwards.
+    pub gradient: &'a mut Array,
+    /// Point of the gradient; afterwards the point of the next one.
+    pub ahead: &'a mut Array,
+    /// The coefficients.
+    pub x: &'a mut Array,
+    /// The coefficients to pull towards, and the share of the way.
+    pub towards: Option<(&'a Array, f32)>,
+    /// Coefficients that may be non-zero, if not all.
+    pub inside: Option<&'a Mask>,
+    /// Step along `gradient`.
+    pub step: f32,
+    /// Extrapolation beyond the new coefficients.
+    pub momentum: f32,
+    /// Weight of the penalty's proximal map.
+    pub tau: f32,
+}
+
+/// Slope of a smoothed total variation, `Σ_j √(1 + Σ_k (unit·weights_k·(x_{j+k} − x_j))²)`, by each voxel. Differences
+/// across the far faces are 0.
+pub struct Slope<'a> {
+    /// Weights of differences along x, y, z.
+    pub weights: [f32; 3],
+    /// Factor of differences.
+    pub unit: f32,
+    /// Overwrites its second argument with the slope of the first, and returns the sum of squares.
+    pub host: &'a (dyn Fn(&[f32], &mut [f32]) -> f64 + Sync),
+}
+
+/// Allocates arrays and combines them. All arrays of a call come from this place or are on the host.
+pub trait Place: Send + Sync {
+    /// The name of its device; `None` for the host.
+    fn device(&self) -> Option<String>;
+
+    /// Zeros.
+    ///
+    /// # Errors
+    /// Too little memory on a device.
+    fn zeros(&self, shape: [usize; 3]) -> Result<Array>;
+
+    /// Overwrites planes of `to` along its first axis, from plane `first` on.
+    fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()>;
+
+    /// Overwrites `to` with planes of `from` along its first axis, from plane `first` on.
+    fn store(&self, from: &Array, first: usize, to: ArrayViewMut3<'_, f32>) -> Result<()>;
+
+    /// Refuses a projector that cannot work here, at planning time.
+    fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
+        let _ = projector;
+        Ok(())
+    }
+
+    /// An array with the numbers of `from`.
+    fn adopt(&self, from: Array3<f32>) -> Result<Array> {
+        let mut array = self.zeros(from.dim().into())?;
+        self.load(from.view(), &mut array, 0)?;
+        Ok(array)
+    }
+
+    /// A copy of `flags`.
+    fn mask(&self, flags: Array3<bool>) -> Result<Mask> {
+        Ok(Mask::host(flags))
+    }
+
+    /// The measured images of a scan for [`Place::compare`] and [`Place::weigh`]. They are loaded here if they fit.
+    fn views<'a>(&self, measured: &'a Array3<f32>) -> Result<Views<'a>> {
+        Ok(Views { measured, here: None })
+    }
+
+    /// The numbers of `x` in the host's memory, moved there if need be.
+    fn read<'a>(&self, x: &'a Array) -> Result<CowArray<'a, f32, Ix3>> {
+        if let Some(array) = x.on_host() {
+            return Ok(array.into());
+        }
+        let mut array = Array3::zeros(x.shape());
+        self.store(x, 0, array.view_mut())?;
+        Ok(array.into())
+    }
+
+    /// Lets `work` change the numbers of `x` in the host's memory.
+    fn change(&self, x: &mut Array, work: &mut dyn FnMut(&mut Array3<f32>)) -> Result<()> {
+        if let Some(array) = x.on_host_mut() {
+            work(array);
+            return Ok(());
+        }
+        let mut array = Array3::zeros(x.shape());
+        self.store(x, 0, array.view_mut())?;
+        work(&mut array);
+        self.load(array.view(), x, 0)
+    }
+
+    /// Ends the array and returns its numbers.
+    fn take(&self, x: Array) -> Result<Array3<f32>> {
+        match x.data {
+            Data::Host(array) => Ok(array),
+            Data::There(_) => Ok(self.read(&x)?.into_owned()),
+        }
+    }
+
+    /// Overwrites `x` with `value`.
+    fn fill(&self, x: &mut Array, value: f32) -> Result<()> {
+        self.change(x, &mut |x| x.par_mapv_inplace(|_| value))
+    }
+
+    /// Overwrites `out` with the first planes of `from`, one for each plane of `out` in `at`.
+    fn scatter(&self, from: &Array, out: &mut Array, at: &[usize]) -> Result<()> {
+        let from = self.read(from)?;
+        self.change(out, &mut |out| {
+            for (plane, &i) in from.outer_iter().zip(at) {
+                out.index_axis_mut(Axis(0), i).assign(&plane);
+            }
+        })
+    }
+
+    /// Sets the elements of `x` outside `inside` to `value`.
+    fn keep(&self, x: &mut Array, inside: &Mask, value: f32) -> Result<()> {
+        self.change(x, &mut |x| {
+            if let Some(inside) = inside.on_host() {
+                Zip::from(x).and(inside).par_for_each(|x, inside| *x = if *inside { *x } else { value });
+            }
+        })
+    }
+
+    /// Overwrites each element `o` of `out` with the value of `map` at `o` and the elements of `inputs`, which have the
+    /// same shape. `factors` are the map's constants a and b.
+    fn map(&self, map: &Map, factors: [f64; 2], out: &mut Array, inputs: &[&Array]) -> Result<()> {
+        let inputs = inputs.iter().map(|x| self.read(x)).collect::<Result<Vec<_>>>()?;
+        self.change(out, &mut |out| map.run(factors, out, &inputs))
+    }
+
+    /// The reduction of `x`, or of `x` and `y`, which have the same shape.
+    fn reduce(&self, kind: Reduction, x: &Array, y: &Array) -> Result<f64> {
+        Ok(kind.of(&self.read(x)?, &self.read(y)?))
+    }
+
+    /// Overwrites the first images of `images` with the line integrals of `volume`; see
+    /// [`crate::voxel::VoxelOperator::forward`].
+    fn forward(
+        &self,
+        projector: &dyn VoxelProjector,
+        geometry: &Geometry,
+        views: &[usize],
+        volume: &Array,
+        images: &mut Array,
+    ) -> Result<()> {
+        let volume = self.read(volume)?;
+        let operator = projector.operator();
+        self.change(images, &mut |images| {
+            operator.forward(geometry, views, volume.view(), images.slice_mut(s![..views.len(), .., ..]));
+        })?;
+        operator.fault()
+    }
+
+    /// Adds the adjoint of the line integrals for the first images of `images` to `volume`.
+    fn adjoint(
+        &self,
+        projector: &dyn VoxelProjector,
+        geometry: &Geometry,
+        views: &[usize],
+        images: &Array,
+        volume: &mut Array,
+    ) -> Result<()> {
+        let images = self.read(images)?;
+        let operator = projector.operator();
+        self.change(volume, &mut |volume| {
+            operator.adjoint(geometry, views, images.slice(s![..views.len(), .., ..]), volume.view_mut());
+        })?;
+        operator.fault()
+    }
+
+    /// Replaces the first images `a` of `images`, line integrals of the views `views`, with `weights·φ'(p − a)`; see
+    /// [`Weighing`]. Returns `Σ (p − a)²` and `Σ φ(p − a)`.
+    fn compare(&self, by: &Weighing<'_>, views: &[usize], images: &mut Array) -> Result<[f64; 2]> {
+        let weights = by.weights.map(|w| self.read(w)).transpose()?;
+        let mut sums = [0.0; 2];
+        self.change(images, &mut |images| sums = by.compare(views, images, weights.as_ref()))?;
+        by.fault()?;
+        Ok(sums)
+    }
+
+    /// Multiplies the first images of `images` by bounds of φ'' (`spread` is false), or by the standard deviation of φ'
+    /// under noise; see [`crate::data_term::Misfit`].
+    fn weigh(&self, by: &Weighing<'_>, spread: bool, views: &[usize], images: &mut Array) -> Result<()> {
+        self.change(images, &mut |images| by.weigh(spread, views, images))?;
+        by.fault()
+    }
+
+    /// Weights and filters the first images of `images`, the measured views `views`, and adds their distance-weighted
+    /// back-projection to `volume`.
+    fn filtered(
+        &self,
+        work: &dyn FilteredViews,
+        views: &[usize],
+        images: &mut Array,
+        volume: &mut Array,
+    ) -> Result<()> {
+        self.change(images, &mut |images| {
+            let each = images.axis_iter_mut(Axis(0)).into_par_iter().zip(views);
+            each.for_each(|(image, &view)| {
+                work.filter(view, image.into_slice().unwrap_or_else(|| unreachable!("images are contiguous")));
+            });
+        })?;
+        let images = self.read(images)?;
+        self.change(volume, &mut |volume| {
+            work.backproject(views, images.slice(s![..views.len(), .., ..]), volume.view_mut());
+        })
+    }
+
+    /// A proximal gradient step with `penalty`.
+    fn update(&self, step: Step<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+        let Step { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
+        if let [Some(gradient), Some(ahead), Some(x)] = [&mut *gradient, &mut *ahead, &mut *x].map(Array::on_host_mut) {
+            let [gradient, ahead, x] = [gradient, ahead, x].map(flat_mut);
+            let towards = towards.and_then(|(to, share)| Some((flat(to.on_host()?), share)));
+            let inside = inside.and_then(Mask::on_host).and_then(|inside| inside.as_slice());
+            penalty.update(Update { gradient, ahead, x, step, momentum, towards, inside }, tau);
+            return penalty.fault();
+        }
+        // The argument of the proximal map, in `gradient`.
+        self.map(&ADD, [1.0, f64::from(step)], gradient, &[ahead])?;
+        if let Some((towards, share)) = towards {
+            self.map(&ADD, [f64::from(share), 1.0], gradient, &[towards])?;
+            self.map(&ADD, [-f64::from(share), 1.0], gradient, &[ahead])?;
+        }
+        if let Some(inside) = inside {
+            self.keep(gradient, inside, f32::MIN)?;
+        }
+        self.change(gradient, &mut |v| {
+            let mut u = Array3::zeros(v.raw_dim());
+            penalty.prox(flat(v), tau, flat_mut(&mut u));
+            *v = u;
+        })?;
+        penalty.fault()?;
+        self.map(&ADD, [-f64::from(momentum), 0.0], ahead, &[x])?;
+        self.map(&ADD, [1.0 + f64::from(momentum), 1.0], ahead, &[gradient])?;
+        self.map(&ADD, [1.0, 0.0], x, &[gradient])
+    }
+
+    /// The value of `penalty` at `x`; see [`Penalty::value`].
+    fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {
+        Ok(penalty.value(self.read(x)?.view()))
+    }
+
+    /// Adapts `penalty` to `x`; see [`Penalty::adapt`].
+    fn adapt(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<Option<f64>> {
+        if !penalty.adapts() {
+            return Ok(None);
+        }
+        Ok(penalty.adapt(self.read(x)?.view()))
+    }
+
+    /// Overwrites `out` with a slope of the total variation of `x`. Returns its sum of squares.
+    fn slope(&self, slope: &Slope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
+        let x = self.read(x)?;
+        let mut sum = 0.0;
+        self.change(out, &mut |out| sum = (slope.host)(x.as_slice().unwrap_or_default(), flat_mut(out)))?;
+        Ok(sum)
+    }
+}
+
+/// The host: arrays in its memory, kernels on its cores.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Host;
+
+impl Place for Host {
+    fn device(&self) -> Option<String> {
+        None
+    }
+
+    fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
+        Ok(Array::host(Array3::zeros(shape)))
+    }
+
+    fn adopt(&self, from: Array3<f32>) -> Result<Array> {
+        Ok(Array::host(from))
+    }
+
+    fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()> {
+        self.change(to, &mut |to| {
+            let mut to = to.slice_mut(s![first..first + from.len_of(Axis(0)), .., ..]);
+            Zip::from(&mut to).and(from).par_for_each(|to, from| *to = *from);
+        })
+    }
+
+    fn store(&self, from: &Array, first: usize, mut to: ArrayViewMut3<'_, f32>) -> Result<()> {
+        if let Some(from) = from.on_host() {
+            let from = from.slice(s![first..first + to.len_of(Axis(0)), .., ..]);
+            Zip::from(&mut to).and(from).par_for_each(|to, from| *to = *from);
+        }
+        Ok(())
+    }
+}
+
+/// The numbers of an array of this module, in order.
+fn flat(x: &Array3<f32>) -> &[f32] {
+    x.as_slice().unwrap_or_else(|| unreachable!("arrays are contiguous"))
+}
+
+/// Mutable version of [`flat`].
+fn flat_mut(x: &mut Array3<f32>) -> &mut [f32] {
+    x.as_slice_mut().unwrap_or_else(|| unreachable!("arrays are contiguous"))
+}

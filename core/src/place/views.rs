@@ -1,0 +1,135 @@
+//! Work on measured views: data terms, and FDK's filtered back-projection.
+
+use super::map::squares;
+use super::{Array, Mask};
+use crate::data_term::Misfit;
+use crate::error::Result;
+use crate::voxel::VoxelView;
+use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, Zip, s};
+use rayon::prelude::*;
+
+/// Measured line integrals, `[view, row, column]`.
+pub struct Views<'a> {
+    /// As the scan holds them.
+    pub measured: &'a Array3<f32>,
+    /// A copy in the place, if it has one.
+    pub here: Option<Array>,
+}
+
+/// How computed line integrals are compared with measured ones.
+#[derive(Clone, Copy)]
+pub struct Weighing<'a> {
+    /// The measured line integrals p.
+    pub views: &'a Views<'a>,
+    /// Pixels outside count as p = 0.
+    pub shadow: Option<&'a Mask>,
+    /// Factors of the residuals of all views.
+    pub weights: Option<&'a Array>,
+    /// The data term φ; `½r²` if there is none.
+    pub term: Option<&'a dyn Misfit>,
+}
+
+impl Weighing<'_> {
+    /// Returns an error of the data term in the calls so far.
+    pub fn fault(&self) -> Result<()> {
+        self.term.map_or(Ok(()), Misfit::fault)
+    }
+
+    /// [`super::Place::compare`] on the host.
+    pub fn compare(
+        &self,
+        views: &[usize],
+        images: &mut Array3<f32>,
+        weights: Option<&CowArray<'_, f32, Ix3>>,
+    ) -> [f64; 2] {
+        let shadow = self.shadow.and_then(Mask::on_host);
+        for (mut image, &v) in images.axis_iter_mut(Axis(0)).zip(views) {
+            let both = Zip::from(&mut image).and(self.views.measured.index_axis(Axis(0), v));
+            match shadow {
+                None => both.par_for_each(|a, p| *a = p - *a),
+                Some(shadow) => both
+                    .and(shadow.index_axis(Axis(0), v))
+                    .par_for_each(|a, p, inside| *a = if *inside { p - *a } else { -*a }),
+            }
+        }
+        let residual = images.slice(s![..views.len(), .., ..]);
+        let residual = residual.as_slice().map_or_else(|| unreachable!("images follow each other"), squares);
+        if let Some(weights) = weights {
+            for (mut image, &v) in images.axis_iter_mut(Axis(0)).zip(views) {
+                image.zip_mut_with(&weights.index_axis(Axis(0), v), |r, w| *r *= w);
+            }
+        }
+        if self.term.is_none() {
+            return [residual, 0.5 * residual];
+        }
+        [residual, self.differentiate(views, images)]
+    }
+
+    /// Replaces residuals r with φ'(r), on the host. Returns `Σ φ(r)`.
+    pub fn differentiate(&self, views: &[usize], images: &mut Array3<f32>) -> f64 {
+        let Some(term) = self.term else { return 0.0 };
+        self.each_image(views, images, |view, p, r| term.differentiate(view, p, r)).iter().sum()
+    }
+
+    /// [`super::Place::weigh`] on the host.
+    pub fn weigh(&self, spread: bool, views: &[usize], images: &mut Array3<f32>) {
+        let Some(term) = self.term else { return };
+        self.each_image(views, images, |view, measured, values| {
+            if spread { term.spread(view, measured, values) } else { term.curve(view, measured, values) }
+        });
+    }
+
+    /// Calls `work` with each of the first images, its view and its measurement. Returns the results in the order of
+    /// the views.
+    fn each_image<T: Send>(
+        &self,
+        views: &[usize],
+        images: &mut Array3<f32>,
+        work: impl Fn(usize, &[f32], &mut [f32]) -> T + Sync,
+    ) -> Vec<T> {
+        let images = images.axis_iter_mut(Axis(0)).into_par_iter().zip(views);
+        images
+            .map(|(image, &view)| {
+                let measured = self.views.measured.index_axis(Axis(0), view);
+                let measured = measured.as_standard_layout();
+                match (measured.as_slice(), image.into_slice()) {
+                    (Some(measured), Some(image)) => work(view, measured, image),
+                    _ => unreachable!("images are contiguous"),
+                }
+            })
+            .collect()
+    }
+}
+
+/// FDK's work on views: weights, the ramp filter along rows, and distance-weighted back-projection.
+pub trait FilteredViews: Sync {
+    /// Weights and filters the image of a view, `[row, column]`.
+    fn filter(&self, view: usize, image: &mut [f32]);
+
+    /// Adds the filtered images of some views to `volume`.
+    fn backproject(&self, views: &[usize], images: ArrayView3<'_, f32>, volume: ArrayViewMut3<'_, f32>);
+
+    /// The weights of a view in numbers, for a device.
+    fn weights(&self, view: usize) -> RowWeights;
+
+    /// The filter along rows, besides the factors in [`RowWeights::columns`]: a pixel's factor by its distance in
+    /// columns, as many as a row has.
+    fn taps(&self) -> Vec<f32>;
+
+    /// A view for back-projection.
+    fn seen(&self, view: usize) -> VoxelView;
+}
+
+/// The weights of a view's pixels before the ramp filter: `columns[c]·(corner + c·u + r·v)·normal/|corner + c·u + r·v|`.
+pub struct RowWeights {
+    /// Factor of each column.
+    pub columns: Vec<f32>,
+    /// From the source to pixel (0, 0), mm.
+    pub corner: [f64; 3],
+    /// From pixel to pixel along a row, mm.
+    pub u: [f64; 3],
+    /// From row to row, mm.
+    pub v: [f64; 3],
+    /// Unit normal of the detector, away from the source.
+    pub normal: [f64; 3],
+}

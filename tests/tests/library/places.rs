@@ -1,0 +1,556 @@
+//! Places: projection against double precision, all other work against the host, what moves, and classical methods against
+//! the CPU.
+
+use crate::common::{Stop, plan, scan, solve_on, spec, truth};
+use conefield_backend_cpu::Cpu;
+use conefield_core::arena::Weights;
+use conefield_core::backend::Backend;
+use conefield_core::data_term::DataTermSpec;
+use conefield_core::geometry::Geometry;
+use conefield_core::method::{Job, Observer, Record};
+use conefield_core::place::{Host, Map, Place, Reduction, State, Step, Weighing};
+use conefield_core::random::{mix, unit};
+use conefield_core::regularizer::{Dual, Kernels, Penalty, RegularizerSpec};
+use conefield_core::scan::{Scan, ScanHeader, Volume};
+use conefield_core::space::Space;
+use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};
+use conefield_core::wgsl::Fragment;
+use conefield_projectors::simulate::{Protocol, simulate};
+use conefield_solvers::iterative::tv::descend;
+use ndarray::{Array3, ArrayView3, s};
+use serde_json::{Value, json};
+use std::sync::Arc;
+
+/// The test scan's geometry with voxels that are no cube, and two tilted views.
+fn geometry() -> Geometry {
+    let mut g = scan().geometry;
+    g.volume.shape = [13, 16, 9];
+    g.volume.spacing = [12.0, 10.0, 15.0];
+    for view in &mut g.views[..2] {
+        view.v = [1.5, -2.0, -17.0];
+        view.source[2] += 30.0;
+    }
+    g
+}
+
+fn numbers(shape: impl Into<[usize; 3]>, seed: u64) -> Array3<f64> {
+    let shape = shape.into();
+    let mut i = 0;
+    Array3::from_shape_simple_fn(shape, || {
+        i += 1;
+        f64::from(unit(mix(seed, i)))
+    })
+}
+
+/// Largest difference as a share of the largest number.
+fn off(found: &Array3<f32>, exact: &Array3<f64>) -> f64 {
+    let top = exact.iter().fold(1e-30f64, |m, v| m.max(v.abs()));
+    found.iter().zip(exact).map(|(a, b)| (f64::from(*a) - b).abs() / top).fold(0.0, f64::max)
+}
+
+/// Positions along a ray are rounded to 2⁻²⁴ of the source's distance in voxels, and weights of neighbouring voxels with
+/// them: some 1e-5 of a voxel. An exact length may begin at the other side of a wall, with next to no length.
+const LIMIT: f64 = 5e-5;
+
+fn projector(settings: Value) -> Box<dyn VoxelProjector> {
+    serde_json::from_value::<Box<dyn VoxelProjectorSpec>>(settings).unwrap().build().unwrap()
+}
+
+fn all() -> Vec<Value> {
+    vec![json!({"type": "siddon"}), json!({"type": "joseph"}), json!({"type": "trilinear"})]
+}
+
+/// Both directions against double precision; how far off they are, and the mismatch of `<Ax, y>` and `<x, Aᵀy>`.
+fn errors(place: &dyn Place, p: &dyn VoxelProjector) -> conefield_core::Result<[f64; 3]> {
+    let g = geometry();
+    let views: Vec<usize> = (0..g.views.len()).rev().collect();
+    let [rows, columns] = g.detector;
+    let (x, y) = (numbers(g.volume.shape, 1), numbers([views.len(), rows, columns], 2));
+    let (mut ax, mut aty) = (Array3::zeros(y.dim()), Array3::ones(x.dim()));
+    p.reference().forward(&g, &views, x.view(), ax.view_mut());
+    p.reference().adjoint(&g, &views, y.view(), aty.view_mut());
+    let (x32, y32) = (x.mapv(|v| v as f32), y.mapv(|v| v as f32));
+    // Room for more views than are asked for.
+    let mut found = place.adopt(Array3::from_elem((views.len() + 3, rows, columns), 7.0))?;
+    place.forward(p, &g, &views, &place.adopt(x32.clone())?, &mut found)?;
+    let mut back = place.adopt(Array3::ones(x.dim()))?;
+    place.adjoint(p, &g, &views, &place.adopt(y32.clone())?, &mut back)?;
+    let found = place.take(found)?.slice_move(s![..views.len(), .., ..]);
+    let back = place.take(back)?;
+    let dot =
+        |a: &Array3<f32>, b: &Array3<f32>| -> f64 { a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum() };
+    let (lhs, rhs) = (dot(&found, &y32), dot(&x32, &back.mapv(|v| v - 1.0)));
+    Ok([off(&found, &ax), off(&back, &aty), (lhs - rhs).abs() / lhs])
+}
+
+/// The host, and the device with several limits.
+fn places(what: &str) -> Vec<(&'static str, Arc<dyn Place>)> {
+    let host: (_, Arc<dyn Place>) = ("host", Arc::new(Host));
+    let there = crate::device::backends(what).into_iter().map(|(name, backend)| (name, backend.place()));
+    [host].into_iter().chain(there).collect()
+}
+
+#[test]
+fn projectors_agree_with_double_precision_and_are_adjoint() {
+    for (name, place) in places("projectors of voxels") {
+        for settings in all() {
+            let [forward, adjoint, mismatch] = errors(place.as_ref(), projector(settings.clone()).as_ref()).unwrap();
+            println!("{settings}, {name}: forward {forward:.1e}, adjoint {adjoint:.1e}, mismatch {mismatch:.1e}");
+            assert!(forward < LIMIT && adjoint < LIMIT && mismatch < 1e-5, "{settings}, {name}");
+        }
+    }
+}
+
+/// A projector whose WGSL is another's, changed.
+struct Changed(Box<dyn VoxelProjector>, fn(&str) -> Option<String>);
+impl VoxelProjector for Changed {
+    fn operator(&self) -> &dyn VoxelOperator<f32> {
+        self.0.operator()
+    }
+    fn reference(&self) -> &dyn VoxelOperator<f64> {
+        self.0.reference()
+    }
+    fn describe(&self) -> String {
+        "changed: for a test".into()
+    }
+    fn wgsl(&self) -> Option<Fragment> {
+        Some(Fragment { source: self.1(&self.0.wgsl()?.source)? })
+    }
+}
+
+#[test]
+fn a_perturbed_walk_is_found_and_what_cannot_run_is_refused() {
+    let Some((_, backend)) = crate::device::backends("negative controls").into_iter().next() else { return };
+    let place = backend.place();
+    let changed = |change| Changed(projector(json!({"type": "joseph"})), change);
+    let wrong = changed(|s| Some(s.replace("fa * fb * step", "fa * fb * 1.01 * step")));
+    let [forward, adjoint, mismatch] = errors(place.as_ref(), &wrong).unwrap();
+    assert!(forward > LIMIT && adjoint > LIMIT && mismatch < 1e-5, "{forward} {adjoint} {mismatch}");
+    let e = place.admits(&changed(|_| None)).unwrap_err().to_string();
+    assert!(e.contains("changed") && e.contains("no WGSL") && e.contains("--backend cpu"), "{e}");
+    let e = place.admits(&changed(|s| Some(s.replace("let fb", "let fc")))).unwrap_err().to_string();
+    assert!(e.contains("projector (changed") && e.contains("line"), "{e}");
+}
+
+/// Numbers of a shape that small buffers cut into parts, some 0.
+fn volume(shape: [usize; 3], seed: u64) -> Array3<f32> {
+    numbers(shape, seed).mapv(|v| if v < 0.1 { 0.0 } else { v as f32 - 0.5 })
+}
+
+#[test]
+fn maps_masks_and_reductions_are_those_of_the_host() {
+    let shape = [11, 7, 19];
+    for (name, place) in places("maps and reductions") {
+        let arrays = [1, 2, 3].map(|seed| volume(shape, seed));
+        let inside = Array3::from_shape_fn(shape, |(x, y, z)| (x + 2 * y + z) % 5 != 0);
+        let on = |place: &dyn Place| -> conefield_core::Result<(Vec<Array3<f32>>, Vec<f64>)> {
+            let [o, x, y] = arrays.clone().map(|a| place.adopt(a).unwrap());
+            let mask = place.mask(inside.clone())?;
+            let mut found = vec![];
+            for map in Map::ALL {
+                let mut out = place.adopt(arrays[0].clone())?;
+                place.map(map, [0.25, 0.125], &mut out, &[&x, &y][..map.inputs])?;
+                found.push(place.take(out)?);
+            }
+            let mut out = place.adopt(arrays[0].clone())?;
+            place.keep(&mut out, &mask, -3.0)?;
+            place.scatter(&x, &mut out, &[9, 0, 4])?;
+            found.push(place.take(out)?);
+            let mut out = place.zeros(shape)?;
+            place.fill(&mut out, 1.5)?;
+            place.load(arrays[2].slice(s![3..9, .., ..]), &mut out, 4)?;
+            let mut part = Array3::zeros((5, shape[1], shape[2]));
+            place.store(&out, 5, part.view_mut())?;
+            found.extend([place.take(out)?, part]);
+            let numbers = Reduction::ALL.iter().map(|kind| place.reduce(*kind, &o, &y)).collect::<Result<_, _>>()?;
+            Ok((found, numbers))
+        };
+        let ((want, sums), (found, numbers)) = (on(&Host).unwrap(), on(place.as_ref()).unwrap());
+        for (k, (want, found)) in want.iter().zip(&found).enumerate() {
+            let off = off(found, &want.mapv(f64::from));
+            assert!(off < 1e-6, "{name}, {k}: {off}");
+        }
+        assert!(sums[1] > 100.0 && sums[3] > 1000.0);
+        for (want, found) in sums.iter().zip(&numbers) {
+            assert!((found / want - 1.0).abs() < 1e-6, "{name}: {found} and {want}");
+        }
+    }
+}
+
+#[test]
+fn a_sum_of_many_numbers_is_exact_to_single_precision() {
+    for (name, place) in places("long sums") {
+        // In plain single precision the small ones would be lost.
+        let mut x = Array3::from_elem((256, 128, 128), 1e-3f32);
+        x[[0, 0, 0]] = 1e3;
+        let found = place.adopt(x.clone()).and_then(|x| place.reduce(Reduction::Squares, &x, &x));
+        let Ok(found) = found else { continue };
+        let want: f64 = x.iter().map(|x| f64::from(*x).powi(2)).sum();
+        assert!((found / want - 1.0).abs() < 1e-7, "{name}: {found} and {want}");
+    }
+}
+
+#[test]
+fn data_terms_are_those_of_the_host() {
+    let scan = scan();
+    let views = [5, 2, 7];
+    let [rows, columns] = scan.geometry.detector;
+    let shadow = Array3::from_shape_fn(scan.projections.dim(), |(v, r, c)| (v + r + 3 * c) % 4 != 0);
+    let lines = numbers([4, rows, columns], 5).mapv(|v| v as f32);
+    let factors = numbers(scan.projections.dim(), 6).mapv(|v| v as f32);
+    let specs = [json!({"type": "least-squares"}), json!({"type": "noise-weighted"})];
+    let mut noisy = scan.projections.clone();
+    noisy.iter_mut().zip(numbers(scan.projections.dim(), 9).iter()).for_each(|(p, n)| *p += 0.1 * *n as f32 * *p);
+    for (name, place) in places("data terms") {
+        for spec in &specs {
+            let spec: Box<dyn DataTermSpec> = serde_json::from_value(spec.clone()).unwrap();
+            let term = spec.build().unwrap().of(noisy.view()).unwrap();
+            for [with_term, masked, weighted, resident] in (0..16).map(|k| [1, 2, 4, 8].map(|bit| k & bit != 0)) {
+                let on = |place: &dyn Place| -> conefield_core::Result<(Array3<f32>, [f64; 2], Array3<f32>)> {
+                    let mut held = place.views(&noisy)?;
+                    held.here = held.here.filter(|_| resident);
+                    let (mask, weights) = (place.mask(shadow.clone())?, place.adopt(factors.clone())?);
+                    let by = Weighing {
+                        views: &held,
+                        shadow: masked.then_some(&mask),
+                        weights: weighted.then_some(&weights),
+                        term: with_term.then_some(term.as_ref()),
+                    };
+                    let mut images = place.adopt(lines.clone())?;
+                    let sums = place.compare(&by, &views, &mut images)?;
+                    let mut weighed = place.adopt(lines.clone())?;
+                    let by = Weighing { term: Some(term.as_ref()), ..by };
+                    place.weigh(&by, false, &views, &mut weighed)?;
+                    place.weigh(&by, true, &views, &mut weighed)?;
+                    Ok((place.take(images)?, sums, place.take(weighed)?))
+                };
+                let ((want, sums, values), (found, others, weighed)) =
+                    (on(&Host).unwrap(), on(place.as_ref()).unwrap());
+                let case = format!("{name}, {}, {with_term} {masked} {weighted} {resident}", term.describe());
+                let off = [(&found, &want), (&weighed, &values)].map(|(a, b)| off(a, &b.mapv(f64::from)));
+                assert!(off[0] < 1e-5 && off[1] < 1e-5, "{case}: {off:?}");
+                for (want, found) in sums.iter().zip(others) {
+                    assert!(*want > 0.1 && (found / want - 1.0).abs() < 1e-5, "{case}: {found} and {want}");
+                }
+            }
+        }
+    }
+}
+
+/// Three updates with gradients and masks in a place and on the host; the largest difference of each array as a share of
+/// the array's largest number. `change` changes the penalty in the place.
+fn updates_differ(
+    place: &Arc<dyn Place>,
+    prior: &Value,
+    [pulled, masked]: [bool; 2],
+    tau: f32,
+    change: fn(Box<dyn Penalty>) -> Box<dyn Penalty>,
+) -> conefield_core::Result<f64> {
+    let g = geometry();
+    let on = |place: &Arc<dyn Place>| {
+        let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: g.volume.shape }, place.clone());
+        let spec: Box<dyn RegularizerSpec> = serde_json::from_value(prior.clone()).unwrap();
+        spec.build().unwrap().on(&g.volume, &space)
+    };
+    let run = |place: &Arc<dyn Place>, mut penalty: Box<dyn Penalty>| -> conefield_core::Result<Vec<Array3<f32>>> {
+        let adopt = |seed| place.adopt(numbers(g.volume.shape, seed).mapv(|v| v as f32));
+        let (mut x, mut ahead, towards) = (adopt(1)?, adopt(2)?, adopt(3)?);
+        let mut kept = Array3::from_elem(g.volume.shape, true);
+        kept.iter_mut().step_by(7).for_each(|inside| *inside = false);
+        let inside = place.mask(kept)?;
+        let mut numbers = vec![];
+        for seed in 10..13 {
+            numbers.extend(place.adapt(penalty.as_mut(), &x)?);
+            let mut gradient = place.adopt(volume(g.volume.shape, seed))?;
+            let step = Step {
+                gradient: &mut gradient,
+                ahead: &mut ahead,
+                x: &mut x,
+                towards: pulled.then_some((&towards, 0.2)),
+                inside: masked.then_some(&inside),
+                step: 0.3,
+                momentum: 0.6,
+                tau,
+            };
+            place.update(step, penalty.as_mut())?;
+            numbers.push(place.penalty(penalty.as_mut(), &x)?);
+        }
+        let state = penalty.state().iter().map(|(_, part)| Ok(part.read(place.as_ref())?.into_owned()));
+        let state = state.collect::<conefield_core::Result<Vec<Vec<f32>>>>()?;
+        let state = state.into_iter().map(|p| Array3::from_shape_vec(g.volume.shape, p).unwrap());
+        // Each number in an array of its own.
+        let numbers = numbers.into_iter().map(|x| Array3::from_elem((1, 1, 1), x as f32));
+        Ok([place.take(x)?, place.take(ahead)?].into_iter().chain(state).chain(numbers).collect())
+    };
+    let host: Arc<dyn Place> = Arc::new(Host);
+    let (want, found) = (run(&host, on(&host)?)?, run(place, change(on(place)?))?);
+    assert_eq!(want.len(), found.len());
+    Ok(want.iter().zip(&found).map(|(want, found)| off(found, &want.mapv(f64::from))).fold(0.0, f64::max))
+}
+
+#[test]
+fn updates_in_a_place_are_those_of_the_host() {
+    let priors = [
+        json!({"type": "none"}),
+        json!({"type": "total-variation", "inner": 3}),
+        json!({"type": "directional-total-variation", "edge": 0.5, "inner": 4}),
+    ];
+    for (name, place) in places("updates") {
+        for prior in &priors {
+            for [pulled, masked] in [[false, false], [true, false], [false, true], [true, true]] {
+                for tau in [0.0, 0.2] {
+                    let off = updates_differ(&place, prior, [pulled, masked], tau, |p| p).unwrap();
+                    println!("{}, pull {pulled}, mask {masked}, weight {tau}, {name}: {off:.1e}", prior["type"]);
+                    assert!(off < LIMIT, "{prior}, pull {pulled}, mask {masked}, weight {tau}, {name}: {off}");
+                    // On the host in between, as a penalty without WGSL.
+                    let off = updates_differ(&place, prior, [pulled, masked], tau, |p| Box::new(OnHost(p)));
+                    match prior["type"].as_str() {
+                        Some("none") => assert!(off.unwrap() < LIMIT, "{prior}, {name}"),
+                        // Its arrays are on the device.
+                        _ if place.device().is_some() => {}
+                        _ => assert_eq!(off.unwrap(), 0.0),
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// A penalty without kernels.
+struct OnHost(Box<dyn Penalty>);
+impl Penalty for OnHost {
+    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
+        self.0.value(x)
+    }
+    fn adapts(&self) -> bool {
+        self.0.adapts()
+    }
+    fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
+        self.0.adapt(x)
+    }
+    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
+        self.0.prox(v, tau, u);
+    }
+    fn state(&mut self) -> Vec<(&str, State<'_>)> {
+        self.0.state()
+    }
+}
+
+/// A penalty whose WGSL is changed.
+struct Rewritten(Box<dyn Penalty>, fn(&str) -> String);
+impl Penalty for Rewritten {
+    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
+        self.0.value(x)
+    }
+    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
+        self.0.prox(v, tau, u);
+    }
+    fn state(&mut self) -> Vec<(&str, State<'_>)> {
+        self.0.state()
+    }
+    fn kernels(&mut self) -> Option<Kernels<'_>> {
+        let change = self.1;
+        self.0.kernels().map(|kernels| match kernels {
+            Kernels::Dual(dual) => {
+                Kernels::Dual(Dual { fragment: Fragment { source: change(&dual.fragment.source) }, ..dual })
+            }
+            Kernels::Clip => Kernels::Clip,
+        })
+    }
+}
+
+#[test]
+fn a_perturbed_prior_is_found_and_one_without_wgsl_travels() {
+    let Some((_, backend)) = crate::device::backends("negative controls").into_iter().next() else { return };
+    let (place, prior) = (backend.place(), json!({"type": "total-variation"}));
+    let differ = |change| updates_differ(&place, &prior, [false; 2], 0.2, change);
+    let wrong = differ(|p| Box::new(Rewritten(p, |s| s.replace("p + d", "p + 1.01 * d"))));
+    assert!(wrong.unwrap() > LIMIT);
+    let wrong = differ(|p| Box::new(Rewritten(p, |s| s.replace("return length(d)", "return 1.01 * length(d)"))));
+    assert!(wrong.unwrap() > LIMIT);
+    let e = differ(|p| Box::new(Rewritten(p, |s| s.replace("let q", "let r")))).unwrap_err().to_string();
+    assert!(e.contains("penalty") && e.contains("line"), "{e}");
+}
+
+#[test]
+fn slopes_of_total_variation_are_those_of_the_host() {
+    let (shape, g) = ([11, 7, 9], [1.0, 0.7, 1.3]);
+    let descended = |place: &dyn Place| {
+        let (mut x, mut work) = (place.adopt(volume(shape, 4)).unwrap(), place.zeros(shape).unwrap());
+        descend(place, &mut x, g, 0.5, 0.1, &mut work).unwrap();
+        place.take(x).unwrap()
+    };
+    let want = descended(&Host).mapv(f64::from);
+    assert!(off(&volume(shape, 4), &want) > 0.01);
+    for (name, place) in places("slopes") {
+        let off = off(&descended(place.as_ref()), &want);
+        assert!(off < 1e-5, "{name}: {off}");
+    }
+}
+
+/// Keeps what a run notes.
+struct Notes(Vec<String>);
+impl Observer for Notes {
+    fn progress(&mut self, _: u64, _: f64, _: f64) {}
+    fn record(&mut self, _: &Record) {}
+    fn note(&mut self, line: &str) {
+        self.0.push(line.into());
+    }
+}
+
+fn notes(method: &Value, backend: &dyn Backend) -> Vec<String> {
+    let (scan, mut notes) = (scan(), Notes(vec![]));
+    let mut plan = plan(&spec(method).unwrap(), backend, &Weights::default()).unwrap();
+    plan.run(&Job { seed: 7, ..Job::new(&scan, backend) }, &mut notes).unwrap();
+    notes.0
+}
+
+#[test]
+fn volumes_stay_on_the_device_also_across_a_checkpoint() {
+    let method = json!({
+        "type": "fista", "basis": {"type": "cubic", "spacing": 1.5}, "stop": {"passes": 6}, "subsets": 4,
+        "prior": {"type": "directional-total-variation"}, "scene": {"support": "carve"},
+    });
+    for (name, backend) in crate::device::backends("checkpoints of volumes") {
+        let said = notes(&method, &backend);
+        assert!(said.iter().any(|n| n.contains(", on ")), "{name}: {said:?}");
+        assert!(!said.iter().any(|n| n.contains("runs on the CPU")), "{name}: {said:?}");
+        let scan = scan();
+        let mut plan = plan(&spec(&method).unwrap(), &backend, &Weights::default()).unwrap();
+        let job = Job { seed: 7, ..Job::new(&scan, &backend) };
+        let whole = plan.run(&job, &mut Notes(vec![])).unwrap().result.volume(&backend).unwrap().data;
+        let mut stop = Stop::at(3);
+        let _ = plan.run(&job, &mut stop);
+        let kept = stop.kept.expect("a checkpoint");
+        assert_eq!(kept.standing.step, 3);
+        let resumed = Job { resume: Some(&kept), ..job };
+        let resumed = plan.run(&resumed, &mut Notes(vec![])).unwrap().result.volume(&backend).unwrap().data;
+        let error = off(&resumed, &whole.mapv(f64::from));
+        println!("{name}: {error:.1e}");
+        assert!(error < 1e-4, "{name}: {error}");
+        // A run that forgets its momentum ends elsewhere.
+        let (fresh, _) = solve_on(&backend, &json!({"type": "chain", "methods": [
+            {"type": "fista", "basis": method["basis"], "stop": {"passes": 3}, "subsets": 4, "prior": method["prior"], "scene": method["scene"]},
+            {"type": "fista", "basis": method["basis"], "stop": {"passes": 3}, "subsets": 4, "prior": method["prior"], "scene": method["scene"]},
+        ]}), &scan, &Weights::default()).unwrap();
+        let fresh = fresh.result.volume(&backend).unwrap().data;
+        assert!(off(&fresh, &whole.mapv(f64::from)) > 1e-3, "{name}");
+    }
+}
+
+fn psnr(spec: &Value, backend: &dyn Backend) -> f64 {
+    let (solution, _) = solve_on(backend, spec, &scan(), &Weights::default()).unwrap();
+    let (found, truth) = (solution.result.volume(backend).unwrap(), truth());
+    let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
+    let mse = found.data.iter().zip(&truth.data).map(square).sum::<f64>() / truth.data.len() as f64;
+    decibels(mse)
+}
+
+fn decibels(mse: f64) -> f64 {
+    10.0 * (0.02f64.powi(2) / mse).log10()
+}
+
+#[test]
+fn classical_methods_end_where_the_cpu_does() {
+    let methods = [
+        json!({"type": "fdk"}),
+        json!({"type": "fdk", "window": "hann", "cutoff": 0.8, "nonnegative": true}),
+        json!({"type": "sart", "stop": {"passes": 3}}),
+        json!({"type": "sart", "subsets": 3, "stop": {"passes": 3}, "scene": {"support": "carve"}}),
+        json!({"type": "cgls", "stop": {"passes": 5}}),
+        json!({"type": "asd-pocs", "stop": {"passes": 5}}),
+        json!({"type": "fista", "prior": {"type": "total-variation"}, "stop": {"passes": 5}}),
+        json!({"type": "fista", "prior": {"type": "directional-total-variation"}, "stop": {"passes": 5},
+            "basis": {"type": "cubic", "spacing": 1.5}, "scene": {"support": "carve"}}),
+    ];
+    // On the CPU, wherever this runs: a method that makes next to nothing would agree with anything.
+    let empty = decibels(truth().data.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / truth().data.len() as f64);
+    let on_cpu: Vec<f64> = methods.iter().map(|m| psnr(m, &Cpu::new())).collect();
+    for (method, cpu) in methods.iter().zip(&on_cpu) {
+        println!("{}: {cpu:.4} dB, an empty volume {empty:.4} dB", method["type"]);
+        assert!(*cpu > empty + 3.0, "{method}: {cpu} dB, an empty volume {empty} dB");
+    }
+    for (name, backend) in crate::device::backends("classical methods") {
+        for (method, cpu) in methods.iter().zip(&on_cpu) {
+            let found = psnr(method, &backend);
+            println!("{}, {name}: {found:.4} dB, CPU {cpu:.4} dB", method["type"]);
+            assert!((cpu - found).abs() < 0.01, "{method}, {name}: {found} dB, CPU {cpu} dB");
+        }
+    }
+}
+
+/// A scan large enough for its arrays to stand out among what else is moved.
+fn larger() -> Scan {
+    let data = Array3::from_shape_fn((40, 44, 48), |(x, y, z)| {
+        let d = [x as f32 - 19.5, y as f32 - 21.5, z as f32 - 23.5];
+        f32::from(u8::from(d.iter().map(|v| v * v).sum::<f32>() < 300.0)) * 0.01
+    });
+    let protocol: Protocol = serde_json::from_value(json!({
+        "dso": 500.0, "dsd": 750.0, "detector": [56, 64], "extent": {"side": [280.0, 280.0]},
+        "angles": {"even": {"views": 24}},
+    }))
+    .unwrap();
+    simulate(&Volume::centered(data, [4.0; 3]), &protocol).unwrap()
+}
+
+/// Bytes that a run moves to the device and from it.
+fn moved(method: &Value, scan: &Scan, backend: &dyn Backend) -> [f64; 2] {
+    let before = backend.moved();
+    solve_on(backend, method, scan, &Weights::default()).unwrap();
+    let after = backend.moved();
+    [after.to_device - before.to_device, after.from_device - before.from_device].map(|bytes| bytes as f64)
+}
+
+#[test]
+fn a_pass_moves_scalars_and_a_run_its_views_and_its_volume() {
+    let scan = larger();
+    let (views, volume) =
+        (4.0 * scan.projections.len() as f64, 4.0 * scan.geometry.volume.shape.iter().product::<usize>() as f64);
+    let tv = json!({"type": "total-variation"});
+    let methods = [
+        json!({"type": "sart", "subsets": 4}),
+        json!({"type": "sart", "subsets": 1}),
+        json!({"type": "cgls"}),
+        json!({"type": "asd-pocs", "subsets": 4, "descents": 5}),
+        json!({"type": "fista", "subsets": 4, "prior": tv, "scene": {"support": "carve"}}),
+        json!({"type": "fista", "subsets": 4, "prior": {"type": "directional-total-variation"},
+            "basis": {"type": "cubic", "spacing": 1.5}}),
+    ];
+    for (name, backend) in crate::device::backends("moved bytes") {
+        if name == "small buffers" {
+            continue;
+        }
+        let [up, down] = moved(&json!({"type": "fdk"}), &scan, &backend);
+        println!("fdk, {name}: {:.3} of the views up, {:.3} of the volume down", up / views, down / volume);
+        assert!(up > views && up < 1.05 * views && down == volume, "{name}: {up} and {down} bytes");
+        for method in &methods {
+            let after = |passes: u64| {
+                let mut method = method.clone();
+                method["stop"] = json!({"passes": passes});
+                moved(&method, &scan, &backend)
+            };
+            let (two, four) = (after(2), after(4));
+            let pass: [f64; 2] = std::array::from_fn(|k| 0.5 * (four[k] - two[k]));
+            println!(
+                "{method}, {name}: {:.3} of the views up, {:.3} of the volume down; a pass {:.3} and {:.3}",
+                two[0] / views,
+                two[1] / volume,
+                pass[0] / views,
+                pass[1] / volume
+            );
+            assert!(pass[0] < 0.1 * views && pass[1] < 0.05 * volume, "{method}, {name}: {pass:?} bytes in a pass");
+            // FISTA estimates its noise on one subset; a coarser basis has fewer coefficients to bring down.
+            assert!(two[0] > views && two[0] < 1.6 * views, "{method}, {name}: {} bytes up", two[0]);
+            assert!(two[1] < 1.15 * volume, "{method}, {name}: {} bytes down", two[1]);
+        }
+        // The test sees what travels.
+        let start = json!({"type": "sart", "subsets": 4, "stop": {"passes": 2, "patience": 1}});
+        let held_out = scan.clone();
+        let before = backend.moved();
+        let mut plan = plan(&spec(&start).unwrap(), &backend, &Weights::default()).unwrap();
+        let job = Job { held_out: Some(&held_out), ..Job::new(&scan, &backend) };
+        plan.run(&job, &mut Notes(vec![])).unwrap();
+        let down = (backend.moved().from_device - before.from_device) as f64;
+        assert!(down > volume + 1.9 * views, "{name}: records of held-out views bring them down: {down}");
+    }
+}
