@@ -62,7 +62,8 @@ fn main() -> Result<()> {
     };
     let (driven, driven_tilted) = (drive(&geometry), drive(&turned));
     let header = ScanHeader { views: 0, detector: [0; 2], volume: geometry.volume.shape };
-    let mut prox = TvProx::new(geometry.volume.shape, [1.0; 3], &Space::new(header, Arc::new(Host))).unwrap();
+    let mut prox =
+        TvProx::new(geometry.volume.shape, [1.0; 3], &Space::new(header, std::sync::Arc::new(Host))).unwrap();
     let (noisy, mut smooth) = (volume.as_slice().unwrap_or_default(), vec![0.0; volume.len()]);
     let dual = times(RUNS, || prox.apply(noisy, 0.1, STEPS, &mut smooth));
     let mut arrays: [Vec<f32>; 3] = std::array::from_fn(|_| noisy.to_vec());

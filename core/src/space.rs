@@ -63,6 +63,12 @@ impl Space {
         if self.tally { Host.zeros([0; 3]) } else { self.place.zeros(shape) }
     }
 
+    /// Zeros in the host's memory, for a stage that works there wherever the arrays are.
+    pub fn on_host(&self, count: usize) -> Vec<f32> {
+        self.hold((count as u64).saturating_mul(size_of::<f32>() as u64));
+        vec![0.0; if self.tally { 0 } else { count }]
+    }
+
     /// Counts bytes held from now on.
     pub fn hold(&self, bytes: u64) {
         let held = self.held.get().saturating_add(bytes);

@@ -54,21 +54,23 @@ impl Weighing<'_> {
         }
         let residual = images.slice(s![..views.len(), .., ..]);
         let residual = residual.as_slice().map_or_else(|| unreachable!("images follow each other"), squares);
+        [residual, self.derivative(views, images, weights).unwrap_or(0.5 * residual)]
+    }
+
+    /// Replaces residuals r with weights·φ'(r), on the host. Returns `Σ φ(r)`, if there is a data term.
+    pub fn derivative(
+        &self,
+        views: &[usize],
+        images: &mut Array3<f32>,
+        weights: Option<&CowArray<'_, f32, Ix3>>,
+    ) -> Option<f64> {
+        let misfits = self.term.map(|term| self.each_image(views, images, |view, p, r| term.differentiate(view, p, r)));
         if let Some(weights) = weights {
             for (mut image, &v) in images.axis_iter_mut(Axis(0)).zip(views) {
                 image.zip_mut_with(&weights.index_axis(Axis(0), v), |r, w| *r *= w);
             }
         }
-        if self.term.is_none() {
-            return [residual, 0.5 * residual];
-        }
-        [residual, self.differentiate(views, images)]
-    }
-
-    /// Replaces residuals r with φ'(r), on the host. Returns `Σ φ(r)`.
-    pub fn differentiate(&self, views: &[usize], images: &mut Array3<f32>) -> f64 {
-        let Some(term) = self.term else { return 0.0 };
-        self.each_image(views, images, |view, p, r| term.differentiate(view, p, r)).iter().sum()
+        misfits.map(|m| m.iter().sum())
     }
 
     /// [`super::Place::weigh`] on the host.

@@ -1,5 +1,7 @@
-    // Compensated (Kahan): a lane may add thousands of numbers.
-    let y = v - lost;
-    let t = total + y;
-    lost = (t - total) - y;
-    total = t;
+{
+            // Compensated (Kahan): a lane may add thousands of numbers.
+            let part = v - lost;
+            let next = total + part;
+            lost = (next - total) - part;
+            total = next;
+        }

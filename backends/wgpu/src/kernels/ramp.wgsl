@@ -28,17 +28,17 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
         let c = 64u * (tile % across) + lane;
         let inside = c > 0u && c <= back.columns;
         var sum = vec4<f32>();
-        for (var from = 0u; from < back.columns; from += PIECE) {
+        for (var start = 0u; start < back.columns; start += PIECE) {
             for (var k = lane; k < PIECE; k += 64u) {
                 var found = vec4<f32>();
-                if from + k < back.columns { found = four(view, r, from + k); }
+                if start + k < back.columns { found = four(view, r, start + k); }
                 piece[k] = found;
             }
             workgroupBarrier();
             if inside {
-                let most = min(PIECE, back.columns - from);
+                let most = min(PIECE, back.columns - start);
                 for (var k = 0u; k < most; k++) {
-                    sum += taps[u32(abs(i32(c - 1u) - i32(from + k)))] * piece[k];
+                    sum += taps[u32(abs(i32(c - 1u) - i32(start + k)))] * piece[k];
                 }
             }
             workgroupBarrier();

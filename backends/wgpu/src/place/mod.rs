@@ -207,12 +207,15 @@ impl Place for DevicePlace {
         match by.term.map(|term| term.wgsl()) {
             Some(None) => {
                 // The data term runs on the host, on residuals.
-                let residual = Weighing { term: None, ..*by };
-                let sums = pixels::compare(self, &residual, None, views, images)?;
+                let residual = Weighing { term: None, weights: None, ..*by };
+                let [residual, _] = pixels::compare(self, &residual, None, views, images)?;
+                let weights = by.weights.map(|w| self.read(w)).transpose()?;
                 let mut misfit = 0.0;
-                self.change(images, &mut |images| misfit = by.differentiate(views, images))?;
+                self.change(images, &mut |images| {
+                    misfit = by.derivative(views, images, weights.as_ref()).unwrap_or_default();
+                })?;
                 by.fault()?;
-                Ok([sums[0], misfit])
+                Ok([residual, misfit])
             }
             term => pixels::compare(self, by, term.flatten().as_ref(), views, images),
         }

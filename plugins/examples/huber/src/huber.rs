@@ -44,7 +44,7 @@ impl Regularizer for Huber {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         let side = grid.spacing.iter().product::<f64>().cbrt();
         let scale = grid.spacing.map(|s| (side / s) as f32);
-        let dual = [0, 1, 2].map(|_| space.array(grid.shape).into_raw_vec_and_offset().0);
+        let dual = [0, 1, 2].map(|_| space.on_host(grid.shape.iter().product()));
         Ok(Box::new(On { shape: grid.shape, scale, threshold: self.threshold as f32, inner: self.inner, dual }))
     }
 
@@ -133,8 +133,8 @@ impl Penalty for On {
         self.primal(v, tau, u);
     }
 
-    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
+    fn state(&mut self) -> Vec<(&str, State<'_>)> {
         let [x, y, z] = &mut self.dual;
-        vec![("dual.x", x), ("dual.y", y), ("dual.z", z)]
+        [("dual.x", x), ("dual.y", y), ("dual.z", z)].map(|(name, p)| (name, State::Host(p))).into()
     }
 }
