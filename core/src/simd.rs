@@ -55,9 +55,9 @@ pub trait Real:
     /// order. If they span less than four vectors, and `line` is long enough from the first one, registers are shuffled
     /// instead of reading memory lane by lane.
     fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
-    /// `K` neighbours of every lane within the first two vectors of `line`: `line[at]`, `line[at + 1]`, … The lanes of
-    /// `at` are integers, and all neighbours are in range.
-    fn window<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
+    /// `K` neighbours of every lane within the first `W` vectors of `line`, 2 to 4: `line[at]`, `line[at + 1]`, … The
+    /// lanes of `at` are integers, and all neighbours are in range.
+    fn window<S: Simd, const K: usize, const W: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
     /// Whether the number is neither infinite nor NaN.
     fn finite(self) -> bool;
     /// Exponential of every lane.
@@ -122,50 +122,32 @@ impl Real for f32 {
         let (first, last) = (at.as_slice()[0], at.as_slice()[len - 1]);
         let base = first as usize;
         let span = (last - first) as usize + K;
-        let register = |k: usize| S::f32s::from_slice(s, &line[base + k * len..base + (k + 1) * len]);
         let lane = at - first;
         if span <= 2 * len && base + 2 * len <= line.len() {
-            return Self::window(s, &line[base..], lane);
+            return Self::window::<S, K, 2>(s, &line[base..], lane);
         }
-        // The four bytes of every lane's index.
-        let number: S::u32s = lane.to_int();
-        let mut bytes = number * 0x0404_0404 + 0x0302_0100;
         if span <= 4 * len && base + 4 * len <= line.len() {
-            let near = [register(0), register(1)];
-            let far = [register(2), register(3)];
-            // Indices into the far two registers count from their start; those into the near two are ignored.
-            let start = S::u32s::splat(s, 0x0101_0101 * (8 * len) as u32);
-            let mut all = [lane; K];
-            for (k, taken) in all.iter_mut().enumerate() {
-                let a = near[0].concat_swizzle_dyn(near[1], bytes.to_bytes());
-                let b = far[0].concat_swizzle_dyn(far[1], (bytes - start).to_bytes());
-                bytes += 0x0404_0404;
-                *taken = lane.simd_ge(S::f32s::splat(s, (2 * len - k) as f32)).select(b, a);
-            }
-            return all;
+            return Self::window::<S, K, 4>(s, &line[base..], lane);
         }
         one_by_one(s, line, at)
     }
     #[inline(always)]
-    fn window<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+    fn window<S: Simd, const K: usize, const W: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
         let len = S::f32s::LEN;
-        let (low, high) = (S::f32s::from_slice(s, &line[..len]), S::f32s::from_slice(s, &line[len..2 * len]));
-        let mut number: S::u32s = at.to_int();
-        let mut all = [low; K];
-        #[cfg(target_arch = "x86_64")]
-        if let Level::Avx512(avx512) = s.level() {
-            for taken in &mut all {
-                *taken = wide::take::<S>(s, avx512, low, high, number);
-                number += 1;
-            }
-            return all;
-        }
-        // The four bytes of every lane's index.
-        let mut bytes = number * 0x0404_0404 + 0x0302_0100;
+        let line = &line[..W * len];
+        let register = |k: usize| S::f32s::from_slice(s, &line[k.min(W - 1) * len..][..len]);
+        let (near, far) = ([register(0), register(1)], [register(2), register(3)]);
+        let first = numbers::<S>(at);
+        let mut all = [at; K];
         // A loop: a closure might not be inlined into the code for an instruction set.
-        for taken in &mut all {
-            *taken = low.concat_swizzle_dyn(high, bytes.to_bytes());
-            bytes += 0x0404_0404;
+        for (k, taken) in all.iter_mut().enumerate() {
+            let number = first + k as u32;
+            *taken = pick::<S>(s, near[0], near[1], number);
+            if W > 2 {
+                // Indices into the far vectors count from their start; those into the near two are ignored.
+                let far = pick::<S>(s, far[0], far[1], number - 2 * len as u32);
+                *taken = at.simd_ge(S::f32s::splat(s, (2 * len - k) as f32)).select(far, *taken);
+            }
         }
         all
     }
@@ -310,7 +292,7 @@ impl Real for f64 {
         one_by_one(s, line, at)
     }
     #[inline(always)]
-    fn window<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+    fn window<S: Simd, const K: usize, const W: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
         one_by_one(s, line, at)
     }
     #[inline(always)]
@@ -357,21 +339,51 @@ impl Real for f64 {
     }
 }
 
-/// Single instructions of AVX-512 that take several on other instruction sets.
+/// Every lane, an integer below 2³¹, as an integer. (Conversion to `u32` also looks for larger ones.)
+#[inline(always)]
+fn numbers<S: Simd>(x: S::f32s) -> S::u32s {
+    let signed: S::i32s = x.to_int();
+    signed.bitcast()
+}
+
+/// The element of `low` followed by `high` at the index in each lane of `number`.
+#[inline(always)]
+fn pick<S: Simd>(s: S, low: S::f32s, high: S::f32s, number: S::u32s) -> S::f32s {
+    #[cfg(target_arch = "x86_64")]
+    match s.level() {
+        Level::Avx512(avx512) => return wide::pick16::<S>(s, avx512, low, high, number),
+        Level::Avx2(avx2) => return wide::pick8::<S>(s, avx2, low, high, number),
+        _ => (),
+    }
+    // The four bytes of every lane's index.
+    low.concat_swizzle_dyn(high, (number * 0x0404_0404 + 0x0302_0100).to_bytes())
+}
+
+/// Single instructions of AVX2 and AVX-512 that take several otherwise.
 #[cfg(target_arch = "x86_64")]
 // The macro calls instructions that its token proves available.
 #[allow(unsafe_code)]
 mod wide {
     use super::{Simd, SimdBase};
-    use fearless_simd::x86::Avx512;
-    use fearless_simd::{SimdFrom, f32x16, kernel, u32x16};
-    use std::arch::x86_64::{__m512, __m512i, _mm512_permutex2var_ps, _mm512_rsqrt14_ps};
+    use fearless_simd::x86::{Avx2, Avx512};
+    use fearless_simd::{SimdFrom, f32x8, f32x16, kernel, u32x8, u32x16};
+    use std::arch::x86_64::*;
 
     kernel!(
         #[inline(always)]
-        fn permute(token: Avx512, low: __m512, number: __m512i, high: __m512) -> __m512 {
+        fn permute16(token: Avx512, low: __m512, number: __m512i, high: __m512) -> __m512 {
             let _ = token;
             _mm512_permutex2var_ps(low, number, high)
+        }
+    );
+
+    kernel!(
+        #[inline(always)]
+        fn permute8(token: Avx2, low: __m256, number: __m256i, high: __m256) -> __m256 {
+            let _ = token;
+            // Each permutation reads the lowest three bits of a number; the fourth becomes a sign, which selects.
+            let [a, b] = [low, high].map(|x| _mm256_permutevar8x32_ps(x, number));
+            _mm256_blendv_ps(a, b, _mm256_castsi256_ps(_mm256_slli_epi32::<28>(number)))
         }
     );
 
@@ -390,12 +402,20 @@ mod wide {
         S::f32s::from_slice(s, f32x16::simd_from(avx512, rsqrt(avx512, x)).as_slice())
     }
 
-    /// The element of `low` followed by `high` at the index in each lane of `number`.
+    /// [`pick`](super::pick) of 16 lanes.
     #[inline(always)]
-    pub(super) fn take<S: Simd>(s: S, avx512: Avx512, low: S::f32s, high: S::f32s, number: S::u32s) -> S::f32s {
+    pub(super) fn pick16<S: Simd>(s: S, avx512: Avx512, low: S::f32s, high: S::f32s, number: S::u32s) -> S::f32s {
         let [low, high] = [low, high].map(|x| f32x16::from_slice(avx512, x.as_slice()).into());
         let number = u32x16::from_slice(avx512, number.as_slice()).into();
-        S::f32s::from_slice(s, f32x16::simd_from(avx512, permute(avx512, low, number, high)).as_slice())
+        S::f32s::from_slice(s, f32x16::simd_from(avx512, permute16(avx512, low, number, high)).as_slice())
+    }
+
+    /// [`pick`](super::pick) of 8 lanes.
+    #[inline(always)]
+    pub(super) fn pick8<S: Simd>(s: S, avx2: Avx2, low: S::f32s, high: S::f32s, number: S::u32s) -> S::f32s {
+        let [low, high] = [low, high].map(|x| f32x8::from_slice(avx2, x.as_slice()).into());
+        let number = u32x8::from_slice(avx2, number.as_slice()).into();
+        S::f32s::from_slice(s, f32x8::simd_from(avx2, permute8(avx2, low, number, high)).as_slice())
     }
 }
 

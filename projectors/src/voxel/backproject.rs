@@ -2,19 +2,21 @@
 //!
 //! Every voxel receives `Σ_i s_i/U_i²·p_i(u, v)`: `U_i` is its depth in view `i`, `p_i` is interpolated bilinearly
 //! where the ray through the voxel's centre meets the detector; pixels outside the detector are 0. The voxels of a line
-//! along z project to a line on the detector and read columns of pixels as described in `readers`.
+//! along z project to a line on the detector and read columns of pixels as described in `readers`; those that run along
+//! the columns are faster, as described in `upright`.
 
 use super::layout::{ColumnMajor, Pinhole};
 use super::readers::{Among, Ends, PAD, Path, Stands, places, read};
+use super::upright::{Blend, Upright};
 use conefield_core::geometry::Geometry;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, WIDEST, run};
 use conefield_core::voxel::VoxelView;
-use ndarray::{ArrayViewMut3, Axis};
+use ndarray::{ArrayViewMut3, Axis, s};
 use rayon::prelude::*;
 
-/// Lines of voxels per task, along x and along y. A tile, and the columns of pixels that it meets in a view, stay in a
-/// core's cache while all views are added; whole planes of voxels would meet most columns of each view.
-const TILE: usize = 32;
+/// Lines of voxels per task, along x and along y. A tile of 512 voxels along z, and the columns of pixels that it meets in
+/// a view, take a quarter of a MiB and stay in a core's cache while all views are added.
+const TILE: usize = 8;
 /// Largest slant of a line of voxels: change in columns per change in rows. Steeper lines are processed voxel by voxel.
 const SLANT: f64 = 0.5;
 
@@ -28,6 +30,7 @@ pub fn backproject<R: Real>(
 ) {
     let seen = |(&v, &scale): (&usize, &f64)| Pinhole::of(geometry, v).voxels(&geometry.volume, scale);
     let all: Vec<VoxelView> = views.iter().zip(scales).map(seen).collect();
+    let shape = geometry.volume.shape;
     let zeros = vec![R::ZERO; geometry.detector[0] + 2 * PAD];
     let mut tiles = vec![];
     for (i, mut rest) in volume.axis_chunks_iter_mut(Axis(0), TILE).enumerate() {
@@ -39,7 +42,7 @@ pub fn backproject<R: Real>(
         }
     }
     tiles.into_par_iter().for_each(|(first, lines)| {
-        run(Tile { detector: geometry.detector, pixels, zeros: &zeros, views: &all, first, lines });
+        run(Tile { detector: geometry.detector, pixels, zeros: &zeros, views: &all, shape, first, lines });
     });
 }
 
@@ -50,6 +53,8 @@ struct Tile<'a, R> {
     /// A column of pixels outside the detector.
     zeros: &'a [R],
     views: &'a [VoxelView],
+    /// Shape of the volume.
+    shape: [usize; 3],
     /// Its first line.
     first: [usize; 2],
     lines: ArrayViewMut3<'a, R>,
@@ -60,19 +65,26 @@ impl<R: Real> Op for Tile<'_, R> {
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(self, s: S) {
-        let Self { detector, pixels, zeros, views, first, mut lines } = self;
-        let nz = lines.dim().2;
+        let Self { detector, pixels, zeros, views, shape, first, mut lines } = self;
+        let (nx, ny, nz) = lines.dim();
         let mut q = vec![R::ZERO; nz.next_multiple_of(V::<S, R>::LEN)];
         let (mut stands, mut ends) = (Stands::new(q.len() / V::<S, R>::LEN), Ends::default());
+        let mut blend = Blend::default();
         for (index, view) in views.iter().enumerate() {
             let image = Image { view, detector, pixels, index, zeros };
-            for (x, mut plane) in lines.outer_iter_mut().enumerate() {
-                for (y, line) in plane.outer_iter_mut().enumerate() {
-                    let Some(voxels) = line.into_slice() else { continue };
-                    match Line::of(&image, [first[0] + x, first[1] + y], nz) {
-                        Some(line) => image.add(s, &line, &mut q, (&mut ends, &mut stands), voxels),
-                        None => image.add_one_by_one([first[0] + x, first[1] + y], voxels),
-                    }
+            let upright = Upright::of(&image, shape, V::<S, R>::LEN);
+            // Successive lines read nearby columns, which are then still in the nearest cache.
+            let along_x = view.column[1].abs() < view.column[2].abs();
+            for i in 0..nx * ny {
+                let [x, y] = if along_x { [i % nx, i / nx] } else { [i / ny, i % ny] };
+                let Some(voxels) = lines.slice_mut(s![x, y, ..]).into_slice() else { continue };
+                let at = [first[0] + x, first[1] + y];
+                if let Some(view) = &upright {
+                    view.add(s, at, voxels, &mut blend);
+                } else if let Some(line) = Line::of(&image, at, nz) {
+                    image.add(s, &line, &mut q, (&mut ends, &mut stands), voxels);
+                } else {
+                    image.add_one_by_one(at, voxels);
                 }
             }
         }
@@ -116,16 +128,26 @@ impl Line {
 }
 
 /// The pixels of a view.
-struct Image<'a, R> {
-    view: &'a VoxelView,
-    detector: [usize; 2],
-    pixels: &'a ColumnMajor<R>,
+pub(super) struct Image<'a, R> {
+    pub view: &'a VoxelView,
+    pub detector: [usize; 2],
+    pub pixels: &'a ColumnMajor<R>,
     /// Its index in `pixels`.
-    index: usize,
+    pub index: usize,
+    /// A column of pixels outside the detector.
     zeros: &'a [R],
 }
 
-impl<R: Real> Image<'_, R> {
+impl<'a, R: Real> Image<'a, R> {
+    /// A column of pixels, counted from column −1.
+    #[inline(always)]
+    pub fn column(&self, column: usize) -> &'a [R] {
+        match column.checked_sub(1) {
+            Some(c) if c < self.detector[1] => self.pixels.column(self.index, c),
+            _ => self.zeros,
+        }
+    }
+
     /// Adds to `voxels` the values that they read on their line; `q`, `ends` and `stands` are buffers.
     #[inline(always)]
     fn add<S: Simd>(
@@ -147,10 +169,6 @@ impl<R: Real> Image<'_, R> {
         let path = line.path.narrow();
         ends.find(q, len);
         stands.place(&path, &among, ends, len);
-        let column = |c: usize| match c.checked_sub(1) {
-            Some(c) if c < columns => self.pixels.column(self.index, c),
-            _ => self.zeros,
-        };
         let weight = V::<S, R>::splat(s, R::of(line.weight));
         let (bend, one) = (V::<S, R>::splat(s, R::of(-line.bend)), V::<S, R>::splat(s, R::ONE));
         // The end of a line that does not fill a vector is processed in a separate buffer.
@@ -159,7 +177,7 @@ impl<R: Real> Image<'_, R> {
         tail[..rest.len()].copy_from_slice(rest);
         for (i, q) in q.chunks_exact(len).enumerate() {
             let q = V::<S, R>::from_slice(s, q);
-            let Some(found) = read(s, &path, &among, stands, i, q, column) else { continue };
+            let Some(found) = read(s, &path, &among, stands, i, q, |c| self.column(c)) else { continue };
             let voxels = if i * len < whole.len() { &mut whole[i * len..(i + 1) * len] } else { &mut tail[..len] };
             // The ratio of the middle's depth to the voxel's is 1/(1 + bend·ρ) = 1 − bend·q.
             let nearer = q.mul_add(bend, one);

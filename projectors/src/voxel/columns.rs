@@ -699,7 +699,7 @@ impl<'a> Hit<'a> {
             let first = windows.first[i] as usize;
             let (pixels, q) = if apart * R::of((len - 1) as f64) <= near {
                 let from = first..first + 2 * len;
-                (R::window::<S, K>(s, &pixels[from.clone()], at), R::window::<S, K>(s, &q[from], at))
+                (R::window::<S, K, 2>(s, &pixels[from.clone()], at), R::window::<S, K, 2>(s, &q[from], at))
             } else {
                 let at = (at + number(R::of(first as f64))).min(most);
                 (R::neighbours::<S, K>(s, pixels, at), R::neighbours::<S, K>(s, q, at))
@@ -770,7 +770,7 @@ impl<'a> Hit<'a> {
             let cell = (apart + V::<S, R>::splat(s, windows.from[i])).floor();
             let first = windows.first[i] as usize;
             let pixels = if near {
-                R::window::<S, K>(s, &pixels[first..first + 2 * len], cell)
+                R::window::<S, K, 2>(s, &pixels[first..first + 2 * len], cell)
             } else {
                 R::neighbours::<S, K>(s, pixels, (cell + number(first as f64)).min(most))
             };

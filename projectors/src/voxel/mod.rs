@@ -6,7 +6,8 @@
 //! - [`columns`]: Joseph for views whose detector columns run along z, or nearly so, as on every circular orbit. The
 //!   rows of a column then read lines of voxels upwards, which are contiguous in memory.
 //! - [`bundles`]: Joseph for all other views.
-//! - [`backproject`]: the voxel-driven, distance-weighted back-projection of FDK. It is not an adjoint.
+//! - [`backproject`]: the voxel-driven, distance-weighted back-projection of FDK. It is not an adjoint. `upright`: the
+//!   same for detector columns along z.
 //! - [`layout`]: memory layouts of projections and volumes for all of these.
 
 pub mod backproject;
@@ -18,6 +19,7 @@ mod readers;
 mod stages;
 #[cfg(test)]
 mod tests;
+mod upright;
 pub mod walk;
 
 pub use stages::{Joseph, Siddon, Trilinear};

@@ -236,7 +236,7 @@ pub(super) fn mix<S: Simd, R: Real>(s: S, a: &[R], b: &[R], share: R, line: &mut
 #[inline(always)]
 fn between<S: Simd, R: Real>(s: S, line: &[R], stand: &Stand<S, R>) -> V<S, R> {
     let [a, b] = match stand.from {
-        Some(at) => R::window::<S, 2>(s, &line[at..at + 2 * V::<S, R>::LEN], stand.cell),
+        Some(at) => R::window::<S, 2, 2>(s, &line[at..at + 2 * V::<S, R>::LEN], stand.cell),
         None => R::neighbours::<S, 2>(s, line, stand.cell),
     };
     stand.share.mul_add(b - a, a)
