@@ -1,5 +1,6 @@
 //! Adapters and their features; an open device and its errors.
 
+use crate::staging::Staging;
 use conefield_core::error::{Error, Result};
 use conefield_core::place::Moved;
 use serde::Serialize;
@@ -186,6 +187,8 @@ pub struct Gpu {
     failed: Arc<Mutex<Option<String>>>,
     /// Bytes to the device and from it.
     moved: [AtomicU64; 2],
+    /// Buffers through which large arrays go to the device.
+    staging: Mutex<Staging>,
 }
 
 impl Gpu {
@@ -241,7 +244,7 @@ impl Gpu {
                 note(&keep, format!("the device was lost: {message}"));
             }
         });
-        Ok(Self { adapter, device, queue, failed, moved: Default::default() })
+        Ok(Self { adapter, device, queue, failed, moved: Default::default(), staging: Mutex::default() })
     }
 
     /// The first error on the device since the last call.
@@ -260,6 +263,12 @@ impl Gpu {
     pub(crate) fn write(&self, to: &wgpu::Buffer, at: u64, data: &[u8]) {
         self.moved[0].fetch_add(data.len() as u64, Ordering::Relaxed);
         self.queue.write_buffer(to, at, data);
+    }
+
+    /// The same for a part of an array, which may be large.
+    pub(crate) fn upload(&self, to: &wgpu::Buffer, at: u64, data: &[u8]) -> Result<()> {
+        self.moved[0].fetch_add(data.len() as u64, Ordering::Relaxed);
+        self.staging.lock().unwrap_or_else(PoisonError::into_inner).write(self, to, at, data)
     }
 
     /// Bytes that crossed between the host and the device.
@@ -317,6 +326,21 @@ impl Gpu {
         })
     }
 
+    /// Waits for the message that a buffer is mapped.
+    pub(crate) fn heard(
+        &self,
+        message: &mpsc::Receiver<std::result::Result<(), wgpu::BufferAsyncError>>,
+    ) -> Result<()> {
+        // The callback may come from another thread's wait, shortly after this thread's wait ends.
+        loop {
+            match message.recv_timeout(CALLBACK) {
+                Err(mpsc::RecvTimeoutError::Timeout) => self.wait()?,
+                Err(mpsc::RecvTimeoutError::Disconnected) => return Err(self.error("a buffer cannot be mapped")),
+                Ok(mapped) => return mapped.map_err(|e| self.error(e.to_string())),
+            }
+        }
+    }
+
     /// Calls `read` with the first `bytes` of `from` when the device has written them.
     pub(crate) fn read(&self, from: &wgpu::Buffer, bytes: u64, read: impl FnOnce(&[u8])) -> Result<()> {
         if bytes == 0 {
@@ -326,19 +350,7 @@ impl Gpu {
         let (sender, receiver) = mpsc::channel();
         slice.map_async(wgpu::MapMode::Read, move |r| drop(sender.send(r)));
         self.wait()?;
-        // The callback may come from another thread's wait, shortly after this thread's wait ends.
-        let mapped = loop {
-            match receiver.recv_timeout(CALLBACK) {
-                Err(mpsc::RecvTimeoutError::Timeout) => self.wait()?,
-                Err(mpsc::RecvTimeoutError::Disconnected) => break None,
-                Ok(r) => break Some(r),
-            }
-        };
-        match mapped {
-            Some(Ok(())) => {}
-            Some(Err(e)) => return Err(self.error(e.to_string())),
-            None => return Err(self.error("its result cannot be read back")),
-        }
+        self.heard(&receiver)?;
         self.moved[1].fetch_add(bytes, Ordering::Relaxed);
         let view = slice.get_mapped_range().map_err(|e| self.error(e.to_string()))?;
         read(&view);
@@ -358,7 +370,7 @@ fn note(keep: &Mutex<Option<String>>, what: String) {
 fn in_words(e: &wgpu::Error) -> String {
     match e {
         wgpu::Error::OutOfMemory { .. } => {
-            "out of memory on the device; smaller tables or fewer rays per step may fit".into()
+            "out of memory on the device; a smaller volume, smaller tables or fewer rays per step may fit".into()
         }
         other => other.to_string(),
     }

@@ -24,6 +24,7 @@ mod place;
 pub mod profile;
 pub mod single;
 pub mod source;
+mod staging;
 #[cfg(feature = "translations")]
 mod translations;
 pub mod wave;

@@ -191,6 +191,24 @@ fn a_sum_of_many_numbers_is_exact_to_single_precision() {
 }
 
 #[test]
+fn arrays_larger_than_all_staging_buffers_arrive_whole() {
+    let shape = (83, 1024, 1024);
+    let mut i = 0u32;
+    let x = Array3::from_shape_simple_fn(shape, || {
+        i = i.wrapping_add(0x9e37_79b9);
+        (i >> 8) as f32
+    });
+    for (name, place) in places("large arrays") {
+        // Small buffers refuse a plane.
+        let Ok(there) = place.adopt(x.clone()) else { continue };
+        assert!(place.read(&there).unwrap() == x, "{name}");
+        if name == "own limits" {
+            return;
+        }
+    }
+}
+
+#[test]
 fn data_terms_are_those_of_the_host() {
     let scan = scan();
     let views = [5, 2, 7];

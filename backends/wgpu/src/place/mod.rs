@@ -104,7 +104,7 @@ impl Place for DevicePlace {
             let data = from.slice(s![planes.start - first..planes.end - first, .., ..]);
             let data = data.as_standard_layout();
             let at = 4 * ((planes.start - part.planes.start) * plane) as u64;
-            self.shared.gpu.write(&part.buffer, at, bytemuck::cast_slice(data.as_slice().unwrap_or_default()));
+            self.shared.gpu.upload(&part.buffer, at, bytemuck::cast_slice(data.as_slice().unwrap_or_default()))?;
         }
         Ok(())
     }
@@ -135,7 +135,7 @@ impl Place for DevicePlace {
             let flags = flags.slice(s![planes.clone(), .., ..]);
             let words = elements::words(&flags);
             let buffer = self.shared.gpu.buffer("a mask", 4 * words.len() as u64, ARRAY)?;
-            self.shared.gpu.write(&buffer, 0, bytemuck::cast_slice(&words));
+            self.shared.gpu.upload(&buffer, 0, bytemuck::cast_slice(&words))?;
             Ok(Part { planes, buffer })
         });
         Ok(Mask::there(shape, Parts(parts.collect::<Result<_>>()?)))
