@@ -630,17 +630,28 @@ fn slope(x: &[f32], shape: [usize; 3], g: [f32; 3], unit: f32, at: [usize; 3]) -
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::place::Host;
     use conefield_core::random::{mix, unit};
     use conefield_core::scan::ScanHeader;
+    use ndarray::Array3;
+    use std::sync::Arc;
+
+    fn space(volume: [usize; 3]) -> Space {
+        Space::new(ScanHeader { views: 0, detector: [0; 2], volume }, Arc::new(Host))
+    }
 
     fn prox(shape: [usize; 3], g: [f32; 3]) -> TvProx {
-        TvProx::new(shape, g, &Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape }))
+        TvProx::new(shape, g, &space(shape)).unwrap()
+    }
+
+    /// The dual of a prior.
+    fn dual(prox: TvProx) -> [Array3<f32>; 3] {
+        prox.dual.map(|p| Host.take(p).unwrap())
     }
 
     /// The prior with the edges of `x`.
     fn with_edges(shape: [usize; 3], g: [f32; 3], x: &Array3<f32>) -> TvProx {
-        let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape });
-        let mut prox = prox(shape, g).with_edges(Edges::new(shape, 0.9, 0.7, &space));
+        let mut prox = prox(shape, g).with_edges(Edges::new(shape, 0.9, 0.7, &space(shape)).unwrap());
         assert!(prox.adapt(x.view()).is_some());
         prox
     }
@@ -697,13 +708,13 @@ mod tests {
     /// The same steps one after another, voxel by voxel; `dual` is `D·p`.
     fn plain(prox: &mut TvProx, v: &Array3<f32>, tau: f32, steps: usize) -> Array3<f32> {
         let TvProx { shape, g, dual, edges } = prox;
-        let (shape, g) = (*shape, *g);
+        let (shape, g, dual) = (*shape, *g, &mut dual.each_mut().map(|p| p.on_host_mut().unwrap()));
         let moved = |at: [usize; 3], k: usize, by: isize| {
             let mut to = at;
             to[k] = to[k].wrapping_add_signed(by);
             to
         };
-        let primal = |dual: &[Array3<f32>; 3]| {
+        let primal = |dual: &[&mut Array3<f32>; 3]| {
             Array3::from_shape_fn(shape, |(x, y, z)| {
                 let at = [x, y, z];
                 let behind = |k: usize| if at[k] > 0 { dual[k][moved(at, k, -1)] } else { 0.0 };
@@ -755,17 +766,17 @@ mod tests {
                         for _ in 0..2 {
                             prox.apply(v.as_slice().unwrap(), tau, steps, u.as_slice_mut().unwrap());
                         }
-                        (u, prox.dual)
+                        (u, dual(prox))
                     })
                 };
-                let (u, dual) = on(1);
+                let (u, p) = on(1);
                 let mut slow = made();
                 plain(&mut slow, &v, tau, steps);
                 let want = plain(&mut slow, &v, tau, steps);
                 let near = |a: &Array3<f32>, b: &Array3<f32>| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5);
-                assert!(near(&u, &want) && (0..3).all(|k| near(&dual[k], &slow.dual[k])), "{shape:?}");
+                assert!(near(&u, &want) && p.iter().zip(dual(slow)).all(|(p, slow)| near(p, &slow)), "{shape:?}");
                 for threads in [2, 3, 8] {
-                    assert!(on(threads) == (u.clone(), dual.clone()), "{shape:?} on {threads} threads");
+                    assert!(on(threads) == (u.clone(), p.clone()), "{shape:?} on {threads} threads");
                 }
             }
         }
@@ -794,9 +805,9 @@ mod tests {
                         for seed in [3, 4] {
                             let mut gradient = number(seed);
                             let update = Update {
-                                gradient: flat_mut(&mut gradient),
-                                ahead: flat_mut(&mut ahead),
-                                x: flat_mut(&mut x),
+                                gradient: gradient.as_slice_mut().unwrap(),
+                                ahead: ahead.as_slice_mut().unwrap(),
+                                x: x.as_slice_mut().unwrap(),
                                 step: 0.7,
                                 momentum: 0.4,
                                 towards: pulled.then_some((towards.as_slice().unwrap(), 0.2)),
@@ -807,7 +818,7 @@ mod tests {
                                 update.around(|v, u| prox.apply(v, tau, steps, u));
                             }
                         }
-                        (ahead, x, prox.dual)
+                        (ahead, x, dual(prox))
                     })
                 };
                 let want = run(1, false);
