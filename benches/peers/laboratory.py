@@ -3,7 +3,7 @@
     cargo build --release -p conefield-cli
     python3 benches/peers/laboratory.py [--backend wgpu] [--sizes small,large] [--runs 3] [--folder DIR]
 
-The scan is a ball with a smaller one inside, from closed forms, so that it takes seconds to make. conefield's times are `train_s` of
+The scan is of two balls about one centre, so that every view is the same and takes no time to make. conefield's times are `train_s` of
 record.json, from arrays of the host to arrays of the host, with the compilation of kernels; ASTRA's are whole calls of FDK_CUDA,
 SIRT3D_CUDA and CGLS3D_CUDA, from and to host arrays (https://pypi.org/project/astra-toolbox). Medians of the runs. Where ASTRA or
 CUDA is absent, the table says so. One H100 takes under four minutes. Needs numpy; prints a Markdown table.
@@ -32,25 +32,19 @@ METHODS = [
 ]
 
 
-def ball(views, pixels, radius, centre):
-    """Line integrals of a ball of attenuation 1 about `centre` (mm)."""
-    out = np.empty((views, pixels, pixels), np.float32)
+def ball(pixels, radius):
+    """Line integrals of a centred ball of attenuation 1: every view is the same."""
     at = (np.arange(pixels) + 0.5) / pixels * DETECTOR - DETECTOR / 2
-    for view in range(views):
-        a = 2 * math.pi * view / views
-        source = DSO * np.array([math.cos(a), math.sin(a), 0.0])
-        along, up = np.array([-math.sin(a), math.cos(a), 0.0]), np.array([0.0, 0.0, 1.0])
-        ray = (DSO - DSD) * np.array([math.cos(a), math.sin(a), 0.0]) - source
-        d = ray + at[None, :, None] * along - at[:, None, None] * up
-        d /= np.linalg.norm(d, axis=-1, keepdims=True)
-        b = d @ (source - centre)
-        out[view] = 2 * np.sqrt(np.maximum(0, b * b - (np.sum((source - centre) ** 2) - radius**2)))
-    return out
+    square = at[None, :] ** 2 + at[:, None] ** 2
+    # Square of a ray's distance from the centre.
+    distance = DSO**2 * square / (square + DSD**2)
+    return 2 * np.sqrt(np.maximum(0, radius**2 - distance))
 
 
 def scan(folder, views, pixels, voxels):
     folder.mkdir(parents=True, exist_ok=True)
-    lines = 0.02 * ball(views, pixels, 100.0, np.zeros(3)) + 0.01 * ball(views, pixels, 30.0, np.array([40.0, 10.0, -20.0]))
+    image = (0.02 * ball(pixels, 100.0) + 0.01 * ball(pixels, 40.0)).astype(np.float32)
+    lines = np.broadcast_to(image, (views, pixels, pixels))
     np.save(folder / "projections.npy", lines)
     (folder / "scan.toml").write_text(
         f"""format = "conefield-scan"

@@ -9,14 +9,15 @@
 //! own overrides them.
 
 mod map;
+mod penalty;
 mod views;
 
 pub use map::{ADD, DIVIDE, FLOOR, INVERT, Map, RELAX, Reduction, TIMES, squares};
-pub use views::{FilteredViews, RowWeights, Views, Weighing};
+pub use penalty::{Dual, Guide, Kernels, Penalty, Update};
+pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 
 use crate::error::Result;
 use crate::geometry::Geometry;
-use crate::regularizer::{Penalty, Update};
 use crate::voxel::VoxelProjector;
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, Zip, s};
 use rayon::prelude::*;
@@ -101,14 +102,14 @@ impl<T> Held<T> {
 }
 
 /// A part of the state that a checkpoint keeps.
-pub enum State<'a> {
+pub enum StatePart<'a> {
     /// An array in a place.
     Placed(&'a mut Array),
     /// Numbers of a stage that runs on the host.
     Host(&'a mut [f32]),
 }
 
-impl State<'_> {
+impl StatePart<'_> {
     /// Number of elements.
     pub fn count(&self) -> usize {
         match self {
@@ -151,7 +152,7 @@ pub struct Moved {
 }
 
 /// The arrays of a proximal gradient step; see [`Update`].
-pub struct Step<'a> {
+pub struct ProximalStep<'a> {
     /// Negative gradient of the data term at `ahead`; unspecified afterwards.
     pub gradient: &'a mut Array,
     /// Point of the gradient; afterwards the point of the next one.
@@ -162,7 +163,7 @@ pub struct Step<'a> {
     pub towards: Option<(&'a Array, f32)>,
     /// Coefficients that may be non-zero, if not all.
     pub inside: Option<&'a Mask>,
-    /// Step along `gradient`.
+    /// ProximalStep along `gradient`.
     pub step: f32,
     /// Extrapolation beyond the new coefficients.
     pub momentum: f32,
@@ -170,9 +171,9 @@ pub struct Step<'a> {
     pub tau: f32,
 }
 
-/// Slope of a smoothed total variation, `Σ_j √(1 + Σ_k (unit·weights_k·(x_{j+k} − x_j))²)`, by each voxel. Differences
+/// VariationSlope of a smoothed total variation, `Σ_j √(1 + Σ_k (unit·weights_k·(x_{j+k} − x_j))²)`, by each voxel. Differences
 /// across the far faces are 0.
-pub struct Slope<'a> {
+pub struct VariationSlope<'a> {
     /// Weights of differences along x, y, z.
     pub weights: [f32; 3],
     /// Factor of differences.
@@ -181,7 +182,7 @@ pub struct Slope<'a> {
     pub host: &'a (dyn Fn(&[f32], &mut [f32]) -> f64 + Sync),
 }
 
-/// Allocates arrays and combines them. All arrays of a call come from this place or are on the host.
+/// Allocates arrays and combines them. All arrays of a call come from this place.
 pub trait Place: Send + Sync {
     /// The name of its device; `None` for the host.
     fn device(&self) -> Option<String>;
@@ -217,8 +218,8 @@ pub trait Place: Send + Sync {
     }
 
     /// The measured images of a scan for [`Place::compare`] and [`Place::weigh`]. They are loaded here if they fit.
-    fn views<'a>(&self, measured: &'a Array3<f32>) -> Result<Views<'a>> {
-        Ok(Views { measured, here: None })
+    fn views<'a>(&self, measured: &'a Array3<f32>) -> Result<MeasuredViews<'a>> {
+        Ok(MeasuredViews { measured, here: None })
     }
 
     /// The numbers of `x` in the host's memory, moved there if need be.
@@ -239,6 +240,17 @@ pub trait Place: Send + Sync {
         }
         let mut array = Array3::zeros(x.shape());
         self.store(x, 0, array.view_mut())?;
+        work(&mut array);
+        self.load(array.view(), x, 0)
+    }
+
+    /// Overwrites the numbers of `x` with those that `work` writes in the host's memory.
+    fn overwrite(&self, x: &mut Array, work: &mut dyn FnMut(&mut Array3<f32>)) -> Result<()> {
+        if let Some(array) = x.on_host_mut() {
+            work(array);
+            return Ok(());
+        }
+        let mut array = Array3::zeros(x.shape());
         work(&mut array);
         self.load(array.view(), x, 0)
     }
@@ -361,8 +373,8 @@ pub trait Place: Send + Sync {
     }
 
     /// A proximal gradient step with `penalty`.
-    fn update(&self, step: Step<'_>, penalty: &mut dyn Penalty) -> Result<()> {
-        let Step { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
+    fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+        let ProximalStep { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
         if let [Some(gradient), Some(ahead), Some(x)] = [&mut *gradient, &mut *ahead, &mut *x].map(Array::on_host_mut) {
             let [gradient, ahead, x] = [gradient, ahead, x].map(flat_mut);
             let towards = towards.and_then(|(to, share)| Some((flat(to.on_host()?), share)));
@@ -404,7 +416,7 @@ pub trait Place: Send + Sync {
     }
 
     /// Overwrites `out` with a slope of the total variation of `x`. Returns its sum of squares.
-    fn slope(&self, slope: &Slope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
+    fn slope(&self, slope: &VariationSlope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
         let x = self.read(x)?;
         let mut sum = 0.0;
         self.change(out, &mut |out| sum = (slope.host)(x.as_slice().unwrap_or_default(), flat_mut(out)))?;

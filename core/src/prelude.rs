@@ -6,7 +6,7 @@ pub use crate::data_term::{DataTerm, DataTermSpec, Misfit};
 pub use crate::error::{Error, Result, ensure};
 pub use crate::geometry::VoxelGrid;
 pub use crate::loss::{Loss, NoiseModel};
-pub use crate::place::State;
+pub use crate::place::StatePart;
 pub use crate::prior::{Blocks, Prior};
 pub use crate::random::{mix, unit};
 pub use crate::regularizer::{Penalty, Regularizer, RegularizerSpec};

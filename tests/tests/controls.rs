@@ -13,7 +13,7 @@ use conefield_core::basis::{Basis, BasisOperator, Expansion};
 use conefield_core::data_term::{DataTerm, Misfit};
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::loss::{Loss, NoiseModel};
-use conefield_core::place::State;
+use conefield_core::place::StatePart;
 use conefield_core::prior::{Blocks, Prior};
 use conefield_core::regularizer::{Penalty, Regularizer};
 use conefield_core::settings::{Initializer, LossSpec};
@@ -1106,8 +1106,8 @@ impl Penalty for PenaltyOn {
         }
     }
 
-    fn state(&mut self) -> Vec<(&str, State<'_>)> {
-        vec![("state", State::Host(&mut self.state))]
+    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
+        vec![("state", StatePart::Host(&mut self.state))]
     }
     fn fault(&self) -> Result<()> {
         let fails = self.fault == RegularizerFault::Fails && self.calls > 0;
@@ -1165,7 +1165,7 @@ struct DataOn {
     fault: DataFault,
     /// What was measured first.
     first: f32,
-    /// Views that were asked for.
+    /// MeasuredViews that were asked for.
     asked: AtomicU64,
 }
 

@@ -36,7 +36,7 @@ impl Regularizer for Settings {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         let side = grid.spacing.iter().product::<f64>().cbrt();
         let strength = grid.spacing.map(|s| (side / s).powi(2) as f32);
-        let [u, slope] = [0, 1].map(|_| space.array(grid.shape).into_raw_vec_and_offset().0);
+        let [u, slope] = [0, 1].map(|_| space.on_host(grid.shape.iter().product()));
         Ok(Box::new(On { shape: grid.shape, strength, inner: self.inner, u, slope }))
     }
 
@@ -97,7 +97,7 @@ impl Penalty for On {
     }
 
     /// The state from which the next call starts, for checkpoints.
-    fn state(&mut self) -> Vec<(&str, &mut [f32])> {
-        vec![("u", &mut self.u)]
+    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
+        vec![("u", StatePart::Host(&mut self.u))]
     }
 }

@@ -9,7 +9,7 @@ use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, Zip, s};
 use rayon::prelude::*;
 
 /// Measured line integrals, `[view, row, column]`.
-pub struct Views<'a> {
+pub struct MeasuredViews<'a> {
     /// As the scan holds them.
     pub measured: &'a Array3<f32>,
     /// A copy in the place, if it has one.
@@ -20,7 +20,7 @@ pub struct Views<'a> {
 #[derive(Clone, Copy)]
 pub struct Weighing<'a> {
     /// The measured line integrals p.
-    pub views: &'a Views<'a>,
+    pub views: &'a MeasuredViews<'a>,
     /// Pixels outside count as p = 0.
     pub shadow: Option<&'a Mask>,
     /// Factors of the residuals of all views.

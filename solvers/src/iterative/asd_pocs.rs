@@ -14,7 +14,7 @@ use conefield_core::error::Result;
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, State};
+use conefield_core::place::{Array, StatePart};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
@@ -195,8 +195,8 @@ impl Iteration for Iterate {
         Ok(self.sweep.x)
     }
 
-    fn state(&mut self) -> Vec<(String, State<'_>)> {
-        vec![("x".into(), State::Placed(&mut self.sweep.x))]
+    fn state(&mut self) -> Vec<(String, StatePart<'_>)> {
+        vec![("x".into(), StatePart::Placed(&mut self.sweep.x))]
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

@@ -11,7 +11,7 @@ use conefield_core::error::Result;
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Reconstruction, Solution};
-use conefield_core::place::{ADD, Array, State};
+use conefield_core::place::{ADD, Array, StatePart};
 use conefield_core::scan::ScanHeader;
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
@@ -170,10 +170,10 @@ impl Iteration for Iterate {
         Ok(self.x)
     }
 
-    fn state(&mut self) -> Vec<(String, State<'_>)> {
+    fn state(&mut self) -> Vec<(String, StatePart<'_>)> {
         let Self { x, residual, direction, .. } = self;
         let all = [("x", x), ("residual", residual), ("direction", direction)];
-        all.map(|(name, x)| (name.to_owned(), State::Placed(x))).into()
+        all.map(|(name, x)| (name.to_owned(), StatePart::Placed(x))).into()
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

@@ -9,7 +9,7 @@ use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::finite::stray;
 use conefield_core::method::{Best, Job, Observer, Reconstruction, Record, Solution};
-use conefield_core::place::{Array, Place, State, squares};
+use conefield_core::place::{Array, Place, StatePart, squares};
 use conefield_core::scan::Volume;
 use conefield_core::space::Space;
 use ndarray::Array3;
@@ -39,7 +39,7 @@ pub trait Iteration {
     fn take(self: Box<Self>, problem: &Problem<'_>) -> Result<Array>;
 
     /// The complete state for the next pass, by name, for checkpoints.
-    fn state(&mut self) -> Vec<(String, State<'_>)>;
+    fn state(&mut self) -> Vec<(String, StatePart<'_>)>;
 
     /// An error of a stage since the last call.
     fn fault(&self) -> Result<()> {
@@ -231,7 +231,7 @@ impl<'a> Run<'a> {
         let standing = Standing { step, recorded: step, seconds, method: kept, ..Standing::default() };
         let mut state = method.state();
         if let (Some(best), Some(_)) = (&mut self.best, self.kept.best) {
-            state.push((BEST.into(), State::Placed(best)));
+            state.push((BEST.into(), StatePart::Placed(best)));
         }
         let read = state.iter().map(|(n, x)| Ok((n, [x.count()], x.read(self.problem.place)?)));
         let read = read.collect::<Result<Vec<_>>>()?;
@@ -280,7 +280,7 @@ pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
 fn restore(resume: &Resume, place: &dyn Place, method: &mut dyn Iteration, best: Option<&mut Array>) -> Result<Kept> {
     let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.method.clone());
     let kept = kept.map_err(|e| Error::invalid(&resume.place, "method", e, "the state of this method"))?;
-    let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), State::Placed(best)));
+    let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), StatePart::Placed(best)));
     for (name, mut values) in method.state().into_iter().chain(best) {
         let found = resume.tensor(&name).map(|t| &t.1);
         let fits = found.filter(|t| t.len() == values.count());

@@ -28,7 +28,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, DIVIDE, Reduction, State, Step};
+use conefield_core::place::{Array, DIVIDE, ProximalStep, Reduction, StatePart};
 use conefield_core::random::stream;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader};
@@ -328,7 +328,9 @@ impl Arrays {
         let Factors { step, momentum, pull, tau } = factors;
         let towards = towards.as_ref().map(|towards| (towards, pull));
         let inside = model.inside(problem);
-        problem.place.update(Step { gradient, ahead, x, step, momentum, towards, inside, tau }, penalty.as_mut())
+        problem
+            .place
+            .update(ProximalStep { gradient, ahead, x, step, momentum, towards, inside, tau }, penalty.as_mut())
     }
 
     /// Clears coefficients outside the object's support and restarts from the rest.
@@ -405,7 +407,7 @@ impl Arrays {
     }
 }
 
-/// Factors of an update; see [`Step`].
+/// Factors of an update; see [`ProximalStep`].
 struct Factors {
     step: f32,
     momentum: f32,
@@ -555,9 +557,9 @@ impl Iteration for Iterate {
         self.data.fault()
     }
 
-    fn state(&mut self) -> Vec<(String, State<'_>)> {
+    fn state(&mut self) -> Vec<(String, StatePart<'_>)> {
         let Arrays { x, ahead, penalty, .. } = &mut self.arrays;
-        let own = [("x", x), ("ahead", ahead)].map(|(name, x)| (name.to_owned(), State::Placed(x)));
+        let own = [("x", x), ("ahead", ahead)].map(|(name, x)| (name.to_owned(), StatePart::Placed(x)));
         let prior = penalty.state().into_iter().map(|(name, x)| (format!("prior.{name}"), x));
         own.into_iter().chain(prior).collect()
     }

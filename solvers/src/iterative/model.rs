@@ -33,13 +33,13 @@ pub(super) fn projected(expansion: &dyn Expansion, voxels: VoxelGrid) -> VoxelGr
 /// Overwrites `voxels` with `B·x`.
 fn expand(place: &dyn Place, basis: &dyn Expansion, x: &Array, voxels: &mut Array) -> Result<()> {
     let x = place.read(x)?;
-    place.change(voxels, &mut |voxels| basis.operator().expand(x.view(), voxels.view_mut()))
+    place.overwrite(voxels, &mut |voxels| basis.operator().expand(x.view(), voxels.view_mut()))
 }
 
 /// Overwrites `x` with `Bᵀ·voxels`.
 fn gather(place: &dyn Place, basis: &dyn Expansion, voxels: &Array, x: &mut Array) -> Result<()> {
     let voxels = place.read(voxels)?;
-    place.change(x, &mut |x| basis.operator().adjoint(voxels.view(), x.view_mut()))
+    place.overwrite(x, &mut |x| basis.operator().adjoint(voxels.view(), x.view_mut()))
 }
 
 impl Model {

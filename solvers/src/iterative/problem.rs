@@ -4,7 +4,7 @@ use crate::shadow::{air_level, shadow};
 use conefield_core::data_term::Misfit;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
-use conefield_core::place::{ADD, Array, INVERT, Mask, Place, Reduction, Views, Weighing};
+use conefield_core::place::{ADD, Array, INVERT, Mask, MeasuredViews, Place, Reduction, Weighing};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::space::Space;
 use conefield_core::voxel::VoxelProjector;
@@ -32,7 +32,7 @@ pub struct Problem<'a> {
     /// The object's shadow, if the other pixels count as 0.
     pub(super) shadow: Option<Mask>,
     /// The measured images.
-    pub(super) views: Views<'a>,
+    pub(super) views: MeasuredViews<'a>,
 }
 
 impl Problem<'_> {

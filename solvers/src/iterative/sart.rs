@@ -12,7 +12,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, RELAX, State};
+use conefield_core::place::{Array, RELAX, StatePart};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
@@ -258,7 +258,7 @@ impl Iteration for Iterate {
         Ok(self.sweep.x)
     }
 
-    fn state(&mut self) -> Vec<(String, State<'_>)> {
-        vec![("x".into(), State::Placed(&mut self.sweep.x))]
+    fn state(&mut self) -> Vec<(String, StatePart<'_>)> {
+        vec![("x".into(), StatePart::Placed(&mut self.sweep.x))]
     }
 }

@@ -11,7 +11,7 @@ use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::{Job, Observer};
-use conefield_core::place::{Array, Mask, Place, Views};
+use conefield_core::place::{Array, Mask, MeasuredViews, Place};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::VoxelScene;
 use conefield_core::settings::KnownVolume;
@@ -155,7 +155,7 @@ impl Opened {
             seed: job.seed,
             inside: self.inside.as_ref(),
             shadow: None,
-            views: Views { measured: &scan.projections, here: None },
+            views: MeasuredViews { measured: &scan.projections, here: None },
         }
     }
 }

@@ -9,7 +9,7 @@ use super::edges::Edges;
 use super::on_host_mut;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::place::{ADD, Array, Place, Slope};
+use conefield_core::place::{ADD, Array, Place, VariationSlope};
 use conefield_core::regularizer::{Dual, Update};
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
 use conefield_core::space::Space;
@@ -574,7 +574,7 @@ pub fn descend(
     }
     let (unit, shape) = (1.0 / smoothing, x.shape());
     let host = |x: &[f32], out: &mut [f32]| slopes(x, shape, g, unit, out);
-    let norm = place.slope(&Slope { weights: g, unit, host: &host }, x, work)?.sqrt();
+    let norm = place.slope(&VariationSlope { weights: g, unit, host: &host }, x, work)?.sqrt();
     if norm > 0.0 {
         place.map(&ADD, [-f64::from((step / norm) as f32), 1.0], x, &[work])?;
     }

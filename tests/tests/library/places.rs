@@ -8,7 +8,7 @@ use conefield_core::backend::Backend;
 use conefield_core::data_term::DataTermSpec;
 use conefield_core::geometry::Geometry;
 use conefield_core::method::{Job, Observer, Record};
-use conefield_core::place::{Host, Map, Place, Reduction, State, Step, Weighing};
+use conefield_core::place::{Host, Map, Place, ProximalStep, Reduction, StatePart, Weighing};
 use conefield_core::random::{mix, unit};
 use conefield_core::regularizer::{Dual, Kernels, Penalty, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
@@ -280,7 +280,7 @@ fn updates_differ(
         for seed in 10..13 {
             numbers.extend(place.adapt(penalty.as_mut(), &x)?);
             let mut gradient = place.adopt(volume(g.volume.shape, seed))?;
-            let step = Step {
+            let step = ProximalStep {
                 gradient: &mut gradient,
                 ahead: &mut ahead,
                 x: &mut x,
@@ -348,7 +348,7 @@ impl Penalty for OnHost {
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
         self.0.prox(v, tau, u);
     }
-    fn state(&mut self) -> Vec<(&str, State<'_>)> {
+    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         self.0.state()
     }
 }
@@ -362,7 +362,7 @@ impl Penalty for Rewritten {
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
         self.0.prox(v, tau, u);
     }
-    fn state(&mut self) -> Vec<(&str, State<'_>)> {
+    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         self.0.state()
     }
     fn kernels(&mut self) -> Option<Kernels<'_>> {
@@ -556,9 +556,10 @@ fn a_pass_moves_scalars_and_a_run_its_views_and_its_volume() {
                 pass[1] / volume
             );
             assert!(pass[0] < 0.1 * views && pass[1] < 0.05 * volume, "{method}, {name}: {pass:?} bytes in a pass");
-            // FISTA estimates its noise on one subset; a coarser basis has fewer coefficients to bring down.
-            assert!(two[0] > views && two[0] < 1.6 * views, "{method}, {name}: {} bytes up", two[0]);
-            assert!(two[1] < 1.15 * volume, "{method}, {name}: {} bytes down", two[1]);
+            // FISTA estimates its noise on one subset. A coarser basis is expanded on the host at the end.
+            let expanded = if method["basis"].is_object() { volume } else { 0.0 };
+            assert!(two[0] > views && two[0] < 1.6 * views + expanded, "{method}, {name}: {} bytes up", two[0]);
+            assert!(two[1] < 1.15 * volume + 0.4 * expanded, "{method}, {name}: {} bytes down", two[1]);
         }
         // The test sees what travels.
         let start = json!({"type": "sart", "subsets": 4, "stop": {"passes": 2, "patience": 1}});

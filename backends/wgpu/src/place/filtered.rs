@@ -14,7 +14,7 @@ use wgpu::BufferUsages as U;
 
 /// Bytes of filtered views on the device at once.
 const PADDED_BYTES: u64 = 512 << 20;
-/// Views that one uniform buffer holds for back-projection.
+/// MeasuredViews that one uniform buffer holds for back-projection.
 const VIEWS: usize = 128;
 
 /// `Back` in `kernels/back.wgsl`.

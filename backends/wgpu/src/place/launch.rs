@@ -22,7 +22,7 @@ const MOST: u32 = 1 << 26;
 const AHEAD: usize = 2;
 /// Elements per partial sum, and most partial sums of a launch.
 const SUMMED: u32 = 4096;
-const SUMS: u32 = 1024;
+const SUMS: u32 = 4096;
 
 /// A kernel that runs `body` for each i of a launch, from `begin` to `end` of the uniform buffer `launch`.
 pub(super) fn each(launch: &str, body: &str) -> String {

@@ -19,7 +19,9 @@ use crate::Shared;
 use crate::compose::fragment_of;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
-use conefield_core::place::{Array, FilteredViews, Map, Mask, Place, Reduction, Slope, Step, Views, Weighing};
+use conefield_core::place::{
+    Array, FilteredViews, Map, Mask, MeasuredViews, Place, ProximalStep, Reduction, VariationSlope, Weighing,
+};
 use conefield_core::regularizer::{Kernels, Penalty};
 use conefield_core::voxel::VoxelProjector;
 use launch::{ARRAY, Room};
@@ -28,13 +30,13 @@ use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// A part of an array: planes along its first axis, in a buffer.
-pub(crate) struct Part {
+pub(crate) struct Chunk {
     planes: Range<usize>,
     buffer: wgpu::Buffer,
 }
 
 /// An array on the device. Arrays of one shape have the same parts.
-pub(crate) struct Parts(Vec<Part>);
+pub(crate) struct Chunks(Vec<Chunk>);
 
 /// The arrays of a device.
 pub struct DevicePlace {
@@ -43,8 +45,8 @@ pub struct DevicePlace {
 }
 
 /// The parts of an array of this place.
-fn parts<T>(x: &conefield_core::place::Held<T>) -> &[Part] {
-    x.get::<Parts>().map_or(&[], |parts| &parts.0)
+fn parts<T>(x: &conefield_core::place::Held<T>) -> &[Chunk] {
+    x.get::<Chunks>().map_or_else(|| unreachable!("an array of another place"), |parts| &parts.0)
 }
 
 impl DevicePlace {
@@ -65,7 +67,7 @@ impl DevicePlace {
             let what = format!("a plane or view of {plane} bytes is larger than a buffer of {bytes} bytes");
             return Err(self.shared.gpu.error(what));
         }
-        // Parts of nearly the same size.
+        // Chunks of nearly the same size.
         let parts = shape[0].div_ceil(most).max(1);
         let each = shape[0].div_ceil(parts).max(1);
         Ok((0..shape[0]).step_by(each).map(|at| at..(at + each).min(shape[0])).collect())
@@ -89,9 +91,9 @@ impl Place for DevicePlace {
     fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
         let parts = self.split(shape)?.into_iter().map(|planes| {
             let bytes = 4 * (planes.len() * plane(shape)) as u64;
-            Ok(Part { planes, buffer: self.shared.gpu.buffer("an array", bytes, ARRAY)? })
+            Ok(Chunk { planes, buffer: self.shared.gpu.buffer("an array", bytes, ARRAY)? })
         });
-        Ok(Array::there(shape, Parts(parts.collect::<Result<_>>()?)))
+        Ok(Array::there(shape, Chunks(parts.collect::<Result<_>>()?)))
     }
 
     fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()> {
@@ -136,13 +138,13 @@ impl Place for DevicePlace {
             let words = elements::words(&flags);
             let buffer = self.shared.gpu.buffer("a mask", 4 * words.len() as u64, ARRAY)?;
             self.shared.gpu.upload(&buffer, 0, bytemuck::cast_slice(&words))?;
-            Ok(Part { planes, buffer })
+            Ok(Chunk { planes, buffer })
         });
-        Ok(Mask::there(shape, Parts(parts.collect::<Result<_>>()?)))
+        Ok(Mask::there(shape, Chunks(parts.collect::<Result<_>>()?)))
     }
 
-    fn views<'a>(&self, measured: &'a Array3<f32>) -> Result<Views<'a>> {
-        // Views that do not fit are loaded in every pass.
+    fn views<'a>(&self, measured: &'a Array3<f32>) -> Result<MeasuredViews<'a>> {
+        // MeasuredViews that do not fit are loaded in every pass.
         let here = match self.zeros(measured.dim().into()) {
             Ok(mut here) => {
                 self.load(measured.view(), &mut here, 0)?;
@@ -155,7 +157,7 @@ impl Place for DevicePlace {
                 None
             }
         };
-        Ok(Views { measured, here })
+        Ok(MeasuredViews { measured, here })
     }
 
     fn fill(&self, x: &mut Array, value: f32) -> Result<()> {
@@ -241,7 +243,7 @@ impl Place for DevicePlace {
         filtered::backproject(&self.shared, &mut self.room(), work, views, images, volume)
     }
 
-    fn update(&self, step: Step<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+    fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
         if penalty.kernels().is_some() {
             return stencils::update(&self.shared, &mut self.room(), step, penalty);
         }
@@ -274,7 +276,7 @@ impl Place for DevicePlace {
         }
     }
 
-    fn slope(&self, slope: &Slope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
+    fn slope(&self, slope: &VariationSlope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
         stencils::slope(&self.shared, &mut self.room(), slope, x, out)
     }
 }

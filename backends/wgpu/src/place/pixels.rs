@@ -1,7 +1,7 @@
 //! Data terms: computed line integrals against measured ones.
 
 use super::launch::{Room, Task, each, summing};
-use super::{Array, DevicePlace, Part, parts, plane};
+use super::{Array, Chunk, DevicePlace, parts, plane};
 use crate::compose::fragment_of;
 use crate::source::{Access, Source};
 use conefield_core::error::Result;
@@ -24,7 +24,7 @@ struct Pixels {
 const NONE: u32 = u32::MAX;
 
 /// The index in `part` of each of `wanted`; `None` if it holds none of them.
-fn indices(part: &Part, wanted: &[usize]) -> Option<Vec<u32>> {
+fn indices(part: &Chunk, wanted: &[usize]) -> Option<Vec<u32>> {
     let at = |i: &usize| if part.planes.contains(i) { (i - part.planes.start) as u32 } else { NONE };
     let all: Vec<u32> = wanted.iter().map(at).collect();
     all.iter().any(|i| *i != NONE).then_some(all)
@@ -70,7 +70,7 @@ impl Sources<'_> {
             let of_all = by.shadow.map(parts).or_else(|| by.weights.map(parts));
             for held in measured {
                 let Some(at) = indices(held, &wanted) else { continue };
-                for k in 0..of_all.map_or(1, <[Part]>::len) {
+                for k in 0..of_all.map_or(1, <[Chunk]>::len) {
                     let at_all = match of_all {
                         Some(all) => indices(&all[k], some),
                         None => Some(at.clone()),

@@ -5,13 +5,13 @@
 //! also reads the planes beside a part, which are copied on the device.
 
 use super::launch::{ARRAY, Room, Task, each, summing};
-use super::{Array, Part, parts, plane};
+use super::{Array, Chunk, parts, plane};
 use crate::Shared;
 use crate::compose::fragment_of;
 use crate::source::{Access, Source};
 use Access::{Read, Write};
 use conefield_core::error::Result;
-use conefield_core::place::{Slope, Step};
+use conefield_core::place::{ProximalStep, VariationSlope};
 use conefield_core::regularizer::{Dual, Guide, Kernels, Penalty};
 
 /// `Stencil` in `kernels/stencil.wgsl`.
@@ -74,13 +74,13 @@ impl<'a> Volume<'a> {
         Self { shared, shape, whole: Stencil { shape: shape.map(|n| n as u32), ..Stencil::default() } }
     }
 
-    fn uniform(&self, part: &Part) -> (&'static str, impl Fn(u32, u32) -> Stencil) {
+    fn uniform(&self, part: &Chunk) -> (&'static str, impl Fn(u32, u32) -> Stencil) {
         let (held, planes) = (part.planes.start as u32, part.planes.len() as u32);
         let whole = self.whole;
         ("stencil", move |begin, end| Stencil { held, planes, begin, end, ..whole })
     }
 
-    fn count(&self, part: &Part) -> u32 {
+    fn count(&self, part: &Chunk) -> u32 {
         (part.planes.len() * plane(self.shape)) as u32
     }
 
@@ -142,7 +142,7 @@ impl<'a> Volume<'a> {
 }
 
 /// A volume with the factors of a step.
-fn of_step<'a>(shared: &'a Shared, step: &Step<'_>) -> Volume<'a> {
+fn of_step<'a>(shared: &'a Shared, step: &ProximalStep<'_>) -> Volume<'a> {
     let mut volume = Volume::new(shared, step.x);
     let pull = step.towards.map_or(0.0, |(_, share)| share);
     volume.whole = Stencil { step: step.step, momentum: step.momentum, pull, ..volume.whole };
@@ -150,7 +150,7 @@ fn of_step<'a>(shared: &'a Shared, step: &Step<'_>) -> Volume<'a> {
 }
 
 /// Overwrites the gradient with the argument of the proximal map.
-pub(super) fn argument(shared: &Shared, room: &mut Room, step: &Step<'_>) -> Result<()> {
+pub(super) fn argument(shared: &Shared, room: &mut Room, step: &ProximalStep<'_>) -> Result<()> {
     let mut bindings = vec![("gradient", Write), ("ahead", Read)];
     let mut v = "let z = ahead[i];\n        var v = z + stencil.step * gradient[i];\n".to_owned();
     if step.towards.is_some() {
@@ -180,7 +180,7 @@ fn extrapolation(u: &str) -> String {
 }
 
 /// Ends an update after a proximal map whose result is in the gradient.
-pub(super) fn finish(shared: &Shared, room: &mut Room, step: Step<'_>) -> Result<()> {
+pub(super) fn finish(shared: &Shared, room: &mut Room, step: ProximalStep<'_>) -> Result<()> {
     let flat = [("gradient", Read), ("x", Write), ("ahead", Write)];
     let source = kernel(&flat, &[], &extrapolation("max(0.0, gradient[i])"));
     let arrays: [(&str, &Array); 3] = [("gradient", step.gradient), ("x", step.x), ("ahead", step.ahead)];
@@ -188,7 +188,12 @@ pub(super) fn finish(shared: &Shared, room: &mut Room, step: Step<'_>) -> Result
 }
 
 /// A whole update with a penalty that has kernels.
-pub(super) fn update(shared: &Shared, room: &mut Room, step: Step<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+pub(super) fn update(
+    shared: &Shared,
+    room: &mut Room,
+    step: ProximalStep<'_>,
+    penalty: &mut dyn Penalty,
+) -> Result<()> {
     argument(shared, room, &step)?;
     let Some(Kernels::Dual(dual)) = penalty.kernels() else { return finish(shared, room, step) };
     if step.tau < f32::MIN_POSITIVE {
@@ -265,7 +270,13 @@ pub(super) fn adapt(shared: &Shared, room: &mut Room, dual: Dual<'_>, x: &Array)
 }
 
 /// Overwrites `out` with the slope of the smoothed total variation of `x`. Returns its sum of squares.
-pub(super) fn slope(shared: &Shared, room: &mut Room, slope: &Slope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
+pub(super) fn slope(
+    shared: &Shared,
+    room: &mut Room,
+    slope: &VariationSlope<'_>,
+    x: &Array,
+    out: &mut Array,
+) -> Result<f64> {
     let functions = [VALUES, ("slope", include_str!("../kernels/slope.wgsl"))];
     let mut source = begun(&[&[("out", Write)][..], &BESIDE].concat(), &functions);
     let body = "let s = slope_at(i);\n        out[i] = s;\n        let v = vec2<f32>(s * s, 0.0);";

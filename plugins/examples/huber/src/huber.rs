@@ -133,8 +133,8 @@ impl Penalty for On {
         self.primal(v, tau, u);
     }
 
-    fn state(&mut self) -> Vec<(&str, State<'_>)> {
+    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         let [x, y, z] = &mut self.dual;
-        [("dual.x", x), ("dual.y", y), ("dual.z", z)].map(|(name, p)| (name, State::Host(p))).into()
+        [("dual.x", x), ("dual.y", y), ("dual.z", z)].map(|(name, p)| (name, StatePart::Host(p))).into()
     }
 }

@@ -7,7 +7,7 @@ use crate::library::{Handle, text};
 use crate::trial;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::place::State;
+use conefield_core::place::StatePart;
 use conefield_core::regularizer::{Penalty, Regularizer};
 use conefield_core::space::Space;
 use conefield_plugin_abi::*;
@@ -163,13 +163,13 @@ impl Penalty for PenaltyOn {
         }
     }
 
-    fn state(&mut self) -> Vec<(&str, State<'_>)> {
+    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         let mut all = vec![];
         for (i, (name, length)) in self.state.iter().enumerate() {
             if let Some(found) = self.entry(i).ok().flatten().filter(|e| e.length == *length) {
                 // SAFETY: the plugin guarantees that this many numbers are valid while the penalty lives; entries do
                 // not overlap.
-                all.push((name.as_str(), State::Host(unsafe { slice::from_raw_parts_mut(found.data, *length) })));
+                all.push((name.as_str(), StatePart::Host(unsafe { slice::from_raw_parts_mut(found.data, *length) })));
             }
         }
         all

@@ -5,7 +5,7 @@ use crate::built::Built;
 use conefield_core::basis::{BasisOperator, Expansion};
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::place::{Host, State};
+use conefield_core::place::{Host, StatePart};
 use conefield_core::regularizer::Penalty;
 use conefield_core::scan::ScanHeader;
 use conefield_core::simd::Real;
@@ -148,8 +148,8 @@ unsafe extern "C" fn state(stage: *mut c_void, index: usize, out: *mut Conefield
         let entry = all.into_iter().nth(index);
         let (name, values) = entry.ok_or_else(|| Error::unsupported("state", "the index is too large"))?;
         let values = match values {
-            State::Host(values) => values,
-            State::Placed(array) => array.on_host_mut().and_then(|x| x.as_slice_mut()).unwrap_or_default(),
+            StatePart::Host(values) => values,
+            StatePart::Placed(array) => array.on_host_mut().and_then(|x| x.as_slice_mut()).unwrap_or_default(),
         };
         let name = ConefieldStr { data: name.as_ptr(), length: name.len() };
         // SAFETY: see `shims/mod.rs`.

@@ -3,7 +3,7 @@
 use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::place::State;
+use conefield_core::place::StatePart;
 use conefield_core::regularizer::{Kernels, Penalty, Regularizer, RegularizerSpec, Update, Weight};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
@@ -94,8 +94,8 @@ impl Penalty for On {
         Some(Kernels::Dual(self.prox.kernels(self.inner)))
     }
 
-    fn state(&mut self) -> Vec<(&str, State<'_>)> {
-        let [x, y, z] = self.prox.state().map(State::Placed);
+    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
+        let [x, y, z] = self.prox.state().map(StatePart::Placed);
         vec![("dual.x", x), ("dual.y", y), ("dual.z", z)]
     }
 }
