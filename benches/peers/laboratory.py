@@ -84,7 +84,7 @@ def conefield(folder, spec, options, backend, runs):
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             out = Path(scratch) / "run"
             command = [ROOT / "target/release/conefield", "-q", "reconstruct", folder, "--spec", spec, "-o", out]
-            subprocess.run([*command, "--backend", backend, *options], check=True)
+            subprocess.run([*command, "--backend", backend, *options], check=True, stdout=subprocess.DEVNULL)
             record = json.loads((out / "record.json").read_text())
             seconds.append(record["train_s"])
             moved = record["moved"]

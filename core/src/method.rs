@@ -511,11 +511,12 @@ pub struct Needs {
     pub optimizer: u64,
     /// Working memory of the backend.
     pub backend: u64,
-    /// Other working memory: iterates, directions, residuals, lists of rays.
+    /// Other working memory: iterates, directions, residuals, lists of rays; without the resulting volume.
     pub working: u64,
     /// Additional memory to resume an interrupted run.
     pub resume: u64,
-    /// Whether the method produces the scan's voxels itself: its last iterate is the volume.
+    /// Whether the method produces the scan's voxels itself: its last iterate is the volume. The memory check then adds
+    /// that volume.
     pub volume: bool,
     /// Evaluation of a field at voxels.
     pub evaluating: u64,

@@ -199,7 +199,7 @@ pub trait Place: Send + Sync {
     /// Overwrites `to` with planes of `from` along its first axis, from plane `first` on.
     fn store(&self, from: &Array, first: usize, to: ArrayViewMut3<'_, f32>) -> Result<()>;
 
-    /// Refuses a projector that cannot work here, at planning time.
+    /// Refuses a projector that cannot work here. A method calls it before it takes arrays.
     fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
         let _ = projector;
         Ok(())

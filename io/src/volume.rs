@@ -177,7 +177,10 @@ pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<(
         VolumeFormat::Npy => npy::write_voxels(w, path, voxels),
         VolumeFormat::Nrrd => nrrd::write(w, path, voxels),
         VolumeFormat::Tiff => tiff::write(w, path, voxels),
-        _ => metaimage::write(w, path, voxels),
+        VolumeFormat::MetaImage => metaimage::write(w, path, voxels),
+        VolumeFormat::MetaImageHeader | VolumeFormat::Zarr => {
+            unreachable!("formats of several files are written above")
+        }
     })
 }
 
