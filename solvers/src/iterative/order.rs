@@ -21,12 +21,12 @@ pub enum Subsets {
 #[serde(rename_all = "kebab-case")]
 pub enum Each {
     /// One view at a time.
-    MeasuredViews,
+    Views,
 }
 
 impl Subsets {
     /// One view at a time.
-    pub const VIEWS: Self = Self::Each(Each::MeasuredViews);
+    pub const VIEWS: Self = Self::Each(Each::Views);
 
     /// Refuses 0; the error names the key `subsets`.
     pub fn validate(self) -> Result<()> {
@@ -37,7 +37,7 @@ impl Subsets {
     pub fn count(self, views: usize) -> usize {
         match self {
             Self::Count(n) => n.clamp(1, views.max(1)),
-            Self::Each(Each::MeasuredViews) => views.max(1),
+            Self::Each(Each::Views) => views.max(1),
         }
     }
 
@@ -52,7 +52,7 @@ impl std::fmt::Display for Subsets {
         match self {
             Self::Count(1) => f.write_str("all views at once"),
             Self::Count(n) => write!(f, "{n} subsets"),
-            Self::Each(Each::MeasuredViews) => f.write_str("one view at a time"),
+            Self::Each(Each::Views) => f.write_str("one view at a time"),
         }
     }
 }
