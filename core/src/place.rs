@@ -1,18 +1,17 @@
 //! Places: where the arrays of a method live.
 //!
 //! Volumes and views are large, and moving them takes longer than most computations with them. A method requests
-//! [`Array`]s from a [`Place`] and combines them there. Only [`Place::load`] and [`Place::store`] move numbers between
-//! an array and the host.
+//! [`Array`]s from a [`Place`] and combines them there. It moves numbers only where it says so: [`Place::load`],
+//! [`Place::store`], and what is made of the two.
 //!
-//! A place must allocate, load and store. The other methods have defaults that compute on the host: arrays that live
-//! there ([`Held::host`]) are used as they are, others are stored, changed and loaded again. A place with kernels of its
-//! own overrides them.
+//! A place must allocate, load and store. The other methods have defaults that compute on the host: arrays in its memory
+//! are used as they are, others are stored, changed and loaded again. A place with kernels of its own overrides them.
 
 mod map;
 mod penalty;
 mod views;
 
-pub use map::{ADD, DIVIDE, FLOOR, INVERT, Map, RELAX, Reduction, TIMES, squares};
+pub use map::{ADD, DIVIDE, FLOOR, INVERT, Map, RELAX, Reduction, squares};
 pub use penalty::{Dual, Guide, Kernels, Penalty, Update};
 pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 
@@ -92,6 +91,16 @@ impl<T> Held<T> {
         }
     }
 
+    /// Its elements in order, if it lives in the host's memory; else none.
+    pub fn slice(&self) -> &[T] {
+        self.on_host().and_then(|array| array.as_slice()).unwrap_or_default()
+    }
+
+    /// Mutable version of [`Held::slice`].
+    pub fn slice_mut(&mut self) -> &mut [T] {
+        self.on_host_mut().and_then(|array| array.as_slice_mut()).unwrap_or_default()
+    }
+
     /// What a place keeps of it.
     pub fn get<D: Any>(&self) -> Option<&D> {
         match &self.data {
@@ -122,10 +131,8 @@ impl StatePart<'_> {
     pub fn read(&self, place: &dyn Place) -> Result<Cow<'_, [f32]>> {
         match self {
             Self::Host(x) => Ok(Cow::Borrowed(x)),
-            Self::Placed(x) => match x.on_host() {
-                Some(x) => Ok(Cow::Borrowed(flat(x))),
-                None => Ok(Cow::Owned(place.read(x)?.into_owned().into_raw_vec_and_offset().0)),
-            },
+            Self::Placed(x) if x.on_host().is_some() => Ok(Cow::Borrowed(x.slice())),
+            Self::Placed(x) => Ok(Cow::Owned(place.read(x)?.into_owned().into_raw_vec_and_offset().0)),
         }
     }
 
@@ -163,7 +170,7 @@ pub struct ProximalStep<'a> {
     pub towards: Option<(&'a Array, f32)>,
     /// Coefficients that may be non-zero, if not all.
     pub inside: Option<&'a Mask>,
-    /// ProximalStep along `gradient`.
+    /// Step along `gradient`.
     pub step: f32,
     /// Extrapolation beyond the new coefficients.
     pub momentum: f32,
@@ -171,8 +178,8 @@ pub struct ProximalStep<'a> {
     pub tau: f32,
 }
 
-/// VariationSlope of a smoothed total variation, `Σ_j √(1 + Σ_k (unit·weights_k·(x_{j+k} − x_j))²)`, by each voxel. Differences
-/// across the far faces are 0.
+/// The derivative of a smoothed total variation, `Σ_j √(1 + Σ_k (unit·weights_k·(x_{j+k} − x_j))²)`, by each voxel.
+/// Differences across the far faces are 0.
 pub struct VariationSlope<'a> {
     /// Weights of differences along x, y, z.
     pub weights: [f32; 3],
@@ -234,25 +241,12 @@ pub trait Place: Send + Sync {
 
     /// Lets `work` change the numbers of `x` in the host's memory.
     fn change(&self, x: &mut Array, work: &mut dyn FnMut(&mut Array3<f32>)) -> Result<()> {
-        if let Some(array) = x.on_host_mut() {
-            work(array);
-            return Ok(());
-        }
-        let mut array = Array3::zeros(x.shape());
-        self.store(x, 0, array.view_mut())?;
-        work(&mut array);
-        self.load(array.view(), x, 0)
+        on_host(self, x, true, work)
     }
 
     /// Overwrites the numbers of `x` with those that `work` writes in the host's memory.
     fn overwrite(&self, x: &mut Array, work: &mut dyn FnMut(&mut Array3<f32>)) -> Result<()> {
-        if let Some(array) = x.on_host_mut() {
-            work(array);
-            return Ok(());
-        }
-        let mut array = Array3::zeros(x.shape());
-        work(&mut array);
-        self.load(array.view(), x, 0)
+        on_host(self, x, false, work)
     }
 
     /// Ends the array and returns its numbers.
@@ -347,8 +341,7 @@ pub trait Place: Send + Sync {
     /// Multiplies the first images of `images` by bounds of φ'' (`spread` is false), or by the standard deviation of φ'
     /// under noise; see [`crate::data_term::Misfit`].
     fn weigh(&self, by: &Weighing<'_>, spread: bool, views: &[usize], images: &mut Array) -> Result<()> {
-        self.change(images, &mut |images| by.weigh(spread, views, images))?;
-        by.fault()
+        by.weigh(self, spread, views, images)
     }
 
     /// Weights and filters the first images of `images`, the measured views `views`, and adds their distance-weighted
@@ -374,14 +367,12 @@ pub trait Place: Send + Sync {
 
     /// A proximal gradient step with `penalty`.
     fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+        self.update_around(step, penalty)
+    }
+
+    /// The same with the proximal map on the host, wherever the arrays are.
+    fn update_around(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
         let ProximalStep { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
-        if let [Some(gradient), Some(ahead), Some(x)] = [&mut *gradient, &mut *ahead, &mut *x].map(Array::on_host_mut) {
-            let [gradient, ahead, x] = [gradient, ahead, x].map(flat_mut);
-            let towards = towards.and_then(|(to, share)| Some((flat(to.on_host()?), share)));
-            let inside = inside.and_then(Mask::on_host).and_then(|inside| inside.as_slice());
-            penalty.update(Update { gradient, ahead, x, step, momentum, towards, inside }, tau);
-            return penalty.fault();
-        }
         // The argument of the proximal map, in `gradient`.
         self.map(&ADD, [1.0, f64::from(step)], gradient, &[ahead])?;
         if let Some((towards, share)) = towards {
@@ -393,7 +384,7 @@ pub trait Place: Send + Sync {
         }
         self.change(gradient, &mut |v| {
             let mut u = Array3::zeros(v.raw_dim());
-            penalty.prox(flat(v), tau, flat_mut(&mut u));
+            penalty.prox(v.as_slice().unwrap_or_default(), tau, u.as_slice_mut().unwrap_or_default());
             *v = u;
         })?;
         penalty.fault()?;
@@ -419,7 +410,9 @@ pub trait Place: Send + Sync {
     fn slope(&self, slope: &VariationSlope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
         let x = self.read(x)?;
         let mut sum = 0.0;
-        self.change(out, &mut |out| sum = (slope.host)(x.as_slice().unwrap_or_default(), flat_mut(out)))?;
+        self.change(out, &mut |out| {
+            sum = (slope.host)(x.as_slice().unwrap_or_default(), out.as_slice_mut().unwrap_or_default())
+        })?;
         Ok(sum)
     }
 }
@@ -441,6 +434,15 @@ impl Place for Host {
         Ok(Array::host(from))
     }
 
+    /// A penalty can fuse the whole update into one pass over memory.
+    fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+        let ProximalStep { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
+        let [gradient, ahead, x] = [gradient, ahead, x].map(Array::slice_mut);
+        let towards = towards.map(|(to, share)| (to.slice(), share));
+        penalty.update(Update { gradient, ahead, x, step, momentum, towards, inside: inside.map(Mask::slice) }, tau);
+        penalty.fault()
+    }
+
     fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()> {
         self.change(to, &mut |to| {
             let mut to = to.slice_mut(s![first..first + from.len_of(Axis(0)), .., ..]);
@@ -457,12 +459,21 @@ impl Place for Host {
     }
 }
 
-/// The numbers of an array of this module, in order.
-fn flat(x: &Array3<f32>) -> &[f32] {
-    x.as_slice().unwrap_or_else(|| unreachable!("arrays are contiguous"))
-}
-
-/// Mutable version of [`flat`].
-fn flat_mut(x: &mut Array3<f32>) -> &mut [f32] {
-    x.as_slice_mut().unwrap_or_else(|| unreachable!("arrays are contiguous"))
+/// Lets `work` change an array in the host's memory; its numbers are moved there first if `read`.
+fn on_host<P: Place + ?Sized>(
+    place: &P,
+    x: &mut Array,
+    read: bool,
+    work: &mut dyn FnMut(&mut Array3<f32>),
+) -> Result<()> {
+    if let Some(array) = x.on_host_mut() {
+        work(array);
+        return Ok(());
+    }
+    let mut array = Array3::zeros(x.shape());
+    if read {
+        place.store(x, 0, array.view_mut())?;
+    }
+    work(&mut array);
+    place.load(array.view(), x, 0)
 }

@@ -1165,7 +1165,7 @@ struct DataOn {
     fault: DataFault,
     /// What was measured first.
     first: f32,
-    /// MeasuredViews that were asked for.
+    /// Views that were asked for.
     asked: AtomicU64,
 }
 

@@ -36,14 +36,6 @@ pub const ADD: Map = Map {
     },
 };
 
-/// `x·o`.
-pub const TIMES: Map = Map {
-    name: "product",
-    inputs: 1,
-    wgsl: "x * o",
-    host: |_, out, [x, _]| out.iter_mut().zip(x).for_each(|(o, x)| *o *= x),
-};
-
 /// `x/a`.
 pub const DIVIDE: Map = Map {
     name: "quotient",
@@ -87,12 +79,13 @@ pub const FLOOR: Map = Map {
 
 impl Map {
     /// All maps.
-    pub const ALL: [&'static Map; 6] = [&ADD, &TIMES, &DIVIDE, &RELAX, &INVERT, &FLOOR];
+    pub const ALL: [&'static Map; 5] = [&ADD, &DIVIDE, &RELAX, &INVERT, &FLOOR];
 
     /// Overwrites `out` on the host; all arrays have the same shape and are in standard order.
     pub fn run(&self, factors: [f64; 2], out: &mut Array3<f32>, inputs: &[CowArray<'_, f32, Ix3>]) {
         let inputs: Vec<&[f32]> = inputs.iter().filter_map(|x| x.as_slice()).collect();
-        super::flat_mut(out).par_chunks_mut(PART).enumerate().for_each(|(n, out)| {
+        let out = out.as_slice_mut().unwrap_or_default();
+        out.par_chunks_mut(PART).enumerate().for_each(|(n, out)| {
             let part = n * PART..n * PART + out.len();
             let input = |i: usize| inputs.get(i).map_or(&[][..], |x| &x[part.clone()]);
             (self.host)(factors, out, [input(0), input(1)]);

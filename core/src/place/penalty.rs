@@ -38,7 +38,7 @@ pub trait Penalty: Send {
         None
     }
 
-    /// StatePart for the next call, by name, for checkpoints.
+    /// State for the next call, by name, for checkpoints.
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         vec![]
     }
@@ -102,7 +102,7 @@ pub struct Update<'a> {
     pub ahead: &'a mut [f32],
     /// The coefficients.
     pub x: &'a mut [f32],
-    /// ProximalStep along `gradient`.
+    /// Step along `gradient`.
     pub step: f32,
     /// Extrapolation beyond the new coefficients.
     pub momentum: f32,

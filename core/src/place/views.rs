@@ -1,7 +1,7 @@
 //! Work on measured views: data terms, and FDK's filtered back-projection.
 
 use super::map::squares;
-use super::{Array, Mask};
+use super::{Array, Mask, Place};
 use crate::data_term::Misfit;
 use crate::error::Result;
 use crate::voxel::VoxelView;
@@ -35,7 +35,7 @@ impl Weighing<'_> {
         self.term.map_or(Ok(()), Misfit::fault)
     }
 
-    /// [`super::Place::compare`] on the host.
+    /// [`Place::compare`] on the host.
     pub fn compare(
         &self,
         views: &[usize],
@@ -73,12 +73,15 @@ impl Weighing<'_> {
         misfits.map(|m| m.iter().sum())
     }
 
-    /// [`super::Place::weigh`] on the host.
-    pub fn weigh(&self, spread: bool, views: &[usize], images: &mut Array3<f32>) {
-        let Some(term) = self.term else { return };
-        self.each_image(views, images, |view, measured, values| {
-            if spread { term.spread(view, measured, values) } else { term.curve(view, measured, values) }
-        });
+    /// [`Place::weigh`] on the host, wherever the images are.
+    pub fn weigh<P: Place + ?Sized>(&self, place: &P, spread: bool, views: &[usize], images: &mut Array) -> Result<()> {
+        let Some(term) = self.term else { return Ok(()) };
+        place.change(images, &mut |images| {
+            self.each_image(views, images, |view, measured, values| {
+                if spread { term.spread(view, measured, values) } else { term.curve(view, measured, values) }
+            });
+        })?;
+        self.fault()
     }
 
     /// Calls `work` with each of the first images, its view and its measurement. Returns the results in the order of

@@ -1,6 +1,5 @@
 //! Edges of a volume, and their normals.
 
-use super::on_host_mut;
 use conefield_core::error::Result;
 use conefield_core::place::Array;
 use conefield_core::regularizer::Guide;
@@ -29,7 +28,7 @@ impl Edges {
 
     /// The components along x, y and z, on the host.
     pub fn vectors(&self) -> [&[f32]; 3] {
-        self.n.each_ref().map(super::on_host)
+        self.n.each_ref().map(Array::slice)
     }
 
     /// The same edges for a place with kernels.
@@ -48,7 +47,7 @@ impl Edges {
         let x = x.as_standard_layout();
         let Some(all) = x.as_slice() else { return };
         let at = |i: usize| &all[i * plane..(i + 1) * plane];
-        let [a, b, c] = self.n.each_mut().map(on_host_mut);
+        let [a, b, c] = self.n.each_mut().map(Array::slice_mut);
         let planes = a.par_chunks_mut(plane).zip(b.par_chunks_mut(plane)).zip(c.par_chunks_mut(plane));
         let squares: Vec<f64> = planes
             .enumerate()

@@ -27,10 +27,8 @@ pub mod shared;
 pub mod stop;
 pub mod tv;
 
-use conefield_core::place::Array;
 use conefield_core::scan::ScanHeader;
 use conefield_core::scene::SupportRule;
-use ndarray::Array3;
 
 pub use drive::{Iteration, Pass};
 pub use problem::Problem;
@@ -43,19 +41,4 @@ pub fn mask_bytes(rule: SupportRule, header: &ScanHeader) -> u64 {
         SupportRule::Box => 0,
         SupportRule::Carve => header.voxels(),
     }
-}
-
-/// The data of a contiguous array.
-pub(crate) fn flat(x: &Array3<f32>) -> &[f32] {
-    x.as_slice().unwrap_or_else(|| unreachable!("arrays of this crate are contiguous"))
-}
-
-/// The data of an array on the host; nothing if it lives elsewhere.
-pub(crate) fn on_host(x: &Array) -> &[f32] {
-    x.on_host().map_or(&[], flat)
-}
-
-/// Mutable version of [`on_host`].
-pub(crate) fn on_host_mut(x: &mut Array) -> &mut [f32] {
-    x.on_host_mut().and_then(|x| x.as_slice_mut()).unwrap_or_default()
 }

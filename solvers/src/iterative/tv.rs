@@ -6,7 +6,6 @@
 //! slopes along them (Ehrhardt and Betcke, SIAM J. Imaging Sci. 9(3), 2016, whose edges come from another image).
 
 use super::edges::Edges;
-use super::on_host_mut;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::place::{ADD, Array, Place, VariationSlope};
@@ -186,7 +185,7 @@ impl TvProx {
         let plane = ny * nz;
         let bounds = split.bounds(nx);
         let edges = self.edges.as_ref().map(Edges::vectors);
-        let dual = self.dual.each_mut().map(on_host_mut);
+        let dual = self.dual.each_mut().map(Array::slice_mut);
         // Copies of the neighbour's planes on both sides of every inner bound.
         let mut halos: Vec<([Vec<f32>; 3], Vec<f32>)> = bounds[1..bounds.len() - 1]
             .iter()

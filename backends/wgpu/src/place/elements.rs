@@ -1,7 +1,7 @@
 //! Elementwise maps, masks and reductions.
 
 use super::launch::{Room, Task, each, summing};
-use super::{Array, Mask, parts, plane};
+use super::{Array, Mask, flag, parts, plane};
 use crate::Shared;
 use crate::source::{Access, Source};
 use conefield_core::error::Result;
@@ -76,8 +76,8 @@ pub(super) fn keep(shared: &Shared, room: &mut Room, x: &mut Array, inside: &Mas
     let mut source = begun();
     source.bind("out", Access::Write, "array<f32>");
     source.bind("inside", Access::Read, "array<u32>");
-    let body = "if ((inside[i / 32u] >> (i % 32u)) & 1u) == 0u { out[i] = elements.a; }";
-    source.add("mask", &each("elements", body));
+    let body = format!("if !{} {{ out[i] = elements.a; }}", flag("inside", "i"));
+    source.add("mask", &each("elements", &body));
     let plane = plane(x.shape());
     for (part, inside) in parts(x).iter().zip(parts(inside)) {
         let bind = [("out", &part.buffer), ("inside", &inside.buffer)];

@@ -16,7 +16,6 @@ mod rays;
 mod stencils;
 
 use crate::Shared;
-use crate::compose::fragment_of;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
 use conefield_core::place::{
@@ -58,7 +57,7 @@ impl DevicePlace {
         self.room.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Planes along the first axis that one buffer holds, of elements of `bits`.
+    /// Planes along the first axis of each part of an array.
     fn split(&self, shape: [usize; 3]) -> Result<Vec<Range<usize>>> {
         let plane = 4 * (shape[1] * shape[2]) as u64;
         let bytes = self.shared.gpu.adapter.bound_bytes();
@@ -67,11 +66,16 @@ impl DevicePlace {
             let what = format!("a plane or view of {plane} bytes is larger than a buffer of {bytes} bytes");
             return Err(self.shared.gpu.error(what));
         }
-        // Chunks of nearly the same size.
+        // Parts of nearly the same size.
         let parts = shape[0].div_ceil(most).max(1);
         let each = shape[0].div_ceil(parts).max(1);
         Ok((0..shape[0]).step_by(each).map(|at| at..(at + each).min(shape[0])).collect())
     }
+}
+
+/// Whether element i of a mask is set, in WGSL.
+fn flag(mask: &str, i: &str) -> String {
+    format!("((({mask}[{i} / 32u] >> ({i} % 32u)) & 1u) == 1u)")
 }
 
 /// Numbers per plane.
@@ -144,7 +148,7 @@ impl Place for DevicePlace {
     }
 
     fn views<'a>(&self, measured: &'a Array3<f32>) -> Result<MeasuredViews<'a>> {
-        // MeasuredViews that do not fit are loaded in every pass.
+        // Views that do not fit are loaded in every pass.
         let here = match self.zeros(measured.dim().into()) {
             Ok(mut here) => {
                 self.load(measured.view(), &mut here, 0)?;
@@ -226,10 +230,7 @@ impl Place for DevicePlace {
     fn weigh(&self, by: &Weighing<'_>, spread: bool, views: &[usize], images: &mut Array) -> Result<()> {
         match by.term.and_then(|term| term.wgsl()) {
             Some(term) => pixels::weigh(self, by, &term, spread, views, images),
-            None => {
-                self.change(images, &mut |images| by.weigh(spread, views, images))?;
-                by.fault()
-            }
+            None => by.weigh(self, spread, views, images),
         }
     }
 
@@ -244,18 +245,10 @@ impl Place for DevicePlace {
     }
 
     fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
-        if penalty.kernels().is_some() {
-            return stencils::update(&self.shared, &mut self.room(), step, penalty);
+        match penalty.kernels() {
+            Some(kernels) => stencils::update(&self.shared, &mut self.room(), step, kernels),
+            None => self.update_around(step, penalty),
         }
-        // The proximal map runs on the host.
-        stencils::argument(&self.shared, &mut self.room(), &step)?;
-        self.change(step.gradient, &mut |v| {
-            let mut u = Array3::zeros(v.raw_dim());
-            penalty.prox(v.as_slice().unwrap_or_default(), step.tau, u.as_slice_mut().unwrap_or_default());
-            *v = u;
-        })?;
-        penalty.fault()?;
-        stencils::finish(&self.shared, &mut self.room(), step)
     }
 
     fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {
@@ -279,11 +272,4 @@ impl Place for DevicePlace {
     fn slope(&self, slope: &VariationSlope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
         stencils::slope(&self.shared, &mut self.room(), slope, x, out)
     }
-}
-
-/// The fragment of a projector.
-fn projector_fragment(projector: &dyn VoxelProjector) -> Result<(String, conefield_core::wgsl::Fragment)> {
-    let name = format!("projector ({})", projector.describe());
-    let fragment = fragment_of(&name, projector.wgsl())?;
-    Ok((name, fragment))
 }

@@ -1,7 +1,7 @@
 //! Data terms: computed line integrals against measured ones.
 
 use super::launch::{Room, Task, each, summing};
-use super::{Array, Chunk, DevicePlace, parts, plane};
+use super::{Array, Chunk, DevicePlace, flag, parts, plane};
 use crate::compose::fragment_of;
 use crate::source::{Access, Source};
 use conefield_core::error::Result;
@@ -124,10 +124,10 @@ pub(super) fn compare(
     images: &mut Array,
 ) -> Result<[f64; 2]> {
     let mut source = begun(by, term)?;
-    let inside = if by.shadow.is_some() { "((shadow[all / 32u] >> (all % 32u)) & 1u) == 1u" } else { "true" };
+    let inside = if by.shadow.is_some() { flag("shadow", "all") } else { "true".into() };
     let weight = if by.weights.is_some() { "weights[all]" } else { "1.0" };
     let derivative = if term.is_some() { "term_differentiate(p, r)" } else { "vec2<f32>(0.5 * r * r, r)" };
-    let body = include_str!("../kernels/compare.wgsl").replace("INSIDE", inside).replace("WEIGHT", weight);
+    let body = include_str!("../kernels/compare.wgsl").replace("INSIDE", &inside).replace("WEIGHT", weight);
     summing(&mut source, "pixels", &body.replace("DERIVATIVE", derivative), false);
     let pixels = plane(images.shape());
     let mut sums = [0.0; 2];

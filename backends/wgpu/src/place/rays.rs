@@ -3,6 +3,7 @@
 use super::launch::{Room, Task, each};
 use super::{Array, parts, plane};
 use crate::Shared;
+use crate::compose::fragment_of;
 use crate::device::Atomics;
 use crate::source::{Access, Source};
 use conefield_core::error::Result;
@@ -63,20 +64,25 @@ fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> S
 /// A projector's kernels: they take line integrals of the buffer `volume` and add up `lines`, or the reverse.
 pub(super) struct Walks<'a> {
     shared: &'a Shared,
-    kernels: [Source; 2],
+    name: String,
+    fragment: Fragment,
 }
 
 impl<'a> Walks<'a> {
     /// Refuses a projector without WGSL.
     pub(super) fn new(shared: &'a Shared, projector: &dyn VoxelProjector) -> Result<Self> {
-        let (name, fragment) = super::projector_fragment(projector)?;
-        let atomics = shared.gpu.adapter.atomics;
-        Ok(Self { shared, kernels: [true, false].map(|forward| kernel(&fragment, &name, atomics, forward)) })
+        let name = format!("projector ({})", projector.describe());
+        let fragment = fragment_of(&name, projector.wgsl())?;
+        Ok(Self { shared, name, fragment })
+    }
+
+    fn kernel(&self, forward: bool) -> Source {
+        kernel(&self.fragment, &self.name, self.shared.gpu.adapter.atomics, forward)
     }
 
     /// Refuses invalid WGSL.
     pub(super) fn validate(&self) -> Result<()> {
-        self.kernels.iter().try_for_each(Source::validate)
+        [true, false].into_iter().try_for_each(|forward| self.kernel(forward).validate())
     }
 
     pub(super) fn forward(
@@ -116,7 +122,7 @@ impl<'a> Walks<'a> {
     ) -> Result<()> {
         let pixels = plane(images.shape());
         let label = if forward { "forward projection" } else { "adjoint of projection" };
-        let source = &self.kernels[usize::from(!forward)];
+        let source = &self.kernel(forward);
         for part in parts(images) {
             let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
             let data: Vec<f32> = some.iter().flat_map(|&v| projected(geometry, v)).flatten().collect();

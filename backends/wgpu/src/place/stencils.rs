@@ -5,14 +5,14 @@
 //! also reads the planes beside a part, which are copied on the device.
 
 use super::launch::{ARRAY, Room, Task, each, summing};
-use super::{Array, Chunk, parts, plane};
+use super::{Array, Chunk, flag, parts, plane};
 use crate::Shared;
 use crate::compose::fragment_of;
 use crate::source::{Access, Source};
 use Access::{Read, Write};
 use conefield_core::error::Result;
 use conefield_core::place::{ProximalStep, VariationSlope};
-use conefield_core::regularizer::{Dual, Guide, Kernels, Penalty};
+use conefield_core::regularizer::{Dual, Guide, Kernels};
 
 /// `Stencil` in `kernels/stencil.wgsl`.
 #[repr(C)]
@@ -33,8 +33,6 @@ struct Stencil {
 /// Names of the dual variables and of the vectors that guide the penalty, along x, y and z.
 const DUAL: [&str; 3] = ["dual_x", "dual_y", "dual_z"];
 const GUIDE: [&str; 3] = ["guide_x", "guide_y", "guide_z"];
-/// [`GUIDE`] at voxel i in WGSL.
-const GUIDED: &str = "vec3<f32>(guide_x[i], guide_y[i], guide_z[i])";
 const PRIMAL: (&str, &str) = ("primal", include_str!("../kernels/primal.wgsl"));
 const VALUES: (&str, &str) = ("values", include_str!("../kernels/values.wgsl"));
 /// Bindings of [`VALUES`].
@@ -150,7 +148,7 @@ fn of_step<'a>(shared: &'a Shared, step: &ProximalStep<'_>) -> Volume<'a> {
 }
 
 /// Overwrites the gradient with the argument of the proximal map.
-pub(super) fn argument(shared: &Shared, room: &mut Room, step: &ProximalStep<'_>) -> Result<()> {
+fn argument(shared: &Shared, room: &mut Room, step: &ProximalStep<'_>) -> Result<()> {
     let mut bindings = vec![("gradient", Write), ("ahead", Read)];
     let mut v = "let z = ahead[i];\n        var v = z + stencil.step * gradient[i];\n".to_owned();
     if step.towards.is_some() {
@@ -160,7 +158,7 @@ pub(super) fn argument(shared: &Shared, room: &mut Room, step: &ProximalStep<'_>
     if step.inside.is_some() {
         bindings.push(("inside", Read));
         // Values far below 0 stay at 0, whatever their neighbours are.
-        v += "        if ((inside[i / 32u] >> (i % 32u)) & 1u) == 0u { v = -3.4e38; }\n";
+        v += &format!("        if !{} {{ v = -3.4e38; }}\n", flag("inside", "i"));
     }
     let source = kernel(&bindings, &[], &(v + "        gradient[i] = v;"));
     let volume = of_step(shared, step);
@@ -179,8 +177,8 @@ fn extrapolation(u: &str) -> String {
     format!("let u = {u};\n        ahead[i] = u + stencil.momentum * (u - x[i]);\n        x[i] = u;")
 }
 
-/// Ends an update after a proximal map whose result is in the gradient.
-pub(super) fn finish(shared: &Shared, room: &mut Room, step: ProximalStep<'_>) -> Result<()> {
+/// Ends an update without a penalty: the proximal map only clips.
+fn finish(shared: &Shared, room: &mut Room, step: ProximalStep<'_>) -> Result<()> {
     let flat = [("gradient", Read), ("x", Write), ("ahead", Write)];
     let source = kernel(&flat, &[], &extrapolation("max(0.0, gradient[i])"));
     let arrays: [(&str, &Array); 3] = [("gradient", step.gradient), ("x", step.x), ("ahead", step.ahead)];
@@ -188,14 +186,9 @@ pub(super) fn finish(shared: &Shared, room: &mut Room, step: ProximalStep<'_>) -
 }
 
 /// A whole update with a penalty that has kernels.
-pub(super) fn update(
-    shared: &Shared,
-    room: &mut Room,
-    step: ProximalStep<'_>,
-    penalty: &mut dyn Penalty,
-) -> Result<()> {
+pub(super) fn update(shared: &Shared, room: &mut Room, step: ProximalStep<'_>, kernels: Kernels<'_>) -> Result<()> {
     argument(shared, room, &step)?;
-    let Some(Kernels::Dual(dual)) = penalty.kernels() else { return finish(shared, room, step) };
+    let Kernels::Dual(dual) = kernels else { return finish(shared, room, step) };
     if step.tau < f32::MIN_POSITIVE {
         return finish(shared, room, step);
     }
@@ -212,12 +205,7 @@ pub(super) fn update(
     let primal = kernel(&primal, &[PRIMAL], "ahead[i] = primal_of(i);");
     let mut bindings = [&of_dual(Write)[..], &BESIDE].concat();
     let mut arrays = [&p[..], &[("values", &*step.ahead)]].concat();
-    let mut guide = "vec3<f32>()";
-    if let Some(Guide { vectors, .. }) = &dual.guide {
-        bindings.extend(GUIDE.map(|name| (name, Read)));
-        arrays.extend(GUIDE.iter().zip(vectors).map(|(name, x)| (*name, &**x)));
-        guide = GUIDED;
-    }
+    let guide = guided(&dual, &mut bindings, &mut arrays);
     let body = include_str!("../kernels/ascend.wgsl").replace("GUIDE", guide);
     let ascend = kernel(&bindings, &[VALUES, ("penalty", &fragment)], &body);
     let of_primal = [&p[..], &[("gradient", &*step.gradient), ("ahead", &*step.ahead)]].concat();
@@ -231,17 +219,24 @@ pub(super) fn update(
     volume.run(room, ("extrapolation", &source), &arrays, Some(p[0].1))
 }
 
+/// Adds the bindings and arrays of the vectors that guide a penalty. Returns the vector at voxel i in WGSL.
+fn guided<'a>(
+    dual: &'a Dual<'_>,
+    bindings: &mut Vec<(&str, Access)>,
+    arrays: &mut Vec<(&'a str, &'a Array)>,
+) -> &'static str {
+    let Some(Guide { vectors, .. }) = &dual.guide else { return "vec3<f32>()" };
+    bindings.extend(GUIDE.map(|name| (name, Read)));
+    arrays.extend(GUIDE.iter().zip(vectors).map(|(name, x)| (*name, &**x)));
+    "vec3<f32>(guide_x[i], guide_y[i], guide_z[i])"
+}
+
 /// The value of a penalty of differences.
 pub(super) fn value(shared: &Shared, room: &mut Room, dual: &Dual<'_>, x: &Array) -> Result<f64> {
     let fragment = fragment_of("the prior", Some(dual.fragment.clone()))?.named("penalty_");
     let mut bindings = BESIDE.to_vec();
     let mut arrays = vec![("values", x)];
-    let mut guide = "vec3<f32>()";
-    if let Some(Guide { vectors, .. }) = &dual.guide {
-        bindings.extend(GUIDE.map(|name| (name, Read)));
-        arrays.extend(GUIDE.iter().zip(vectors).map(|(name, x)| (*name, &**x)));
-        guide = GUIDED;
-    }
+    let guide = guided(dual, &mut bindings, &mut arrays);
     let mut source = begun(&bindings, &[VALUES, ("penalty", &fragment)]);
     let body = format!("let v = vec2<f32>(penalty_cost(differences(place(i)), {guide}), 0.0);");
     summing(&mut source, "stencil", &body, false);

@@ -149,7 +149,7 @@ unsafe extern "C" fn state(stage: *mut c_void, index: usize, out: *mut Conefield
         let (name, values) = entry.ok_or_else(|| Error::unsupported("state", "the index is too large"))?;
         let values = match values {
             StatePart::Host(values) => values,
-            StatePart::Placed(array) => array.on_host_mut().and_then(|x| x.as_slice_mut()).unwrap_or_default(),
+            StatePart::Placed(array) => array.slice_mut(),
         };
         let name = ConefieldStr { data: name.as_ptr(), length: name.len() };
         // SAFETY: see `shims/mod.rs`.
