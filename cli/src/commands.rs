@@ -102,9 +102,12 @@ pub struct General {
     /// Worker threads [default: one per core].
     #[arg(long, global = true, value_name = "N", help_heading = "General options", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
-    /// Memory limit, such as 8GiB [default: available memory]. A command that needs more is refused.
+    /// Memory limit, such as 8GiB [default: available memory]. Arrays beyond it live in scratch files.
     #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = conefield::parse::bytes)]
     pub memory: Option<u64>,
+    /// Folder for scratch files, on a fast disk [default: where the output goes; commands without one use none].
+    #[arg(long, global = true, value_name = "FOLDER", help_heading = "General options")]
+    pub scratch: Option<PathBuf>,
     /// Load this plugin, or every plugin in this folder; repeatable.
     #[arg(long = "plugin", global = true, value_name = "PATH", help_heading = "General options")]
     pub plugins: Vec<PathBuf>,
@@ -126,6 +129,10 @@ impl General {
         }
         if self.allow_plugins_from_spec {
             all.push("--allow-plugins-from-spec".into());
+        }
+        if let Some(folder) = &self.scratch {
+            all.push("--scratch".into());
+            all.push(folder.into());
         }
         let numbers = [("--threads", self.threads.map(u64::from)), ("--memory", self.memory)];
         for (flag, number) in numbers {

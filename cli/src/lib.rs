@@ -33,9 +33,8 @@ struct Cli {
 const SUCCESS: u8 = 0;
 const FAILURE: u8 = 1;
 
-/// Runs the command line of this process. `held` returns the bytes allocated now.
-pub fn main(held: fn() -> u64) -> ExitCode {
-    memory::count(held);
+/// Runs the command line of this process.
+pub fn main() -> ExitCode {
     ExitCode::from(run(std::env::args_os(), None))
 }
 
@@ -56,6 +55,7 @@ pub fn run(args: impl IntoIterator<Item = OsString>, program: Option<Vec<OsStrin
         return FAILURE;
     }
     memory::set_budget(general.memory);
+    general.scratch.iter().for_each(|folder| memory::allow_scratch(folder));
     if let Some(n) = general.threads
         && let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global()
     {

@@ -1,11 +1,11 @@
 //! The `conefield` command.
 
-use peak_alloc::PeakAlloc;
+use conefield::scratch::Allocator;
 
-/// Counts allocated bytes, so that readers can be limited.
+/// Keeps arrays beyond the memory limit in files.
 #[global_allocator]
-static HEAP: PeakAlloc = PeakAlloc;
+static HEAP: Allocator = Allocator;
 
 fn main() -> std::process::ExitCode {
-    conefield_cli::main(|| HEAP.current_usage() as u64)
+    conefield_cli::main()
 }

@@ -17,7 +17,8 @@
 //! - [`specs`]: the shipped specs by name; [`method`]: a spec, built, with its memory.
 //! - [`files`]: volumes, scans and weights by file name; [`plugins`]: libraries with stages; [`parse`]: parsers of
 //!   values.
-//! - [`backend`]: backends; [`memory`]: a run's memory and the available memory; [`machine`]: the current machine.
+//! - [`backend`]: backends; [`memory`]: a run's memory and the available memory; [`scratch`]: arrays beyond it;
+//!   [`machine`]: the current machine.
 //! - [`session`]: every run, from its inputs ([`input`]) to its [`record`].
 //! - [`explain`]: explanation of a spec; [`score`]: comparison of a volume with its reference.
 //! - [`simulation`], [`pretraining`], [`projection`]: the work of the commands of these names.
@@ -40,6 +41,7 @@ pub mod projection;
 pub mod reconstruct;
 pub mod record;
 pub mod score;
+pub mod scratch;
 pub mod session;
 pub mod shipped;
 pub mod simulation;

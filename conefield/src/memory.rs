@@ -3,14 +3,17 @@
 //! An estimate is the peak over reading, training and export. It omits everything that is always small, except the
 //! program itself.
 
+use crate::scratch;
 use conefield_core::method::{Needs, Plan};
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result, allowance};
 use conefield_evaluation::report::text::bytes;
 use conefield_io::{SLAB_BYTES, ScanSize};
 use serde::Serialize;
+use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use sysinfo::{MemoryRefreshKind, ProcessesToUpdate, RefreshKind, System, get_current_pid};
+use tracing::info;
 
 /// Code, threads and tables of libraries.
 const PROGRAM: u64 = 24 << 20;
@@ -18,23 +21,22 @@ const PROGRAM: u64 = 24 << 20;
 /// The limit of `--memory`.
 static BUDGET: OnceLock<u64> = OnceLock::new();
 
-/// Returns the bytes allocated by the process, if the allocator counts them.
-static HELD: OnceLock<fn() -> u64> = OnceLock::new();
+/// The folder of `--scratch`, or the one beside an output.
+static SCRATCH: OnceLock<PathBuf> = OnceLock::new();
 
-/// Makes readers reserve memory in the allowance.
-pub fn count(held: fn() -> u64) {
-    let _ = HELD.set(held);
-}
-
-/// Sets the memory limit; `None` means the available memory. Readers check it as they allocate.
+/// Sets the memory limit; `None` means the available memory. Readers check it as they allocate. For programs whose
+/// allocator is [`scratch::Allocator`].
 pub fn set_budget(bytes: Option<u64>) {
     if let Some(bytes) = bytes {
         let _ = BUDGET.set(bytes);
     }
-    if let Some(held) = HELD.get() {
-        let most = bytes.unwrap_or(u64::MAX).min(available());
-        allowance::set_memory(most, *held);
-    }
+    allowance::set_memory(bytes.unwrap_or(u64::MAX).min(available()), scratch::allocated);
+}
+
+/// Allows arrays that do not fit into memory to live on the disk of `folder`. The first call counts. For programs whose
+/// allocator is [`scratch::Allocator`].
+pub fn allow_scratch(folder: &Path) {
+    let _ = SCRATCH.set(folder.to_owned());
 }
 
 /// Bytes at the peak, by use.
@@ -83,13 +85,24 @@ impl Memory {
         format!("{}: {}", bytes(self.total), parts.collect::<Vec<_>>().join(", "))
     }
 
-    /// Refuses an estimate that does not fit, with figures; `smaller` lists what would fit into the given bytes.
+    /// Moves arrays to the disk if the estimate does not fit and a folder is allowed for them. Else refuses it, with
+    /// figures; `smaller` lists what would fit into the given bytes.
     pub fn check(&self, smaller: impl FnOnce(u64) -> Vec<String>) -> Result<()> {
         let (available, whose) = match BUDGET.get() {
             Some(bytes) => (*bytes, "--memory allows"),
             None => (available(), "are available"),
         };
         if self.total <= available {
+            return Ok(());
+        }
+        // What is read and written at random stays in memory.
+        let stays = self.model + self.optimizer;
+        if let Some(folder) = SCRATCH.get().filter(|_| available >= scratch::LEAST && stays <= available / 4) {
+            let beside = self.total + self.total / 8;
+            scratch::begin(folder, available, beside)?;
+            allowance::set_memory(available.saturating_add(beside), scratch::allocated);
+            let (limit, place) = (bytes(available), folder.display());
+            info!("needs {}: stays below {limit} of memory; scratch files in {place} hold the rest", self.line());
             return Ok(());
         }
         let smaller = smaller(available);

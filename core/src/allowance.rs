@@ -5,27 +5,45 @@
 
 use crate::error::{Error, Result};
 use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU64, Ordering};
 
-/// The byte limit of the process, and the function that returns its current allocation.
-static MEMORY: OnceLock<(u64, fn() -> u64)> = OnceLock::new();
+/// The byte limit of the process.
+static MOST: AtomicU64 = AtomicU64::new(u64::MAX);
 
-/// Limits the process to `most` bytes; `held` returns its current allocation. Only the first call has an effect.
-/// Without it there is no limit.
+/// The function that returns the current allocation of the process.
+static HELD: OnceLock<fn() -> u64> = OnceLock::new();
+
+/// Bytes that may be at work at once.
+static ROOM: AtomicU64 = AtomicU64::new(u64::MAX);
+
+/// Limits the process to `most` bytes; `held` returns its current allocation. Without it there is no limit.
 pub fn set_memory(most: u64, held: fn() -> u64) {
-    let _ = MEMORY.set((most, held));
+    MOST.store(most, Ordering::Relaxed);
+    let _ = HELD.set(held);
+}
+
+/// Says that memory holds only `bytes` of the arrays at once; the others are on the disk meanwhile.
+pub fn set_room(bytes: u64) {
+    ROOM.store(bytes, Ordering::Relaxed);
+}
+
+/// Bytes of an array that may be at work at once. A method that passes through a larger one many times does so part by
+/// part.
+pub fn room() -> u64 {
+    ROOM.load(Ordering::Relaxed)
 }
 
 /// Checks that `bytes` more may be allocated for `field` of the file `place`. This is a check, not a reservation: a
 /// single thread reads.
 pub fn memory(place: &str, field: &str, bytes: u64) -> Result<()> {
-    let Some((most, held)) = MEMORY.get() else { return Ok(()) };
-    let held = held();
-    if held.saturating_add(bytes) <= *most {
+    let Some(held) = HELD.get() else { return Ok(()) };
+    let (held, most) = (held(), MOST.load(Ordering::Relaxed));
+    if held.saturating_add(bytes) <= most {
         return Ok(());
     }
     let mib = |n: u64| format!("{} MiB", n.div_ceil(1 << 20));
     let found = format!("{} more, with {} already held", mib(bytes), mib(held));
-    Err(Error::invalid(place, field, found, format!("at most {} in total, set by --memory or the system", mib(*most))))
+    Err(Error::invalid(place, field, found, format!("at most {} in total, set by --memory or the system", mib(most))))
 }
 
 /// The same check for `count` 32-bit numbers.

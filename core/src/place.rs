@@ -15,6 +15,7 @@ pub use map::{ADD, DIVIDE, FLOOR, INVERT, Map, RELAX, Reduction, squares};
 pub use penalty::{Dual, Guide, Kernels, Penalty, Update};
 pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 
+use crate::allowance;
 use crate::error::Result;
 use crate::geometry::Geometry;
 use crate::voxel::VoxelProjector;
@@ -212,6 +213,11 @@ pub trait Place: Send + Sync {
         Ok(())
     }
 
+    /// Bytes of an array that a method may pass through many times.
+    fn room(&self) -> u64 {
+        u64::MAX
+    }
+
     /// An array with the numbers of `from`.
     fn adopt(&self, from: Array3<f32>) -> Result<Array> {
         let mut array = self.zeros(from.dim().into())?;
@@ -345,13 +351,14 @@ pub trait Place: Send + Sync {
     }
 
     /// Weights and filters the first images of `images`, the measured views `views`, and adds their distance-weighted
-    /// back-projection to `volume`.
+    /// back-projection to `slab`, planes of the volume along x from plane `first` on.
     fn filtered(
         &self,
         work: &dyn FilteredViews,
         views: &[usize],
         images: &mut Array,
-        volume: &mut Array,
+        slab: &mut Array,
+        first: usize,
     ) -> Result<()> {
         self.change(images, &mut |images| {
             let each = images.axis_iter_mut(Axis(0)).into_par_iter().zip(views);
@@ -360,8 +367,8 @@ pub trait Place: Send + Sync {
             });
         })?;
         let images = self.read(images)?;
-        self.change(volume, &mut |volume| {
-            work.backproject(views, images.slice(s![..views.len(), .., ..]), volume.view_mut());
+        self.change(slab, &mut |slab| {
+            work.backproject(views, images.slice(s![..views.len(), .., ..]), slab.view_mut(), first);
         })
     }
 
@@ -428,6 +435,10 @@ impl Place for Host {
 
     fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
         Ok(Array::host(Array3::zeros(shape)))
+    }
+
+    fn room(&self) -> u64 {
+        allowance::room()
     }
 
     fn adopt(&self, from: Array3<f32>) -> Result<Array> {

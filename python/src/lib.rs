@@ -20,12 +20,12 @@ mod stages;
 mod volume;
 mod work;
 
-use peak_alloc::PeakAlloc;
+use conefield::scratch::Allocator;
 use pyo3::prelude::*;
 
 /// Counts allocated bytes, so that the memory of readers can be limited.
 #[global_allocator]
-static HEAP: PeakAlloc = PeakAlloc;
+static HEAP: Allocator = Allocator;
 
 #[pymodule]
 mod _native {
@@ -53,7 +53,6 @@ mod _native {
 
     #[pymodule_init]
     fn init(m: &Bound<'_, PyModule>) -> PyResult<()> {
-        conefield::memory::count(|| crate::HEAP.current_usage() as u64);
         conefield::memory::set_budget(None);
         m.add("__version__", env!("CARGO_PKG_VERSION"))
     }

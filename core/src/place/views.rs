@@ -111,8 +111,8 @@ pub trait FilteredViews: Sync {
     /// Weights and filters the image of a view, `[row, column]`.
     fn filter(&self, view: usize, image: &mut [f32]);
 
-    /// Adds the filtered images of some views to `volume`.
-    fn backproject(&self, views: &[usize], images: ArrayView3<'_, f32>, volume: ArrayViewMut3<'_, f32>);
+    /// Adds the filtered images of some views to `slab`, planes of the volume along x from plane `first` on.
+    fn backproject(&self, views: &[usize], images: ArrayView3<'_, f32>, slab: ArrayViewMut3<'_, f32>, first: usize);
 
     /// The weights of a view in numbers, for a device.
     fn weights(&self, view: usize) -> RowWeights;
@@ -121,7 +121,7 @@ pub trait FilteredViews: Sync {
     /// columns, as many as a row has.
     fn taps(&self) -> Vec<f32>;
 
-    /// A view for back-projection.
+    /// A view for back-projection; voxel (0, 0, 0) is the first one of the volume.
     fn seen(&self, view: usize) -> VoxelView;
 }
 

@@ -16,28 +16,30 @@ use rayon::prelude::*;
 
 /// Lines of voxels per task, along x and along y. A tile of 512 voxels along z, and the columns of pixels that it meets in
 /// a view, take a quarter of a MiB and stay in a core's cache while all views are added.
-const TILE: usize = 8;
+pub const TILE: usize = 8;
 /// Largest slant of a line of voxels: change in columns per change in rows. Steeper lines are processed voxel by voxel.
 const SLANT: f64 = 0.5;
 
-/// Adds the views `views` of `geometry`, with the pixels `pixels` and the scales `s_i` in `scales` (mm²), to `volume`.
+/// Adds the views `views` of `geometry`, with the pixels `pixels` and the scales `s_i` in `scales` (mm²), to `slab`:
+/// planes of the volume along x, from plane `first` on. The result does not depend on the slabs.
 pub fn backproject<R: Real>(
     geometry: &Geometry,
     views: &[usize],
     pixels: &ColumnMajor<R>,
     scales: &[f64],
-    mut volume: ArrayViewMut3<'_, R>,
+    mut slab: ArrayViewMut3<'_, R>,
+    first: usize,
 ) {
     let seen = |(&v, &scale): (&usize, &f64)| Pinhole::of(geometry, v).voxels(&geometry.volume, scale);
     let all: Vec<VoxelView> = views.iter().zip(scales).map(seen).collect();
     let shape = geometry.volume.shape;
     let zeros = vec![R::ZERO; geometry.detector[0] + 2 * PAD];
     let mut tiles = vec![];
-    for (i, mut rest) in volume.axis_chunks_iter_mut(Axis(0), TILE).enumerate() {
+    for (i, mut rest) in slab.axis_chunks_iter_mut(Axis(0), TILE).enumerate() {
         let ny = rest.dim().1;
         for y in (0..ny).step_by(TILE) {
             let (lines, after) = rest.split_at(Axis(1), TILE.min(ny - y));
-            tiles.push(([i * TILE, y], lines));
+            tiles.push(([first + i * TILE, y], lines));
             rest = after;
         }
     }

@@ -404,7 +404,7 @@ fn by_lines<R: Real>(g: &Geometry, y: &Array3<f64>) -> Array3<R> {
     let views = all_views(g);
     let pixels = ColumnMajor::new(g, &views, y.mapv(R::of).view(), |_, _, _, x| x);
     let mut out = Array3::from_elem(g.volume.shape, R::ZERO);
-    backproject(g, &views, &pixels, &scales(g), out.view_mut());
+    backproject(g, &views, &pixels, &scales(g), out.view_mut(), 0);
     out
 }
 
@@ -450,6 +450,43 @@ proptest! {
             let scale = (dot(&ax, &ax) * dot(&y, &y)).sqrt() + 1e-9;
             prop_assert!((left - right).abs() < 1e-11 * scale, "{}: {left} {right}", p.describe());
             prop_assert!(ax.iter().all(|v| v.is_finite()));
+        }
+    }
+}
+
+/// Planes `first..` along x as a volume of their own.
+fn slab_of(g: &Geometry, planes: Range<usize>) -> Geometry {
+    let mut g = g.clone();
+    let middle = |n: f64| (n - 1.0) / 2.0;
+    let [from, to] = [planes.start as f64, planes.end as f64];
+    g.volume.center[0] += g.volume.spacing[0] * (middle(from + to) - middle(g.volume.shape[0] as f64));
+    g.volume.shape[0] = planes.len();
+    g
+}
+
+/// The line integrals of slabs add up to those of the whole, and each slab gets its part of the adjoint.
+#[test]
+fn slabs_add_up() {
+    for g in [crooked(true), crooked(false), turned(crooked(true), 4.0)] {
+        for projector in [&Joseph {} as &dyn VoxelProjector, &Siddon {}, &Trilinear::default()] {
+            let op = projector.reference();
+            let nx = g.volume.shape[0];
+            let x = noise::<f64>(g.volume.shape, 3);
+            let whole = forward(op, &g, x.view());
+            let y = noise::<f64>([g.views.len(), g.detector[0], g.detector[1]], 5);
+            let back = adjoint(op, &g, y.view());
+            let mut sum = Array3::zeros(whole.raw_dim());
+            let mut worst: f64 = 0.0;
+            for first in (0..nx).step_by(5) {
+                let planes = first..(first + 5).min(nx);
+                let part = slab_of(&g, planes.clone());
+                sum += &forward(op, &part, x.slice(ndarray::s![planes.clone(), .., ..]));
+                let found = adjoint(op, &part, y.view());
+                let want = back.slice(ndarray::s![planes, .., ..]);
+                worst = Zip::from(&found).and(want).fold(worst, |w, a, b| w.max((a - b).abs()));
+            }
+            let off = Zip::from(&sum).and(&whole).fold(0.0f64, |w, a, b| w.max((a - b).abs()));
+            println!("{}: {off:e} {worst:e}", projector.describe());
         }
     }
 }

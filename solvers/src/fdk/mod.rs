@@ -20,13 +20,13 @@ use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, dot, norm, sub};
 use conefield_core::method::{
     Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
 };
-use conefield_core::place::{Array, FLOOR, FilteredViews, RowWeights};
+use conefield_core::place::{Array, FLOOR, FilteredViews, Host, Place, RowWeights};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::SurroundRule;
 use conefield_core::space::Space;
 use conefield_core::voxel::VoxelView;
 use conefield_projectors::voxel::Joseph;
-use conefield_projectors::voxel::backproject::backproject;
+use conefield_projectors::voxel::backproject::{TILE, backproject};
 use conefield_projectors::voxel::layout::{ColumnMajor, Pinhole, column_major_bytes};
 use filter::{Ramp, Window};
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, s};
@@ -34,6 +34,7 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
+use std::sync::Arc;
 use std::time::Instant;
 use weights::{Disc, FdkOrbit, lean, place};
 
@@ -104,8 +105,8 @@ impl Plan for Fdk {
         let upright = &orbit.symmetric(&upright).0;
         let (scan, place) = (job.scan, job.backend.place());
         let run = Backprojection { settings: self, scan, orbit: &orbit, upright, geometry: &geometry, measured };
-        let space = Space::new(scan.header(), place.clone());
-        let mut volume = run.all(&space, start, observer)?;
+        let space = Space::new(scan.header(), place);
+        let (mut volume, place) = run.all(&space, start, observer)?;
         if self.nonnegative {
             place.map(&FLOOR, [0.0; 2], &mut volume, &[])?;
         }
@@ -171,25 +172,41 @@ struct Backprojection<'a> {
 }
 
 impl Backprojection<'_> {
-    /// Back-projects all views, in batches. Reports progress since `start`.
-    fn all(&self, space: &Space, start: Instant, observer: &mut dyn Observer) -> Result<Array> {
-        let mut volume = space.volume()?;
+    /// Back-projects all views, in batches. A volume larger than the room of its place is computed in slabs, each from
+    /// all views, and collected on the host. Reports progress since `start`. Returns the volume with its place.
+    fn all(&self, space: &Space, start: Instant, observer: &mut dyn Observer) -> Result<(Array, Arc<dyn Place>)> {
+        let (place, [nx, ny, nz]) = (space.place(), space.header().volume);
         let at_once = views_at_once(self.geometry.detector, held(space.header()));
         let mut images = images(space, self.geometry.detector, at_once)?;
         let all: Vec<usize> = (0..self.geometry.views.len()).collect();
-        let mut done = 0;
-        for views in all.chunks(at_once) {
-            if observer.cancelled() {
-                return Err(Error::Interrupted { step: done as u64 });
-            }
-            self.load(space, views, &mut images)?;
-            space.place().filtered(self, views, &mut images, &mut volume)?;
-            done += views.len();
-            let share = done as f64 / all.len() as f64;
-            let spent = start.elapsed().as_secs_f64();
-            observer.progress(done as u64, share, spent * (1.0 - share) / share);
+        let planes = slab([nx, ny, nz], place.room());
+        if planes < nx {
+            let count = nx.div_ceil(planes);
+            observer
+                .note(&format!("{count} slabs of at most {planes} planes along x: the views are read {count} times"));
         }
-        Ok(volume)
+        let mut volume = None;
+        let (mut done, whole) = (0, nx.div_ceil(planes) * all.len());
+        for first in (0..nx).step_by(planes) {
+            let mut slab = space.array([planes.min(nx - first), ny, nz])?;
+            for views in all.chunks(at_once) {
+                if observer.cancelled() {
+                    return Err(Error::Interrupted { step: 0 });
+                }
+                self.load(space, views, &mut images)?;
+                place.filtered(self, views, &mut images, &mut slab, first)?;
+                done += views.len();
+                let share = done as f64 / whole as f64;
+                let spent = start.elapsed().as_secs_f64();
+                observer.progress((share * all.len() as f64) as u64, share, spent * (1.0 - share) / share);
+            }
+            if planes >= nx {
+                return Ok((slab, place.clone()));
+            }
+            let volume = volume.get_or_insert_with(|| Array3::zeros([nx, ny, nz]));
+            place.store(&slab, 0, volume.slice_mut(s![first..first + slab.shape()[0], .., ..]))?;
+        }
+        Ok((Array::host(volume.unwrap_or_default()), Arc::new(Host)))
     }
 
     /// Overwrites the first of `images` with the measured images of the consecutive views `views`.
@@ -245,10 +262,10 @@ impl FilteredViews for Backprojection<'_> {
         });
     }
 
-    fn backproject(&self, views: &[usize], images: ArrayView3<'_, f32>, volume: ArrayViewMut3<'_, f32>) {
+    fn backproject(&self, views: &[usize], images: ArrayView3<'_, f32>, slab: ArrayViewMut3<'_, f32>, first: usize) {
         let scales: Vec<f64> = views.iter().map(|&v| self.scale(v)).collect();
         let pixels = ColumnMajor::new(self.geometry, views, images, |_, _, _, x| x);
-        backproject(self.geometry, views, &pixels, &scales, volume);
+        backproject(self.geometry, views, &pixels, &scales, slab, first);
     }
 
     fn weights(&self, view: usize) -> RowWeights {
@@ -331,6 +348,13 @@ fn held(header: &ScanHeader) -> u64 {
 /// Number of views that fit into `bytes`.
 fn views_at_once(detector: [usize; 2], bytes: u64) -> usize {
     (bytes / column_major_bytes::<f32>(detector, 1).max(1)).clamp(1, 64) as usize
+}
+
+/// Planes along x of a slab of at most `room` bytes: whole tiles of the back-projection, at least one.
+fn slab([nx, ny, nz]: [usize; 3], room: u64) -> usize {
+    let plane = (4 * ny * nz) as u64;
+    if plane.saturating_mul(nx as u64) <= room { nx } else { (room / plane.max(1)) as usize / TILE * TILE }
+        .clamp(TILE, nx.max(TILE))
 }
 
 /// Largest spread of the sources along z and slope of the detector rows, as a share of the circle's radius. Calibrated

@@ -82,14 +82,13 @@ pub(super) fn backproject(
     shared: &Shared,
     room: &mut Room,
     work: &dyn FilteredViews,
-    views: &[usize],
-    images: &Array,
-    volume: &mut Array,
+    (views, images): (&[usize], &Array),
+    (slab, first): (&mut Array, usize),
 ) -> Result<()> {
     let [weights, convolve, voxels] = kernels();
     let gpu = &shared.gpu;
     let [_, rows, columns] = images.shape();
-    let shape = volume.shape();
+    let shape = slab.shape();
     let padded = (rows + 2) * (columns + 2);
     let (bytes, most) = (4 * padded as u64, gpu.adapter.bound_bytes());
     if bytes > most {
@@ -126,8 +125,8 @@ pub(super) fn backproject(
             // Four rows and 64 columns per group, and a column of zeros on each side.
             let tiles = some.len() * (rows + 2).div_ceil(4) * (columns + 2).div_ceil(64);
             room.run(shared, task, ("back", uniform), (64 * tiles) as u32)?;
-            for held in parts(volume) {
-                let uniform = |begin, end| Back { begin, end, held: held.planes.start as u32, ..whole };
+            for held in parts(slab) {
+                let uniform = |begin, end| Back { begin, end, held: (first + held.planes.start) as u32, ..whole };
                 let bind = [("volume", &held.buffer)];
                 let task = Task { label: "back-projection", source: &voxels, bind: &bind };
                 room.run(shared, task, ("back", uniform), (held.planes.len() * plane(shape)) as u32)?;

@@ -239,9 +239,10 @@ impl Place for DevicePlace {
         work: &dyn FilteredViews,
         views: &[usize],
         images: &mut Array,
-        volume: &mut Array,
+        slab: &mut Array,
+        first: usize,
     ) -> Result<()> {
-        filtered::backproject(&self.shared, &mut self.room(), work, views, images, volume)
+        filtered::backproject(&self.shared, &mut self.room(), work, (views, images), (slab, first))
     }
 
     fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {

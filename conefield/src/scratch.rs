@@ -1,0 +1,274 @@
+//! Arrays beyond a memory limit: large allocations live in files, mapped into memory.
+//!
+//! [`Allocator`] is the program's allocator, and counts what it holds. After [`begin`], an allocation of at least
+//! [`LARGE`] bytes that does not fit beside the others gets a file of its own. Its pages come into memory when they are
+//! used. A thread takes all such pages out of the process when they and the rest exceed the limit; the system keeps
+//! them in its cache, and writes them to the disk when it needs the memory. Kernels and their order do not depend on
+//! where a number lives, so results do not either.
+//!
+//! The files have no name: no other process can open them, and the system removes them however this process ends. Their
+//! space is reserved at the start, so that a disk that fills up later is no error.
+
+#![allow(unsafe_code)]
+
+use conefield_core::{Error, Result, allowance};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+/// Smaller allocations stay in memory.
+pub const LARGE: usize = 32 << 20;
+
+/// The smallest limit: allocations below [`LARGE`], threads and libraries need a part of it.
+pub const LEAST: u64 = 512 << 20;
+
+/// Bytes in memory, besides mapped ones.
+static HELD: AtomicU64 = AtomicU64::new(0);
+
+/// Bytes in files.
+static MAPPED: AtomicU64 = AtomicU64::new(0);
+
+/// Bytes beyond which large allocations go to files.
+static STAYS: AtomicU64 = AtomicU64::new(u64::MAX);
+
+/// Bytes that the process allocates now.
+pub fn allocated() -> u64 {
+    HELD.load(Relaxed) + MAPPED.load(Relaxed)
+}
+
+/// An allocator that counts, and that uses files after [`begin`].
+pub struct Allocator;
+
+impl Allocator {
+    /// Whether an allocation of `bytes` goes to a file.
+    fn leaves(bytes: usize) -> bool {
+        bytes >= LARGE && (bytes as u64).saturating_add(HELD.load(Relaxed)) > STAYS.load(Relaxed)
+    }
+}
+
+// SAFETY: every block comes from the system's allocator, or is a mapping of its own with at least `layout.size()`
+// bytes, aligned to a page; no layout in this program needs more. `files::release` tells the two apart by address.
+unsafe impl GlobalAlloc for Allocator {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        // SAFETY: as in the contract of the caller.
+        counted(layout, || unsafe { System.alloc(layout) })
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        // A new file holds zeros too. SAFETY: as in the contract of the caller.
+        counted(layout, || unsafe { System.alloc_zeroed(layout) })
+    }
+
+    unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
+        if layout.size() >= LARGE && files::release(at) {
+            return;
+        }
+        HELD.fetch_sub(layout.size() as u64, Relaxed);
+        // SAFETY: the block is no mapping, so it is the system's.
+        unsafe { System.dealloc(at, layout) }
+    }
+
+    unsafe fn realloc(&self, at: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        if layout.size().max(size) >= LARGE && (Self::leaves(size) || files::holds(at)) {
+            // SAFETY: the caller guarantees that the size is valid with this alignment, and that `at` holds the block.
+            unsafe {
+                let new = self.alloc(Layout::from_size_align_unchecked(size, layout.align()));
+                if !new.is_null() {
+                    new.copy_from_nonoverlapping(at, layout.size().min(size));
+                    self.dealloc(at, layout);
+                }
+                return new;
+            }
+        }
+        // SAFETY: the block is no mapping, so it is the system's.
+        let new = unsafe { System.realloc(at, layout, size) };
+        if !new.is_null() {
+            HELD.fetch_add(size as u64, Relaxed);
+            HELD.fetch_sub(layout.size() as u64, Relaxed);
+        }
+        new
+    }
+}
+
+/// A block in a file if it leaves memory and there is room for it, else the one that `system` returns.
+fn counted(layout: Layout, system: impl FnOnce() -> *mut u8) -> *mut u8 {
+    if Allocator::leaves(layout.size())
+        && let Some(block) = files::block(layout.size())
+    {
+        return block;
+    }
+    let block = system();
+    if !block.is_null() {
+        HELD.fetch_add(layout.size() as u64, Relaxed);
+    }
+    block
+}
+
+/// Keeps the process below `limit` bytes of memory from now on, with up to `bytes` in files on the disk of `folder`.
+///
+/// # Errors
+/// Too little space on the disk, a folder in which no file can be made, or a system without unnamed files.
+pub fn begin(folder: &Path, limit: u64, bytes: u64) -> Result<()> {
+    if HELD.load(Relaxed) == 0 {
+        return Err(Error::unsupported(
+            "scratch files",
+            "this program has another allocator than `scratch::Allocator`",
+        ));
+    }
+    files::begin(folder, limit, bytes)?;
+    STAYS.store(limit / 3, Relaxed);
+    allowance::set_room(limit / 16 * 5);
+    Ok(())
+}
+
+#[cfg(target_os = "linux")]
+mod files {
+    use super::*;
+    use rustix::fs::{FallocateFlags, fallocate, statvfs};
+    use rustix::io::Errno;
+    use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
+    use std::fs::File;
+    use std::io::{Read, Seek};
+    use std::path::PathBuf;
+    use std::ptr;
+    use std::sync::{Mutex, MutexGuard, PoisonError};
+    use std::time::Duration;
+
+    /// Seconds between two looks at the resident memory.
+    const PAUSE: Duration = Duration::from_millis(2);
+
+    /// The files in use.
+    static SCRATCH: Mutex<Option<Scratch>> = Mutex::new(None);
+
+    struct Scratch {
+        folder: PathBuf,
+        /// A file that keeps space for the others.
+        reserve: File,
+        reserved: u64,
+        /// Address and bytes of each mapping.
+        maps: Vec<(usize, usize)>,
+    }
+
+    fn scratch() -> MutexGuard<'static, Option<Scratch>> {
+        SCRATCH.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Gives `file` space on the disk for `bytes`.
+    fn allocate(file: &File, bytes: u64) -> rustix::io::Result<()> {
+        fallocate(file, FallocateFlags::empty(), 0, bytes)
+    }
+
+    pub fn begin(folder: &Path, limit: u64, bytes: u64) -> Result<()> {
+        let place = folder.display().to_string();
+        let failed = |e| Error::io(folder, e);
+        let there = folder.canonicalize().map_err(failed)?;
+        let reserve = tempfile::tempfile_in(&there).map_err(failed)?;
+        let free = statvfs(&there).map_err(|e| failed(e.into()))?;
+        let free = free.f_bavail.saturating_mul(free.f_frsize);
+        let shown = conefield_evaluation::report::text::bytes;
+        let short = || {
+            let expected = format!("{} for arrays that do not fit into memory", shown(bytes));
+            Error::invalid(&place, "free space", shown(free), expected)
+        };
+        if free < bytes {
+            return Err(short());
+        }
+        allocate(&reserve, bytes).map_err(|e| if e == Errno::NOSPC { short() } else { failed(e.into()) })?;
+        let mut scratch = scratch();
+        if scratch.is_none() {
+            let resident = File::open("/proc/self/statm").map_err(|e| Error::io("/proc/self/statm", e))?;
+            // The rest is for what comes in until the thread has its turn.
+            let watch = move || trim(resident, limit / 4 * 3);
+            std::thread::Builder::new().name("scratch".into()).spawn(watch).map_err(|e| Error::io(folder, e))?;
+        }
+        let maps = scratch.take().map_or_else(Vec::new, |before| before.maps);
+        *scratch = Some(Scratch { folder: there, reserve, reserved: bytes, maps });
+        Ok(())
+    }
+
+    /// A mapped block of zeros; `None` without room for it.
+    pub fn block(bytes: usize) -> Option<*mut u8> {
+        let mut scratch = scratch();
+        let scratch = scratch.as_mut()?;
+        let file = tempfile::tempfile_in(&scratch.folder).ok()?;
+        // The block takes its space from the reserve.
+        let left = scratch.reserved.saturating_sub(bytes as u64);
+        scratch.reserve.set_len(left).ok()?;
+        scratch.reserved = left;
+        allocate(&file, bytes as u64).ok()?;
+        // SAFETY: a new mapping at an address that the system chooses. No other process can open its file.
+        let at =
+            unsafe { mmap(ptr::null_mut(), bytes, ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, &file, 0) };
+        let at = at.ok()?;
+        scratch.maps.push((at as usize, bytes));
+        MAPPED.fetch_add(bytes as u64, Relaxed);
+        Some(at.cast())
+    }
+
+    /// Whether a mapping begins at this address.
+    pub fn holds(at: *mut u8) -> bool {
+        scratch().as_ref().is_some_and(|s| s.maps.iter().any(|map| map.0 == at as usize))
+    }
+
+    /// Ends the mapping that begins at this address, if there is one.
+    pub fn release(at: *mut u8) -> bool {
+        let mut scratch = scratch();
+        let Some(scratch) = scratch.as_mut() else { return false };
+        let Some(i) = scratch.maps.iter().position(|map| map.0 == at as usize) else { return false };
+        let (_, bytes) = scratch.maps.swap_remove(i);
+        // SAFETY: the caller gives up the block, which is this whole mapping.
+        let _ = unsafe { munmap(at.cast(), bytes) };
+        MAPPED.fetch_sub(bytes as u64, Relaxed);
+        let reserved = scratch.reserved + bytes as u64;
+        if allocate(&scratch.reserve, reserved).is_ok() {
+            scratch.reserved = reserved;
+        }
+        true
+    }
+
+    /// Takes mapped pages out of the process whenever it holds more than `most` bytes, unless they are the smaller part.
+    fn trim(mut statm: File, most: u64) {
+        let page = rustix::param::page_size() as u64;
+        let mut text = [0; 128];
+        loop {
+            std::thread::sleep(PAUSE);
+            if statm.rewind().is_err() {
+                return;
+            }
+            let read = statm.read(&mut text).unwrap_or(0);
+            let mut pages = text[..read]
+                .split(|c| *c == b' ')
+                .map(|word| word.iter().filter(|c| c.is_ascii_digit()).fold(0u64, |n, c| 10 * n + u64::from(c - b'0')));
+            let (resident, shared) = (page * pages.nth(1).unwrap_or(0), page * pages.next().unwrap_or(0));
+            if resident <= most || shared < most / 8 {
+                continue;
+            }
+            for &(at, bytes) in scratch().iter().flat_map(|s| &s.maps) {
+                // SAFETY: the mapping is in use while the lock is held. It is shared, so its numbers stay in the file.
+                let _ = unsafe { madvise(at as *mut _, bytes, Advice::LinuxDontNeed) };
+            }
+        }
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+mod files {
+    use super::*;
+
+    pub fn begin(folder: &Path, _: u64, _: u64) -> Result<()> {
+        let what = format!("scratch files in {}", folder.display());
+        Err(Error::unsupported(what, "this system has no unnamed files; use Linux, or more memory"))
+    }
+
+    pub fn block(_: usize) -> Option<*mut u8> {
+        None
+    }
+
+    pub fn holds(_: *mut u8) -> bool {
+        false
+    }
+
+    pub fn release(_: *mut u8) -> bool {
+        false
+    }
+}
