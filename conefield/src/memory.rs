@@ -85,6 +85,15 @@ impl Memory {
         format!("{}: {}", bytes(self.total), parts.collect::<Vec<_>>().join(", "))
     }
 
+    /// Bytes for scratch files if the estimate does not fit into the limit, and arrays may leave memory.
+    pub fn beside(&self) -> Option<[u64; 2]> {
+        let limit = BUDGET.get().copied().unwrap_or_else(available);
+        // What is read and written at random stays in memory.
+        let stays = self.model + self.optimizer;
+        let fits = self.total <= limit || limit < scratch::LEAST || stays > limit / 4 || !cfg!(target_os = "linux");
+        (!fits).then_some([limit, self.total + self.total / 8])
+    }
+
     /// Moves arrays to the disk if the estimate does not fit and a folder is allowed for them. Else refuses it, with
     /// figures; `smaller` lists what would fit into the given bytes.
     pub fn check(&self, smaller: impl FnOnce(u64) -> Vec<String>) -> Result<()> {
@@ -95,17 +104,15 @@ impl Memory {
         if self.total <= available {
             return Ok(());
         }
-        // What is read and written at random stays in memory.
-        let stays = self.model + self.optimizer;
-        if let Some(folder) = SCRATCH.get().filter(|_| available >= scratch::LEAST && stays <= available / 4) {
-            let beside = self.total + self.total / 8;
-            scratch::begin(folder, available, beside)?;
-            allowance::set_memory(available.saturating_add(beside), scratch::allocated);
-            let (limit, place) = (bytes(available), folder.display());
+        if let (Some([limit, beside]), Some(folder)) = (self.beside(), SCRATCH.get()) {
+            scratch::begin(folder, limit, beside)?;
+            allowance::set_memory(limit.saturating_add(beside), scratch::allocated);
+            let (limit, place) = (bytes(limit), folder.display());
             info!("needs {}: stays below {limit} of memory; scratch files in {place} hold the rest", self.line());
             return Ok(());
         }
-        let smaller = smaller(available);
+        let mut smaller = smaller(available);
+        smaller.extend(self.beside().map(|_| "a run with --scratch FOLDER on a disk with room".to_owned()));
         let hint = match smaller.as_slice() {
             [] => "no single reduction would make it fit".to_owned(),
             all => format!("{} would fit", all.join(" or ")),

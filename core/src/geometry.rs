@@ -6,6 +6,7 @@
 
 use crate::error::{Error, Result, ensure};
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 
 /// A point or vector in the world, in millimetres.
 pub type Vec3 = [f64; 3];
@@ -127,6 +128,13 @@ impl VoxelGrid {
     pub fn voxel(&self, index: [usize; 3]) -> Vec3 {
         let lo = self.bounds()[0];
         std::array::from_fn(|k| lo[k] + (index[k] as f64 + 0.5) * self.spacing[k])
+    }
+
+    /// The grid of some planes along x.
+    pub fn slab(&self, planes: Range<usize>) -> Self {
+        let mut slab = Self { shape: [planes.len(), self.shape[1], self.shape[2]], ..*self };
+        slab.center[0] += self.spacing[0] * 0.5 * ((planes.start + planes.end) as f64 - self.shape[0] as f64);
+        slab
     }
 
     /// Number of voxels, or `None` if it overflows `usize`.

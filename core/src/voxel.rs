@@ -79,6 +79,11 @@ pub trait VoxelOperator<R: Real>: Send + Sync {
         volume: ArrayViewMut3<'_, R>,
     );
 
+    /// Whether the line integrals of slabs, each a volume of its own, add up to those of the whole.
+    fn is_additive(&self) -> bool {
+        false
+    }
+
     /// Returns and clears the first error since the last call; see [`crate::stage::Stage::fault`].
     fn fault(&self) -> Result<()> {
         Ok(())

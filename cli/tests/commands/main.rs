@@ -29,6 +29,7 @@ mod report;
 #[cfg(unix)]
 mod resume;
 mod schema;
+mod scratch;
 mod selection;
 mod study;
 mod tradeoff;

@@ -16,7 +16,7 @@ fn scan(folder: &Path, views: usize, side: usize) -> PathBuf {
 }
 
 /// The same for `voxels`³ voxels.
-fn scan_of(folder: &Path, views: usize, side: usize, voxels: usize) -> PathBuf {
+pub fn scan_of(folder: &Path, views: usize, side: usize, voxels: usize) -> PathBuf {
     let mm = |x: f64| Millimetres(x);
     let view = |i: usize| {
         let (angle, pixel) = (Radians(std::f64::consts::TAU * i as f64 / views as f64), mm(200.0 / side as f64));

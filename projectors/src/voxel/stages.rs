@@ -115,6 +115,10 @@ impl VoxelProjector for Trilinear {
 }
 
 impl<R: Real> VoxelOperator<R> for Siddon {
+    fn is_additive(&self) -> bool {
+        true
+    }
+
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, out: ArrayViewMut3<'_, R>) {
         rays::forward(&SiddonWalk, geometry, views, volume, out);
     }
@@ -136,6 +140,10 @@ impl<R: Real> VoxelOperator<R> for Trilinear {
 
 /// Uses columns for views that allow it, and bundles for the others.
 impl<R: Real> VoxelOperator<R> for Joseph {
+    fn is_additive(&self) -> bool {
+        true
+    }
+
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, mut out: ArrayViewMut3<'_, R>) {
         let (mut fitting, mut others) = ((vec![], vec![]), (vec![], vec![]));
         let all: Vec<_> = views.par_iter().map(|&v| columns::of(geometry, v)).collect();

@@ -179,7 +179,7 @@ impl Backprojection<'_> {
         let at_once = views_at_once(self.geometry.detector, held(space.header()));
         let mut images = images(space, self.geometry.detector, at_once)?;
         let all: Vec<usize> = (0..self.geometry.views.len()).collect();
-        let planes = slab([nx, ny, nz], place.room());
+        let planes = planes(place.as_ref(), [nx, ny, nz])?;
         if planes < nx {
             let count = nx.div_ceil(planes);
             observer
@@ -350,11 +350,21 @@ fn views_at_once(detector: [usize; 2], bytes: u64) -> usize {
     (bytes / column_major_bytes::<f32>(detector, 1).max(1)).clamp(1, 64) as usize
 }
 
-/// Planes along x of a slab of at most `room` bytes: whole tiles of the back-projection, at least one.
-fn slab([nx, ny, nz]: [usize; 3], room: u64) -> usize {
-    let plane = (4 * ny * nz) as u64;
-    if plane.saturating_mul(nx as u64) <= room { nx } else { (room / plane.max(1)) as usize / TILE * TILE }
-        .clamp(TILE, nx.max(TILE))
+/// Planes along x of the largest slab that `place` has room for: whole tiles of the back-projection, at least one.
+fn planes(place: &dyn Place, [nx, ny, nz]: [usize; 3]) -> Result<usize> {
+    let plane = (4 * ny * nz).max(1) as u64;
+    let mut planes = (place.room() / plane).min(nx as u64) as usize;
+    if planes < nx {
+        planes = (planes / TILE * TILE).max(TILE);
+    }
+    // A device does not say how much memory it has.
+    while let Err(e) = place.zeros([planes, ny, nz]) {
+        if planes <= TILE {
+            return Err(e);
+        }
+        planes = (planes / 2).next_multiple_of(TILE);
+    }
+    Ok(planes)
 }
 
 /// Largest spread of the sources along z and slope of the detector rows, as a share of the circle's radius. Calibrated

@@ -4,11 +4,12 @@
 use crate::common::{Stop, plan, scan, solve_on, spec, truth};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
-use conefield_core::backend::Backend;
+use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::data_term::DataTermSpec;
 use conefield_core::geometry::Geometry;
 use conefield_core::method::{Job, Observer, Record};
-use conefield_core::place::{Host, Map, Place, ProximalStep, Reduction, StatePart, Weighing};
+use conefield_core::pipeline::Pipeline;
+use conefield_core::place::{Array, Host, Map, Place, ProximalStep, Reduction, StatePart, Weighing};
 use conefield_core::random::{mix, unit};
 use conefield_core::regularizer::{Dual, Kernels, Penalty, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
@@ -17,7 +18,7 @@ use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};
 use conefield_core::wgsl::Fragment;
 use conefield_projectors::simulate::{Protocol, simulate};
 use conefield_solvers::iterative::tv::descend;
-use ndarray::{Array3, ArrayView3, s};
+use ndarray::{Array3, ArrayView3, ArrayViewMut3, s};
 use serde_json::{Value, json};
 use std::sync::Arc;
 
@@ -571,4 +572,61 @@ fn a_pass_moves_scalars_and_a_run_its_views_and_its_volume() {
         let down = (backend.moved().from_device - before.from_device) as f64;
         assert!(down > volume + 1.9 * views, "{name}: records of held-out views bring them down: {down}");
     }
+}
+
+/// A place that holds no array of more than `1` bytes.
+struct Little(u64);
+
+impl Place for Little {
+    fn device(&self) -> Option<String> {
+        Host.device()
+    }
+    fn zeros(&self, shape: [usize; 3]) -> conefield_core::Result<Array> {
+        let bytes = 4 * shape.iter().product::<usize>() as u64;
+        if bytes > self.0 {
+            return Err(conefield_core::Error::unsupported("the place", format!("{bytes} bytes, it has {}", self.0)));
+        }
+        Host.zeros(shape)
+    }
+    fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> conefield_core::Result<()> {
+        Host.load(from, to, first)
+    }
+    fn store(&self, from: &Array, first: usize, to: ArrayViewMut3<'_, f32>) -> conefield_core::Result<()> {
+        Host.store(from, first, to)
+    }
+}
+
+/// A CPU with such a place.
+struct LittleCpu(u64);
+
+impl Backend for LittleCpu {
+    fn name(&self) -> &'static str {
+        "little"
+    }
+    fn compile(&self, pipeline: &Pipeline) -> conefield_core::Result<(Box<dyn Executable>, Explain)> {
+        Cpu::new().compile(pipeline)
+    }
+    fn place(&self) -> Arc<dyn Place> {
+        Arc::new(Little(self.0))
+    }
+}
+
+/// FDK makes its slabs as small as a place needs them, and gives the same bits; a place without room for the smallest
+/// one is told.
+#[test]
+fn a_volume_larger_than_its_place_is_computed_in_slabs() {
+    let scan = larger();
+    let run = |backend: &dyn Backend| {
+        let (solution, _) = solve_on(backend, &json!({"type": "fdk"}), &scan, &Weights::default())?;
+        Ok::<_, conefield_core::Error>(solution.result.volume(backend)?.data)
+    };
+    let whole = run(&Cpu::new()).unwrap();
+    let views = 4 * scan.projections.len() as u64;
+    let volume = 4 * whole.len() as u64;
+    assert!(whole.iter().any(|x| *x > 0.0) && views < volume, "{views} {volume}");
+    for bytes in [views, volume - 1] {
+        assert!(run(&LittleCpu(bytes)).unwrap() == whole, "{bytes} bytes");
+    }
+    let e = run(&LittleCpu(volume / 40)).unwrap_err().to_string();
+    assert!(e.contains("the place"), "{e}");
 }
