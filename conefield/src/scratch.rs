@@ -17,10 +17,10 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Smaller allocations stay in memory.
-pub const LARGE: usize = 32 << 20;
+pub const LARGE: usize = 16 << 20;
 
 /// The smallest limit: allocations below [`LARGE`], threads and libraries need a part of it.
-pub const LEAST: u64 = 512 << 20;
+pub const LEAST: u64 = 256 << 20;
 
 /// Bytes in memory, besides mapped ones.
 static HELD: AtomicU64 = AtomicU64::new(0);
@@ -159,30 +159,33 @@ mod files {
     }
 
     pub fn begin(folder: &Path, limit: u64, bytes: u64) -> Result<()> {
-        let place = folder.display().to_string();
         let failed = |e| Error::io(folder, e);
-        let there = folder.canonicalize().map_err(failed)?;
-        let reserve = tempfile::tempfile_in(&there).map_err(failed)?;
-        let free = statvfs(&there).map_err(|e| failed(e.into()))?;
-        let free = free.f_bavail.saturating_mul(free.f_frsize);
-        let shown = conefield_evaluation::report::text::bytes;
-        let short = || {
-            let expected = format!("{} for arrays that do not fit into memory", shown(bytes));
-            Error::invalid(&place, "free space", shown(free), expected)
-        };
-        if free < bytes {
-            return Err(short());
-        }
-        allocate(&reserve, bytes).map_err(|e| if e == Errno::NOSPC { short() } else { failed(e.into()) })?;
         let mut scratch = scratch();
         if scratch.is_none() {
+            let folder = folder.canonicalize().map_err(failed)?;
+            let reserve = tempfile::tempfile_in(&folder).map_err(failed)?;
             let resident = File::open("/proc/self/statm").map_err(|e| Error::io("/proc/self/statm", e))?;
             // The rest is for what comes in until the thread has its turn.
             let watch = move || trim(resident, limit / 4 * 3);
-            std::thread::Builder::new().name("scratch".into()).spawn(watch).map_err(|e| Error::io(folder, e))?;
+            std::thread::Builder::new().name("scratch".into()).spawn(watch).map_err(failed)?;
+            *scratch = Some(Scratch { folder, reserve, reserved: 0, maps: vec![] });
         }
-        let maps = scratch.take().map_or_else(Vec::new, |before| before.maps);
-        *scratch = Some(Scratch { folder: there, reserve, reserved: bytes, maps });
+        let Some(scratch) = scratch.as_mut() else { return Ok(()) };
+        // A second estimate extends what the first one reserved.
+        let more = bytes.saturating_sub(scratch.reserved);
+        let free = statvfs(&scratch.folder).map_err(|e| failed(e.into()))?;
+        let free = free.f_bavail.saturating_mul(free.f_frsize);
+        let short = || {
+            let [free, more] = [free, more].map(conefield_evaluation::report::text::bytes);
+            let expected = format!("{more} for arrays that do not fit into memory");
+            Error::invalid(folder.display().to_string(), "free space", free, expected)
+        };
+        if free < more {
+            return Err(short());
+        }
+        let reserved = scratch.reserved.max(bytes);
+        allocate(&scratch.reserve, reserved).map_err(|e| if e == Errno::NOSPC { short() } else { failed(e.into()) })?;
+        scratch.reserved = reserved;
         Ok(())
     }
 
