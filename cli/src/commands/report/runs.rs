@@ -7,9 +7,10 @@ use conefield::{method, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::error::ensure;
-use conefield_evaluation::report::page::{Notice, Page, PageRun};
+use conefield_evaluation::report::page::{Notice, Page, PageRun, PageSpread};
 use conefield_evaluation::report::text::stem;
 use serde::Deserialize;
+use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -68,6 +69,27 @@ fn cases(folder: &Path) -> Result<Vec<PathBuf>> {
     let mut found: Vec<PathBuf> = entries.collect::<Result<_>>()?;
     found.sort();
     Ok(found)
+}
+
+/// Means and standard deviations over the seeds of the studies in `folders`.
+pub fn spreads(folders: &[PathBuf]) -> Result<Vec<PageSpread>> {
+    #[derive(Deserialize)]
+    struct Study {
+        #[serde(default)]
+        summary: Vec<Line>,
+    }
+    #[derive(Deserialize)]
+    struct Line {
+        case: String,
+        method: String,
+        figures: Value,
+    }
+    let tables = folders.iter().map(|f| f.join("table.json")).filter(|t| t.is_file());
+    let studies = tables.map(|t| read_json::<Study>(&t)).collect::<Result<Vec<_>>>()?;
+    let lines = studies.into_iter().flat_map(|s| s.summary);
+    let spread =
+        |l: Line| PageSpread { name: format!("{}/{}", l.case, l.method), figures: l.figures };
+    Ok(lines.map(spread).collect())
 }
 
 /// The runs of the page, with unique names.
