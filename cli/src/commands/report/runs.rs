@@ -2,6 +2,7 @@
 
 use crate::run_folder::RunOnDisk;
 use conefield::explain::Explanation;
+use conefield::study::pictures::score_last;
 use conefield::tradeoff::json::read_json;
 use conefield::{method, specs};
 use conefield_backend_cpu::Cpu;
@@ -87,8 +88,7 @@ pub fn spreads(folders: &[PathBuf]) -> Result<Vec<PageSpread>> {
     let tables = folders.iter().map(|f| f.join("table.json")).filter(|t| t.is_file());
     let studies = tables.map(|t| read_json::<Study>(&t)).collect::<Result<Vec<_>>>()?;
     let lines = studies.into_iter().flat_map(|s| s.summary);
-    let spread =
-        |l: Line| PageSpread { name: format!("{}/{}", l.case, l.method), figures: l.figures };
+    let spread = |l: Line| PageSpread { name: format!("{}/{}", l.case, l.method), figures: l.figures };
     Ok(lines.map(spread).collect())
 }
 
@@ -112,12 +112,21 @@ pub fn page_runs(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun
                 spec: run.spec().to_owned(),
                 plan: plan(run).ok(),
                 record: run.record().cloned(),
-                curves: run.curves().to_vec(),
+                curves: curves(run),
                 name,
                 ..PageRun::default()
             }
         })
         .collect()
+}
+
+/// The lines of the run's metrics; that of the result has the score of the record.
+fn curves(run: &RunOnDisk) -> Vec<Value> {
+    let mut lines = run.curves().to_vec();
+    if let Some(record) = run.record() {
+        score_last(&mut lines, record);
+    }
+    lines
 }
 
 /// Describes what the spec builds. Fails if its plugins are not loaded.
