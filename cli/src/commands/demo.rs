@@ -102,6 +102,8 @@ impl DemoArgs {
             .with_noise(noise, self.seed);
         let scan = simulate(&truth, &protocol)?;
         conefield_io::write_scan(folder.join(SCAN), &scan, Some(&truth))?;
+        // As it is on disk, so that a report recognizes it.
+        let scan = conefield_scans::read_scan(folder.join(SCAN))?;
         info!("simulated {views} views of {0} x {0} pixels", 2 * size, views = self.views);
 
         signals::listen()?;

@@ -325,12 +325,12 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
 
 /// Random points miss such a place, and a smaller learning rate does not help.
 #[test]
-fn numbers_that_are_not_finite_at_a_face_are_found_and_the_run_names_the_stage() {
+fn numbers_that_are_not_finite_at_an_edge_are_found_and_the_run_names_the_stage() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| text(&dir.path().join(name));
     done(&["simulate", "phantom:head:16", "-o", &at("scan"), "--views", "6", "--detector", "16x16"]);
     let library = dir.path().join("faulty.so");
-    cc(&sources().join("plugins/tests/faulty.c"), &["FAULT=NAN_AT_A_FACE"], &library);
+    cc(&sources().join("plugins/tests/faulty.c"), &["FAULT=NAN_AT_AN_EDGE"], &library);
     let library = text(&library);
     let checked = said(&["plugins", "check", &library], &[dir.path()]);
     assert!(checked.contains("faulty: finite"), "{checked}");
