@@ -2,6 +2,7 @@
 
 pub use conefield::tradeoff::json::to_json;
 use conefield_core::{Error, Result};
+use conefield_evaluation::report::Table;
 pub use conefield_evaluation::report::text::{bytes, duration, number, table};
 use serde::Serialize;
 use std::fmt::Write as _;
@@ -12,7 +13,39 @@ pub const LONGEST_LINE: usize = 4000;
 
 /// Prints `text` and a line end. A closed reader (`| head`) is not an error.
 pub fn say(text: &str) -> Result<()> {
-    print(&plain(text))
+    let text = plain(text);
+    print(&width().map_or(text.clone(), |width| wrapped(&text, width)))
+}
+
+/// The table as text that fits into the terminal, if standard output is one.
+pub fn fitted(table: &Table) -> String {
+    width().map_or_else(|| table.text(), |width| table.text_within(width))
+}
+
+/// Columns of the terminal, if standard output is one.
+fn width() -> Option<usize> {
+    terminal_size::terminal_size_of(std::io::stdout()).map(|(width, _)| width.0.into())
+}
+
+/// `text` with lines of at most `width` characters. The rest of a line stands below its last column, which begins after
+/// two spaces.
+fn wrapped(text: &str, width: usize) -> String {
+    let lines = text.split('\n').map(|line| {
+        let mut rest: Vec<char> = line.chars().collect();
+        let column = rest.windows(3).rposition(|w| w[0] == ' ' && w[1] == ' ' && w[2] != ' ').map_or(2, |at| at + 2);
+        let indent = if column <= width / 2 { column } else { 4.min(width / 4) };
+        let mut folded = String::new();
+        while rest.len() > width {
+            let Some(at) = rest[..=width].iter().rposition(|c| *c == ' ').filter(|at| *at > indent) else { break };
+            folded.extend(&rest[..at]);
+            folded.push('\n');
+            let after = rest.split_off(at + 1);
+            rest = [vec![' '; indent], after].concat();
+        }
+        folded.extend(&rest);
+        folded
+    });
+    lines.collect::<Vec<_>>().join("\n")
 }
 
 /// Prints one JSON object.
@@ -69,6 +102,14 @@ fn escaped(text: &str, bad: impl Fn(char) -> bool, escape: impl Fn(char, &mut St
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn long_lines_continue_below_their_last_column() {
+        let text = "a  one two three\nshort";
+        assert_eq!(wrapped(text, 11), "a  one two\n   three\nshort");
+        assert_eq!(wrapped("abcdefghijkl", 5), "abcdefghijkl");
+        assert_eq!(wrapped("one two three four", 9), "one two\n  three\n  four");
+    }
 
     #[test]
     fn what_a_terminal_obeys_is_shown_instead() {

@@ -67,7 +67,7 @@ impl Progress {
     /// Progress of `what`. Records are written to `log` (JSON, one per line) as they arrive.
     pub fn new(what: &str, log: Option<(PathBuf, File)>) -> Self {
         let bar = BARS.add(ProgressBar::new(1000));
-        if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3} %  {msg}") {
+        if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:12}] {percent:>3} %  {wide_msg}") {
             bar.set_style(style.progress_chars("=> "));
         }
         bar.set_prefix(what.to_owned());
@@ -142,23 +142,16 @@ impl Progress {
     /// The current state in one line.
     fn line(&self, step: u64, seconds_left: f64) -> String {
         let r = &self.latest;
-        let mut line = format!("step {step}");
-        if let Some(loss) = r.loss {
-            line += &format!(", loss {loss:.3e}");
-        }
-        if let Some(speed) = r.samples_per_s {
-            line += &format!(", {:.2} M samples/s", speed / 1e6);
-        }
-        if let Some(h) = r.held_out {
-            line += &format!(", held out {h:.4}");
-        }
-        if let Some(p) = r.psnr {
-            line += &format!(", {p:.2} dB");
-        }
-        if seconds_left.is_finite() {
-            line += &format!(", {} left", crate::out::duration(seconds_left));
-        }
-        line
+        // A narrow terminal cuts the end off.
+        let parts = [
+            Some(format!("step {step}")),
+            seconds_left.is_finite().then(|| format!("{} left", crate::out::duration(seconds_left))),
+            r.psnr.map(|p| format!("{p:.2} dB")),
+            r.held_out.map(|h| format!("held out {h:.4}")),
+            r.loss.map(|loss| format!("loss {loss:.3e}")),
+            r.samples_per_s.map(|speed| format!("{:.2} M samples/s", speed / 1e6)),
+        ];
+        parts.into_iter().flatten().collect::<Vec<_>>().join(", ")
     }
 }
 

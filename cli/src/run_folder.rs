@@ -2,6 +2,7 @@
 //! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last
 //! and only for a finished run, `record.json`.
 
+use conefield::plugins::Used;
 use conefield::record::ScanRecord;
 use conefield::tradeoff::json::{LONGEST, read_json};
 use conefield_core::error::ensure;
@@ -225,6 +226,12 @@ impl RunOnDisk {
     /// The reference volume, as named on the command line.
     pub fn reference(&self) -> Option<&Path> {
         self.known.as_ref()?.reference.as_deref()
+    }
+
+    /// The plugins whose stages it used.
+    pub fn plugins(&self) -> Vec<Used> {
+        let plugins = self.record.as_ref().map(|r| r["plugins"].clone());
+        plugins.and_then(|p| serde_json::from_value(p).ok()).unwrap_or_default()
     }
 
     /// Held-out views.

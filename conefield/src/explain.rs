@@ -14,6 +14,8 @@ use serde::Serialize;
 pub struct Explanation {
     spec: String,
     source: String,
+    /// The other specs and files that the spec is made of.
+    extends: Vec<String>,
     description: String,
     #[serde(flatten)]
     outline: Outline,
@@ -55,6 +57,7 @@ impl Explanation {
         Ok(Self {
             spec: loaded.spec.name.clone(),
             source: loaded.source.clone(),
+            extends: loaded.sources().into_iter().filter(|s| *s != loaded.source).collect(),
             description: loaded.spec.description.clone(),
             outline,
             parameters,
@@ -74,6 +77,9 @@ fn text(r: &Explanation) -> String {
     let mut lines = vec![];
     let shipped = r.source.strip_prefix(&r.spec) == Some(" (shipped)");
     lines.push(if shipped || r.spec.is_empty() { r.source.clone() } else { format!("{} ({})", r.spec, r.source) });
+    if !r.extends.is_empty() {
+        lines.push(format!("extends {}", r.extends.join(", ")));
+    }
     if !r.description.is_empty() {
         lines.push(r.description.clone());
     }

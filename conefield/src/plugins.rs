@@ -78,6 +78,16 @@ impl Used {
         }
     }
 
+    /// The path of its library.
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+
+    /// Whether a plugin of this name is loaded.
+    pub fn is_loaded(&self) -> bool {
+        with(|plugins| plugins.found.iter().any(|f| f.library.as_ref().is_ok_and(|l| l.name == self.name)))
+    }
+
     /// Text for people.
     pub fn line(&self) -> String {
         format!("{} {} ({})", self.name, self.version, self.path)

@@ -58,6 +58,16 @@
     const show = (x) => (x === null || x === undefined ? "-" : typeof kind === "function" ? kind(x) : kind === 0 ? String(x) : short(x, kind));
     scores.append(row("th", [name, ...found.map((x) => figure(show(x)))]));
   }
+  const spreads = byId("spreads");
+  const shown_figures = [["psnr", "PSNR, dB", 2], ["ssim_2d", "SSIM 2D", 4], ["ssim_3d", "SSIM 3D", 4], ["held_out", "held-out error", 5], ["train_s", "solving, s", 2], ["total_s", "all, s", 2]]
+    .filter(([key]) => page.spreads.some((s) => s.figures[key]));
+  if (page.spreads.length > 0) {
+    spreads.append(row("th", ["mean ± standard deviation", "seeds", ...shown_figures.map(([, name]) => name)]));
+    for (const { name, figures } of page.spreads) {
+      const show = (s, digits) => (Number.isFinite(s?.mean) ? s.mean.toFixed(digits) + (s.sd === null ? "" : ` ± ${s.sd.toFixed(digits)}`) : "-");
+      spreads.append(row("th", [name, figure(String(Math.max(...Object.values(figures).map((s) => s.n)))), ...shown_figures.map(([key, , digits]) => figure(show(figures[key], digits)))]));
+    }
+  }
   for (const run of runs) {
     const parts = [["reading", "load_s"], ["preparing", "prepare_s"], ["solving", "train_s"], ["export", "export_s"], ["picture", "picture_s"], ["scores", "score_s"]];
     const known = parts.map(([name, key], i) => [name, run.record?.[key] ?? 0, page.colours[i]]).filter(([, s]) => s > 0);
@@ -74,7 +84,7 @@
     }
     byId("times").append(element("div", { class: "bars" }, names, bar));
   }
-  byId("scores-section").hidden = scores.childElementCount === 1 && byId("times").childElementCount === 0;
+  byId("scores-section").hidden = scores.childElementCount === 1 && page.spreads.length === 0 && byId("times").childElementCount === 0;
 
   for (const run of runs) {
     const plan = run.record?.plan;
@@ -252,7 +262,7 @@
   /** The centre of the first voxel along axis k, mm. */
   const first = (volume, k) => volume.center[k] - (volume.shape[k] - 1) * volume.spacing[k] / 2;
 
-  const state = { show: 0, minus: -1, beside: -1, window: [...volumes[0].window], span: null, usual: 1, at: null };
+  const state = { show: 0, minus: -1, beside: page.beside ?? -1, window: [...volumes[0].window], span: null, usual: 1, at: null };
   for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
     const numbers = value.split(",").map(Number);
     if (!numbers.every(Number.isFinite)) continue;
@@ -428,7 +438,7 @@
     clearTimeout(later);
     later = setTimeout(() => {
       const parts = { show: state.show, minus: state.minus, beside: state.beside, window: state.window.map((x) => Number(x.toPrecision(6))), at: state.at?.map((x) => Number(x.toPrecision(6))) ?? null };
-      const text = Object.entries(parts).filter(([, v]) => v !== null && v !== -1).map(([k, v]) => `${k}=${[v].flat().join(",")}`).join("&");
+      const text = Object.entries(parts).filter(([, v]) => v !== null).map(([k, v]) => `${k}=${[v].flat().join(",")}`).join("&");
       try { history.replaceState(null, "", `#${text}`); } catch { /* The address may be read-only. */ }
     }, 200);
   }
@@ -463,7 +473,7 @@
     byId("shown").textContent = first_pane.caption();
     if (state.beside >= 0) byId("shown-beside").textContent = second_pane.caption();
     const shown = volumes[state.show];
-    byId("volume-note").textContent = shown.note;
+    byId("volume-note").textContent = `${shown.name}: ${shown.note}`;
     showWindow();
     const mm = state.at ?? shown.shape.map((n, k) => first(shown, k) + Math.floor(n / 2) * shown.spacing[k]);
     panes().forEach((p) => { p.layout(); p.go(mm); });

@@ -12,6 +12,7 @@ enum Fault {
     MORE_CHANNELS, MORE_PARAMETERS, TWIN_BLOCKS, PAST_TILE, NO_FORWARD_PASS, WRONG_PASSES, REDUCES_NOTHING,
     FEW_RESOLUTIONS, MORE_RESOLUTIONS, NAN_RESOLUTION, NEGATIVE_RESOLUTION, BEFORE_GRADIENTS, WRONG_GRADIENT,
     WRONG_INPUT_GRADIENT, REMEMBERS, FAILS, FAILS_LATER, SLEEPS, SLEEPS_IN_CREATE, ABORTS,
+    NAN_AT_AN_EDGE,
 };
 #ifndef ENTRY
 #define ENTRY conefield_plugin
@@ -81,6 +82,7 @@ static ConefieldStatus forward(const void *stage, const float *params, struct Co
         for (size_t i = 0; i < x.rows; i++) {
             float v = params[c] * x.data[c * x.stride + i];
             if (FAULT == NOT_A_NUMBER || (FAULT == NOT_A_NUMBER_LATER && call > 100)) v = NAN;
+            if (FAULT == NAN_AT_AN_EDGE && x.data[i] > 0.96f && x.data[x.stride + i] > 0.96f) v = NAN;
             if (FAULT == REMEMBERS) v += 1e-6f * (float)(call % 1000);
             y.data[c * y.stride + i] = v;
         }

@@ -157,7 +157,12 @@ impl Projector for RayMarch {
             (_, Some(n)) => {
                 let unknown = || {
                     let found = "an encoder that does not say how fine it is";
-                    Error::invalid("spec", "step_cells", found, "samples, step_mm or step_voxels with it")
+                    Error::invalid(
+                        "spec",
+                        "step_cells",
+                        found,
+                        "samples, step_mm or step_voxels with it: --set projector.step_voxels=1 takes a sample per voxel",
+                    )
                 };
                 n * lengths.cell_mm.ok_or_else(unknown)?
             }
@@ -268,6 +273,7 @@ mod tests {
         assert!(fitted(&RayMarch::default(), lengths).unwrap().is_none());
         let e = fitted(&cells, Lengths { cell_mm: None, ..lengths }).unwrap_err().to_string();
         assert!(e.contains("step_cells") && e.contains("does not say how fine"), "{e}");
+        assert!(e.contains("--set projector.step_voxels=1"), "{e}");
         assert!(RayMarch { step_cells: Some(-1.0), ..RayMarch::default() }.build().is_err());
         assert_eq!(cells.describe(), "ray-march: a sample every 2 of the encoder's finest cells, stratified, clipped");
     }

@@ -133,7 +133,7 @@ pub struct Training {
     /// Takes some rays of each step from windows of neighbouring pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub windows: Option<Windows>,
-    /// Steps between two records of the metrics.
+    /// Most steps between two records of the metrics; a run has at least ten.
     pub report_every: u64,
 }
 

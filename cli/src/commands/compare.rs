@@ -138,7 +138,7 @@ impl CompareArgs {
         if self.json {
             out::json(&report)?;
         } else {
-            out::say(&table.text())?;
+            out::say(&out::fitted(&table))?;
             let picture = if drawn { format!("picture: {}\n", path.display()) } else { String::new() };
             out::say(&format!("\n{}table and runs in {}", picture, self.output.display()))?;
         }

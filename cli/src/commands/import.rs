@@ -79,51 +79,9 @@ impl ImportArgs {
 
     /// Views, distances, arc, values and the folder, a line each.
     fn summary(&self, imported: &Imported, survey: &Survey) -> String {
-        let g = &imported.scan.geometry;
-        let (setup, arc, check) = (&survey.setup, &survey.setup.angles, &survey.check);
-        let [rows, columns] = g.detector;
-        let [height, width] = setup.pixel_mm.map(short);
-        let orbit = if setup.circle { "" } else { " (medians: the views are not on one circle)" };
-        let values =
-            format!("line integrals from {} to {}", short(check.range[0].into()), short(check.range[1].into()));
-        let counts = match &imported.counts {
-            None => ", as in the files".to_owned(),
-            Some(c) => format!(
-                "; open beam {}, {} % of the counts raised to {}, {} of {} pixels interpolated",
-                short(c.open_beam[1]),
-                short(100.0 * c.clamped),
-                short(c.floor),
-                c.bad_by_fields + c.bad_by_outliers,
-                rows * columns,
-            ),
-        };
-        let lines = [
-            (
-                "views",
-                format!("{} of {rows} x {columns} pixels (rows x columns), {height} x {width} mm each", g.views.len()),
-            ),
-            (
-                "source",
-                format!(
-                    "{} mm to the axis, {} mm to the detector, magnification {}{orbit}",
-                    short(setup.source_to_axis_mm),
-                    short(setup.source_to_detector_mm),
-                    short(setup.magnification),
-                ),
-            ),
-            (
-                "arc",
-                format!(
-                    "{} degrees from {} in steps of {}",
-                    short(arc.covered_deg),
-                    short(arc.first_deg),
-                    short(arc.step_deg)
-                ),
-            ),
-            ("values", values + &counts),
-            ("written", format!("{} (conefield info prints more)", self.output.display())),
-        ];
-        out::table(&lines.map(|(name, line)| vec![name.to_owned(), line]), &[])
+        let mut lines = info::in_short(&imported.scan, survey, imported.counts.as_ref());
+        lines.push(vec!["written".into(), format!("{} (conefield info prints more)", self.output.display())]);
+        out::table(&lines, &[])
     }
 
     /// The geometry in mm and a summary of the values.
@@ -138,12 +96,4 @@ impl ImportArgs {
         found["line_integrals"] = json!(survey.check);
         found
     }
-}
-
-/// `x` with at most six significant digits and nine decimals.
-fn short(x: f64) -> String {
-    let digits = if x == 0.0 { 0 } else { (5 - x.abs().log10().floor() as i32).clamp(0, 9) };
-    let text = format!("{x:.*}", digits as usize);
-    let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
-    if text == "-0" { "0".to_owned() } else { text.to_owned() }
 }

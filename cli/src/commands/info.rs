@@ -13,6 +13,7 @@ use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::MiddleSlices;
 use conefield_evaluation::report::survey_png;
+use conefield_scans::counts::CountsReport;
 use conefield_scans::diagnosis::{Survey, setup, survey};
 use ndarray::ArrayView3;
 use serde_json::{Value, json};
@@ -43,6 +44,7 @@ impl InfoArgs {
         let png = self.png.as_deref();
         boundary::picture(png, &Inputs::of([path]))?;
         let ends = |end: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(end));
+        let mut head = String::new();
         let found = if ends("safetensors") {
             no_picture(path, png)?;
             weights(path)?
@@ -55,12 +57,14 @@ impl InfoArgs {
         } else if conefield_io::is_volume(path) {
             volume(path, png)?
         } else {
-            scan(path, png)?
+            let (found, lines) = scan(path, png)?;
+            head = lines + "\n\n";
+            found
         };
         if self.json {
             return out::json(&found);
         }
-        out::say(&(lines(&found) + &warnings(&found)))
+        out::say(&(head + &lines(&found) + &warnings(&found)))
     }
 }
 
@@ -180,7 +184,55 @@ pub fn facts(s: &Scan, survey: &Survey) -> Value {
     })
 }
 
-fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
+/// Views, distances, arc and values of a scan, a line each, as names and texts. `counts` are those it was made from.
+pub fn in_short(scan: &Scan, survey: &Survey, counts: Option<&CountsReport>) -> Vec<Vec<String>> {
+    let g = &scan.geometry;
+    let (setup, arc, check) = (&survey.setup, &survey.setup.angles, &survey.check);
+    let [rows, columns] = g.detector;
+    let [height, width] = setup.pixel_mm.map(short);
+    let orbit = if setup.circle { "" } else { " (medians: the views are not on one circle)" };
+    let values = format!("line integrals from {} to {}", short(check.range[0].into()), short(check.range[1].into()));
+    let counts = match counts {
+        None => String::new(),
+        Some(c) => format!(
+            "; open beam {}, {} % of the counts raised to {}, {} of {} pixels interpolated",
+            short(c.open_beam[1]),
+            short(100.0 * c.clamped),
+            short(c.floor),
+            c.bad_by_fields + c.bad_by_outliers,
+            rows * columns,
+        ),
+    };
+    let lines = [
+        (
+            "views",
+            format!("{} of {rows} x {columns} pixels (rows x columns), {height} x {width} mm each", g.views.len()),
+        ),
+        (
+            "source",
+            format!(
+                "{} mm to the axis, {} mm to the detector, magnification {}{orbit}",
+                short(setup.source_to_axis_mm),
+                short(setup.source_to_detector_mm),
+                short(setup.magnification),
+            ),
+        ),
+        (
+            "arc",
+            format!(
+                "{} degrees from {} in steps of {}",
+                short(arc.covered_deg),
+                short(arc.first_deg),
+                short(arc.step_deg)
+            ),
+        ),
+        ("values", values + &counts),
+    ];
+    lines.map(|(name, line)| vec![name.to_owned(), line]).into()
+}
+
+/// Facts of a scan, and the most important ones in short.
+fn scan(path: &Path, png: Option<&Path>) -> Result<(Value, String)> {
     Memory::of_data_set(&conefield_io::scan_size(path)?).check(|_| vec![])?;
     let data = conefield_scans::read_data_set(path, conefield_io::Parts::ALL)?;
     let s = &data.train;
@@ -189,6 +241,10 @@ fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
     if let Some(png) = png {
         survey_png(png, &title(path, s, &survey), &s.geometry)?;
     }
+    let mut short = in_short(s, &survey, None);
+    let volume = s.geometry.volume;
+    let [[nx, ny, nz], [x, y, z]] = [volume.shape.map(|n| n.to_string()), volume.spacing.map(self::short)];
+    short.push(vec!["volume".into(), format!("{nx} x {ny} x {nz} voxels of {x} x {y} x {z} mm")]);
     let mut found = facts(s, &survey);
     if let (Some(warning), Some(all)) = (calibrate::suspicion(s, &Cpu::new())?, found["warnings"].as_array_mut()) {
         all.push(json!(warning));
@@ -208,7 +264,7 @@ fn scan(path: &Path, png: Option<&Path>) -> Result<Value> {
     found["truth"] = json!(data.volume.is_some());
     found["missing"] = json!(missing);
     found["provenance"] = s.provenance.clone();
-    Ok(found)
+    Ok((found, out::table(&short, &[])))
 }
 
 /// The title of the picture.
@@ -255,6 +311,14 @@ fn weights(path: &Path) -> Result<Value> {
         w.tensors.iter().map(|(name, (shape, _))| (name.clone(), json!(shape))).collect();
     let parameters: usize = w.tensors.values().map(|t| t.1.len()).sum();
     Ok(json!({ "kind": "weights", "parameters": parameters, "tensors": tensors, "notes": w.notes }))
+}
+
+/// `x` with at most six significant digits and nine decimals.
+fn short(x: f64) -> String {
+    let digits = if x == 0.0 { 0 } else { (5 - x.abs().log10().floor() as i32).clamp(0, 9) };
+    let text = format!("{x:.*}", digits as usize);
+    let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
+    if text == "-0" { "0".to_owned() } else { text.to_owned() }
 }
 
 /// Numbers with seven significant digits.

@@ -84,7 +84,11 @@ impl ReportArgs {
         for group in groups {
             group.show(&found, &options, coarser, &mut page, &mut results, &mut references)?;
         }
-        page.volumes = results.into_iter().flatten().chain(references).collect();
+        page.volumes = results.into_iter().flatten().chain(named(references)).collect();
+        if let [_] = &page.runs[..] {
+            page.beside = (1..page.volumes.len()).find(|i| page.volumes[*i].is_reference());
+        }
+        page.spreads = runs::spreads(&self.runs)?;
         page.title = runs::title(&page);
         page.notes = notes(&page, coarser);
         let bytes = page.write(&self.output)?;
@@ -145,6 +149,15 @@ pub fn standing(folder: &Path, seconds: u64) -> Result<String> {
         run.live = std::fs::read(&live).ok().map(|png| png_url(&png));
     }
     page.html(&folder.display().to_string())
+}
+
+/// References with names that distinguish them.
+fn named(references: Vec<(PathBuf, PageVolume)>) -> impl Iterator<Item = PageVolume> {
+    let several = references.len() > 1;
+    references.into_iter().map(move |(path, r)| match several {
+        true => r.named(&format!("{} {}", scans::REFERENCE, path.display())),
+        false => r,
+    })
 }
 
 /// Notes on the page.

@@ -135,7 +135,7 @@ impl StudyArgs {
         if self.json {
             out::json(&report)?;
         } else {
-            out::say(&report.text())?;
+            out::say(&report.text(&out::fitted))?;
             out::say(&format!("\ntable, pictures and runs in {}", self.output.display()))?;
         }
         refuse_failures(&report.failures(), work.study.cells().len())
@@ -379,7 +379,10 @@ impl Work<'_> {
         let Study { cases, methods, seeds, .. } = self.study;
         let here = || outcomes.iter().filter(|(c, o)| c.case == case && o.figures.is_some());
         let shown = here().filter(|(c, _)| c.seed == seeds[0]).map(|(c, o)| Shown {
-            name: methods[c.method].name.clone(),
+            name: match seeds.len() {
+                1 => methods[c.method].name.clone(),
+                _ => format!("{}, seed {},", methods[c.method].name, c.seed),
+            },
             psnr: o.figures.as_ref().and_then(|f| f.psnr()),
             run: self.run(c),
         });

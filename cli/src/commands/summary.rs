@@ -19,6 +19,10 @@ pub fn summary(r: &RunRecord, scan: &ScanRecord, output: &Path) -> String {
         out::duration(r.train_s),
         out::duration(r.written.export_s),
     )];
+    if let Some(plan) = &r.plan {
+        let point = plan.point.as_ref().map_or(String::new(), |p| format!("{p}, "));
+        lines.push(format!("method: {point}spec {}, {}", r.spec, plan.why));
+    }
     if let Some(budget) = r.budget_s {
         let why = if r.total_s < USED * budget { ": the method stopped by itself" } else { "" };
         lines.push(format!("{} in all, of a budget of {}{why}", out::duration(r.total_s), out::duration(budget)));

@@ -1,13 +1,15 @@
 //! Shared parts of commands on the field of a finished run.
 
+use crate::run_folder::RunOnDisk;
 use clap::Args;
 use conefield::backend::{self, BackendChoice};
 use conefield::files;
 use conefield::memory::Memory;
+use conefield::plugins::Used;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// A finished run, the grid to evaluate and the backend.
 #[derive(Args)]
@@ -42,10 +44,24 @@ impl Trained {
         }
         let bytes = file.metadata().map_err(|e| Error::io(&file, e))?.len();
         memory(bytes, buffers)?;
-        let field = files::read_field(&file)?;
+        let field = files::read_field(&file).map_err(|e| self.with_plugins(e))?;
         let trained = field.scene.grid;
         let grid = self.voxels.map_or(trained, |n| trained.with_longest(n.into()));
         Ok(OpenedField { file, field, grid, bytes })
+    }
+
+    /// The error of reading the field; if the run used plugins that are not loaded, it says how to load them.
+    fn with_plugins(&self, error: Error) -> Error {
+        let folder = if self.run.is_dir() { &self.run } else { self.run.parent().unwrap_or(Path::new("")) };
+        let used = RunOnDisk::read(folder).map(|run| run.plugins()).unwrap_or_default();
+        let missing: Vec<&Used> = used.iter().filter(|plugin| !plugin.is_loaded()).collect();
+        if missing.is_empty() {
+            return error;
+        }
+        let paths = missing.iter().map(|plugin| plugin.path()).collect::<Vec<_>>().join(", ");
+        let options = missing.iter().map(|plugin| format!("--plugin {}", plugin.path())).collect::<Vec<_>>().join(" ");
+        let found = format!("{paths}, which the run used and this command has not loaded ({error})");
+        Error::invalid(folder.join("record.json").display().to_string(), "plugins", found, options)
     }
 }
 

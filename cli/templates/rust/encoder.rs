@@ -3,33 +3,33 @@
 use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-stage_type!(Encoder, "@name@", Waves, "waves of learned directions");
+stage_type!(Encoder, "@name@", Settings, "waves of learned directions");
 
 /// What a spec may set.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
-pub struct Waves {
+pub struct Settings {
     /// Number of channels, one per wave.
     pub waves: usize,
     /// Largest initial frequency of a wave, in radians per cube side.
     pub frequency: f32,
 }
 
-impl Default for Waves {
+impl Default for Settings {
     fn default() -> Self {
         Self { waves: 32, frequency: 20.0 }
     }
 }
 
 #[typetag::serde(name = "@name@")]
-impl EncoderSpec for Waves {
+impl EncoderSpec for Settings {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         ensure((1..=4096).contains(&self.waves), "spec", "waves", self.waves, "1 to 4096")?;
         Ok(Box::new(ByRow::new(self.clone())))
     }
 }
 
-impl Waves {
+impl Settings {
     /// The angle of wave `c`, whose parameters are its direction and its phase.
     fn angle<R: Real>(params: &[R], x: &[R], c: usize) -> R {
         let [a, b, d, phase] = [0, 1, 2, 3].map(|k| params[4 * c + k]);
@@ -37,7 +37,7 @@ impl Waves {
     }
 }
 
-impl RowMap for Waves {
+impl RowMap for Settings {
     fn widths(&self) -> [usize; 2] {
         [3, self.waves]
     }

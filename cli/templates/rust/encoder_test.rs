@@ -1,13 +1,13 @@
 //! Tests the stage with conefield's conformance kit.
 
-use @crate@::Waves;
+use @crate@::Settings;
 use conefield_conformance::{Options, check_encoder};
 use conefield_plugin::prelude::*;
 
 #[test]
 fn it_conforms() {
     for waves in [1, 6] {
-        let stage = Waves { waves, ..Waves::default() }.build().unwrap();
+        let stage = Settings { waves, ..Settings::default() }.build().unwrap();
         let report = check_encoder(stage.as_ref(), &Options::encoder());
         assert!(report.passed(), "{report}");
     }
@@ -15,6 +15,6 @@ fn it_conforms() {
 
 #[test]
 fn no_waves_are_refused_by_name() {
-    let e = Waves { waves: 0, ..Waves::default() }.build().err().unwrap().to_string();
+    let e = Settings { waves: 0, ..Settings::default() }.build().err().unwrap().to_string();
     assert!(e.contains("waves: found 0"), "{e}");
 }

@@ -292,6 +292,8 @@ fn what_files_say_does_not_reach_the_terminal_as_it_is() {
         fs::read_to_string(at("scan/scan.toml")).unwrap().replacen("phantom:head:16", "a\\u001b[2J\\u009bb", 1);
     fs::write(at("scan/scan.toml"), provenance).unwrap();
     let said = done(&["info", &scan]);
+    let heads: Vec<_> = said.lines().map(|l| l.split_whitespace().next().unwrap_or_default()).take(7).collect();
+    assert_eq!(heads, ["views", "source", "arc", "values", "volume", "", "kind"], "{said}");
     assert!(!said.contains(['\u{1b}', '\u{9b}']) && said.contains("a\\u{1b}[2J\\u{9b}b"), "{said}");
     let raw = done(&["info", &scan, "--json"]);
     assert!(!raw.contains(['\u{1b}', '\u{9b}']));

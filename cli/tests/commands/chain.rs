@@ -258,4 +258,9 @@ fn the_demonstration_compares_three_ways() {
     assert_eq!(results.len(), 3);
     assert!(results.iter().all(|r| r["scores"]["psnr"].as_f64().is_some_and(f64::is_finite)));
     assert!(dir.path().join("demo/compare.png").is_file());
+    // Both fields make the same number of steps.
+    assert_eq!(results[1]["steps"], results[2]["steps"]);
+    let page = text(&dir.path().join("page.html"));
+    let said = done(&["report", &out, "-o", &page]);
+    assert!(said.contains("3 runs, 4 volumes"), "{said}");
 }

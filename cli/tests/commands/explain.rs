@@ -47,6 +47,28 @@ fn the_uppermost_layer_decides_in_stages_of_stages() {
 }
 
 #[test]
+fn a_description_is_that_of_its_own_file() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("mine.toml");
+    std::fs::write(&path, "extends = \"fast\"\nname = \"mine\"\n").unwrap();
+    let said = json(&["explain", &text(&path), "--json"]);
+    assert_eq!((said["description"].as_str(), said["extends"][0].as_str()), (Some(""), Some("fast (shipped)")));
+    assert_ne!(json(&["explain", "fast", "--json"])["description"], "");
+}
+
+#[test]
+fn callbacks_that_an_encoder_cannot_serve_are_refused_with_file_and_line() {
+    let dir = tempdir().unwrap();
+    let path = text(&dir.path().join("two.toml"));
+    let encoder = "[encoder]\ntype = \"concat\"\nencoders = [\"hash-grid\", \"dense-grid\"]\n";
+    for (callback, remedy) in [("coarse-to-fine", "callbacks without coarse-to-fine"), ("fft-mask", "\"channel\"")] {
+        std::fs::write(&path, format!("extends = \"fast\"\ncallbacks = [\"{callback}\"]\n{encoder}")).unwrap();
+        let said = refused(1, &["explain", &path]);
+        assert!(said.contains("two.toml:2") && said.contains("callbacks.0") && said.contains(remedy), "{said}");
+    }
+}
+
+#[test]
 fn a_scan_adds_its_memory() {
     let dir = tempdir().unwrap();
     let scan = text(&dir.path().join("scan"));

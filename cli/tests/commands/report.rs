@@ -85,6 +85,9 @@ fn the_page_holds_what_the_files_have_and_fetches_nothing() {
     assert_eq!((&said["coarser"], said["runs"][0].as_str()), (&1.into(), Some("sirt")));
     let page = Page::read(&out);
     assert_eq!(page.names("volumes"), ["sirt", "reference"]);
+    // It opens with the reference beside the result, both in the reference's grey window.
+    assert_eq!(page.data["beside"], 1);
+    assert_eq!(page.data["volumes"][0]["window"], page.data["volumes"][1]["window"]);
     holds(&page, 0, &format!("{run}/volume.nii.gz"));
     holds(&page, 1, &format!("{scan}/truth.nii.gz"));
     let spacing: Vec<f64> = serde_json::from_value(page.data["volumes"][0]["spacing"].clone()).unwrap();
@@ -178,6 +181,24 @@ fn runs_stand_beside_each_other() {
     done(&["simulate", "phantom:head:24", "-o", &at("other"), "--views", "5", "--detector", "20x28"]);
     let said = refused(1, &["report", &first, "-o", &out, "--force", "--scan", &at("other")]);
     assert!(said.contains("another scan than the one of"), "{said}");
+}
+
+#[test]
+fn the_page_of_a_study_has_one_reference_and_means_over_the_seeds() {
+    let dir = tempdir().unwrap();
+    let at = |name: &str| text(&dir.path().join(name));
+    let study = "volumes = ['phantom:head:16']\nspecs = ['fdk', 'cgls']\nseeds = [1, 2]\nviews = 8\nsteps = 2\n";
+    fs::write(at("s.toml"), study).unwrap();
+    done(&["study", &at("s.toml"), "-o", &at("study")]);
+    done(&["report", &at("study"), "-o", &at("page.html")]);
+    let page = Page::read(at("page.html").as_ref());
+    // Each seed has a scan with a file of its own, but the truth is the same.
+    assert_eq!((page.names("volumes").len(), page.names("volumes")[4]), (5, "reference"));
+    assert_eq!(page.data["beside"], Value::Null);
+    assert_eq!(page.names("spreads"), ["head-16/fdk", "head-16/cgls"]);
+    let table: Value = serde_json::from_str(&fs::read_to_string(at("study/table.json")).unwrap()).unwrap();
+    assert_eq!(page.data["spreads"][0]["figures"], table["summary"][0]["figures"]);
+    assert!(page.data["spreads"][0]["figures"]["psnr"]["sd"].is_number());
 }
 
 #[test]

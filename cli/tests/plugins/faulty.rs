@@ -323,6 +323,24 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
     page(&rows);
 }
 
+/// Random points miss such a place, and a smaller learning rate does not help.
+#[test]
+fn numbers_that_are_not_finite_at_an_edge_are_found_and_the_run_names_the_stage() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| text(&dir.path().join(name));
+    done(&["simulate", "phantom:head:16", "-o", &at("scan"), "--views", "6", "--detector", "16x16"]);
+    let library = dir.path().join("faulty.so");
+    cc(&sources().join("plugins/tests/faulty.c"), &["FAULT=NAN_AT_AN_EDGE"], &library);
+    let library = text(&library);
+    let checked = said(&["plugins", "check", &library], &[dir.path()]);
+    assert!(checked.contains("faulty: finite"), "{checked}");
+    let sets = ["--spec", "fast", "--steps", "100", "--set", "encoder.type=faulty", "--set", "projector.samples=64"];
+    let run = at("run");
+    let ran = said(&[&["--plugin", &library, "reconstruct", &at("scan"), "-o", &run][..], &sets].concat(), &[]);
+    let named = "the first stage whose output is not finite: encoder (";
+    assert!(ran.contains("training diverged") && ran.contains(named), "{ran}");
+}
+
 /// A message up to its required part: the rest may depend on the number of threads.
 fn shortened(message: &str, want: &str) -> String {
     if message.contains("not hold: ") {

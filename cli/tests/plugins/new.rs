@@ -29,7 +29,17 @@ fn use_it(kind: &str, folder: &Path, library: &Path, scan: &Path) -> serde_json:
     let run = text(&folder.join("run"));
     let small = if PIECES.contains(&kind) { "stop={ passes = 12 }" } else { "training.rays=32" };
     let small = ["--steps", "12", "--set", small, "--json"];
-    json(&[&["--plugin", &library, "reconstruct", &text(scan), "--spec", &spec, "-o", &run][..], &small].concat())
+    let record =
+        json(&[&["--plugin", &library, "reconstruct", &text(scan), "--spec", &spec, "-o", &run][..], &small].concat());
+    if kind == "encoder" {
+        // Without its plugin a field cannot be evaluated; the message has the option for it.
+        let path = record["plugins"][0]["path"].as_str().unwrap();
+        for (command, output) in [("export", "export.nii"), ("features", "features.png")] {
+            let said = refused(1, &[command, &run, "-o", &text(&folder.join(output))]);
+            assert!(said.contains("record.json") && said.contains(&format!("--plugin {path}")), "{said}");
+        }
+    }
+    record
 }
 
 #[test]
@@ -40,8 +50,11 @@ fn in_rust() {
         let name = format!("new-{kind}");
         let into = text(dir.path());
         let said = done(&["plugins", "new", &name, "--kind", kind, "--lang", "rust", "--into", &into]);
-        assert!(said.contains("cargo build --release"), "{said}");
+        assert!(said.contains("cargo build --release") && said.contains("some minutes"), "{said}");
         let folder = dir.path().join(&name);
+        // Paths of this machine would not mean anything on another.
+        let manifest = std::fs::read_to_string(folder.join("Cargo.toml")).unwrap();
+        assert!(manifest.contains("path = \"../"), "{manifest}");
         // The versions of this build, so that nothing else is downloaded.
         std::fs::copy(sources().join("Cargo.lock"), folder.join("Cargo.lock")).unwrap();
         cargo(&folder, &["build", "--release"]);

@@ -2,6 +2,7 @@
 
 use crate::memory::Memory;
 use crate::study::spread::Spread;
+use crate::tradeoff::json::read_json;
 use conefield_core::Result;
 use conefield_evaluation::report::{CurveOptions, MiddleSlices, Panel, compare_png, panels_png, slices_png};
 use serde_json::Value;
@@ -83,7 +84,22 @@ pub fn curves(path: &Path, title: &str, methods: &[(String, Vec<PathBuf>)]) -> R
 /// The lines of a run's metrics. Skips a line that a killed run left unfinished.
 fn records(run: &Path) -> Vec<Value> {
     let text = std::fs::read(run.join("metrics.jsonl")).unwrap_or_default();
-    String::from_utf8_lossy(&text).lines().filter_map(|l| serde_json::from_str(l).ok()).collect()
+    let mut records: Vec<Value> =
+        String::from_utf8_lossy(&text).lines().filter_map(|l| serde_json::from_str(l).ok()).collect();
+    if let Ok(record) = read_json::<Value>(&run.join("record.json")) {
+        score_last(&mut records, &record);
+    }
+    records
+}
+
+/// Gives the line of the result in a run's metrics the PSNR of the run's `record`. Lines during the run count one voxel
+/// in 64, the record all of them.
+pub fn score_last(records: &mut [Value], record: &Value) {
+    let step = record["best_step"].as_u64().or(record["steps"].as_u64());
+    let result = records.iter_mut().rev().find(|r| r["step"].as_u64() == step);
+    if let (Some(result), Some(psnr)) = (result, record["scores"]["psnr"].as_f64()) {
+        result["psnr"] = psnr.into();
+    }
 }
 
 /// PSNR over `key`, where both are above the start of a logarithmic axis.
@@ -120,6 +136,20 @@ fn height(curve: &Curve, x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn the_last_point_is_the_score_of_the_whole_volume() {
+        let line = |step: u64, psnr: f64| json!({ "step": step, "psnr": psnr });
+        let scored = |record: Value| {
+            let mut lines = vec![line(10, 20.0), line(20, 25.0)];
+            score_last(&mut lines, &record);
+            lines.iter().map(|l| l["psnr"].as_f64().unwrap()).collect::<Vec<_>>()
+        };
+        assert_eq!(scored(json!({ "steps": 20, "scores": { "psnr": 26.0 } })), [20.0, 26.0]);
+        assert_eq!(scored(json!({ "steps": 20, "best_step": 10, "scores": { "psnr": 26.0 } })), [26.0, 25.0]);
+        assert_eq!(scored(json!({ "steps": 20, "scores": null })), [20.0, 25.0]);
+    }
 
     #[test]
     fn curves_are_averaged_where_all_of_them_are() {

@@ -233,10 +233,10 @@ impl StudyReport {
         failed.map(|(r, e)| format!("{}/{} failed: {e}", group(&r.case, r.seed), r.method)).collect()
     }
 
-    /// Text for a terminal: means and failures.
-    pub fn text(&self) -> String {
+    /// Text for a terminal: means and failures; `shown` writes a table.
+    pub fn text(&self, shown: &dyn Fn(&Table) -> String) -> String {
         let mut parts = vec![self.line()];
-        parts.extend(self.tables().into_iter().map(|(case, table)| format!("{case}\n{}", table.text())));
+        parts.extend(self.tables().into_iter().map(|(case, table)| format!("{case}\n{}", shown(&table))));
         parts.extend(Some(self.failures().join("\n")).filter(|f| !f.is_empty()));
         parts.join("\n\n")
     }

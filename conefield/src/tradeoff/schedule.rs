@@ -254,16 +254,22 @@ impl Schedule {
             None => format!("spec {spec}"),
         };
         let (e, steps) = (&self.expected, self.kind.steps());
-        let mut lines = vec![format!("planned: {named}, {}", self.why)];
+        let mut lines = vec![format!("method: {named}, {}", self.why)];
         lines.extend(self.passed_over.iter().map(|line| format!("passed over: {line}")));
         if e.then_s > 0.0 {
             lines.push(format!("planned: at most {} after the training", time(e.then_s)));
         }
+        let train_s = self.train_s.min(self.steps as f64 * e.step_s);
+        let free = match self.train_s - train_s {
+            // The method has no more passes.
+            free if free > e.step_s => format!("; it then stops by itself and leaves {}", time(free)),
+            _ => String::new(),
+        };
         lines.push(format!(
-            "planned: {} to read and to measure, {} to prepare, {} for about {} {steps} of {}, {} to write and compare",
+            "planned: {} to read and to measure, {} to prepare, {} for about {} {steps} of {} each, {} to write and compare{free}",
             time(self.load_s),
             time(e.prepare_s),
-            time(self.train_s),
+            time(train_s),
             number(self.steps),
             time(e.step_s),
             time(e.after_s() - e.then_s),

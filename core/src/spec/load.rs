@@ -248,6 +248,8 @@ impl Layer {
         let above = [above, std::slice::from_ref(&self.origin)].concat();
         self.extend_methods(&mut node, shipped, &above, work)?;
         let Some(mut tree) = self.base(&mut node, shipped, &above, work)? else { return Ok(node) };
+        // A description is that of its own spec.
+        tree.take("description");
         tree.merge(node);
         Ok(tree)
     }

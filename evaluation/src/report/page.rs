@@ -32,10 +32,14 @@ pub struct Page {
     pub warnings: Vec<Notice>,
     /// Results in the order of `runs`, then references.
     pub volumes: Vec<PageVolume>,
+    /// Index of the volume that the page shows beside the first when it opens.
+    pub beside: Option<usize>,
     /// The runs.
     pub runs: Vec<PageRun>,
     /// Their scans.
     pub scans: Vec<PageScan>,
+    /// Statistics over the seeds of studies.
+    pub spreads: Vec<PageSpread>,
     /// Remarks about the page itself.
     pub notes: Vec<String>,
     /// Seconds after which the page asks its server for a newer one; without a server it fetches nothing.
@@ -98,6 +102,15 @@ pub struct PredictedView {
     pub residual: String,
     /// Root mean square of the residual.
     pub rms: f64,
+}
+
+/// A case and a method of a study over its seeds.
+#[derive(Debug, Serialize)]
+pub struct PageSpread {
+    /// Case and method.
+    pub name: String,
+    /// Figures by their names in `table.json`, each with `mean`, `sd` (null for a single value) and `n`.
+    pub figures: Value,
 }
 
 /// A scan.

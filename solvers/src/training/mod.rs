@@ -6,13 +6,14 @@
 pub mod callback;
 pub mod callbacks;
 pub mod checkpoint;
+mod culprit;
 pub mod run;
 
 pub use callback::{Callback, CallbackSpec, Callbacks, Kept, State, Update};
 pub use run::Run;
 
 use conefield_core::backend::{Adam, BlockWork, TrainRay, Work};
-use conefield_core::error::{Error, Result};
+use conefield_core::error::Result;
 use conefield_core::loss::Loss;
 use std::time::Instant;
 
@@ -88,8 +89,8 @@ fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Re
         Ok(())
     })?;
     if update == Update::Take && !(stats.loss.is_finite() && stats.prior.is_finite()) {
-        let what = format!("the loss is {}, the prior {}; {}", stats.loss, stats.prior, run::HINT);
-        return Err(Error::Diverged { step: run.step, what });
+        let what = format!("the loss is {}, the prior {}", stats.loss, stats.prior);
+        return Err(culprit::diverged(run, &work, &what));
     }
     run.step += 1;
     run.samples += stats.samples;
@@ -102,12 +103,19 @@ fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Re
     Ok(())
 }
 
+/// Part of a run without a record at most, so that the curve of a short run has ten points.
+const LONGEST_GAP: f64 = 0.1;
+
 /// Records the steps since the last record, if one is due.
 fn record(run: &mut Run<'_>, task: &dyn Task, callbacks: &mut Callbacks, over: bool) -> Result<()> {
-    let due = run.step > 0 && (run.step.is_multiple_of(run.report_every) || over);
+    let share = run.clock.done(run.step);
+    // After one more step it would be too late.
+    let late = share + share / run.step.max(1) as f64 > run.tally.recorded + LONGEST_GAP + 1e-9;
+    let due = run.step > 0 && (run.step.is_multiple_of(run.report_every) || late || over);
     if !due || run.tally.window.steps == 0 {
         return Ok(());
     }
+    run.tally.recorded = share;
     run.clock.pause();
     let lr = run.tally.rate * task.adam(run.epoch(), run.clock.share(run.step)).lr;
     let mut record = run.tally.window.record(run.step, run.clock.seconds(), lr);

@@ -60,11 +60,14 @@ pub struct Tally {
     pub rate: f64,
     /// Number of rollbacks to an earlier state.
     pub rollbacks: u64,
+    /// Share of the run at the last record.
+    #[serde(default)]
+    pub recorded: f64,
 }
 
 impl Default for Tally {
     fn default() -> Self {
-        Self { window: Window::default(), updates: 0, rate: 1.0, rollbacks: 0 }
+        Self { window: Window::default(), updates: 0, rate: 1.0, rollbacks: 0, recorded: 0.0 }
     }
 }
 

@@ -318,6 +318,33 @@ pub fn extremes(stage: &dyn Stage, options: &Options) -> Outcome {
     settle(wild, "0, denormal, ±1e30 give finite outputs")
 }
 
+/// Points along each side of the grid of [`finite`].
+const SIDE: usize = 17;
+
+/// Outputs and input gradients are finite for all usual inputs: for a stage that reads points, a grid that includes the
+/// faces and corners of the cube, since random points miss a corner.
+pub fn finite(stage: &dyn Stage, options: &Options) -> Outcome {
+    if let Err(skip) = by_row(stage) {
+        return skip;
+    }
+    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
+    let n = SIDE.pow(3);
+    let (mut x, dy) = data::<f32>(&info, options, n);
+    if info.input == 3 {
+        let (low, width) = (options.inputs.start, options.inputs.end - options.inputs.start);
+        let at = |i: usize| (low + width * (i % SIDE) as f64 / (SIDE - 1) as f64) as f32;
+        x = [SIDE * SIDE, SIDE, 1].iter().flat_map(|step| (0..n).map(move |i| at(i / step))).collect();
+    }
+    let [y, _] = forward(k, &info, &p, &x, n);
+    let [_, dx] = gradients(k, &info, &p, &x, &dy, n);
+    let wild = |what: &str, values: &[f32]| {
+        let i = values.iter().position(|v| !v.is_finite())?;
+        let inputs: Vec<String> = (0..info.input.min(3)).map(|c| format!("{:.3}", x[c * n + i % n])).collect();
+        Some(format!("{what} {} is {} where the inputs are {}", i / n, values[i], inputs.join(", ")))
+    };
+    settle(wild("channel", &y).or_else(|| wild("input gradient", &dx)), &format!("at {n} inputs"))
+}
+
 /// NaN and infinities do not leave their rows.
 pub fn poison(stage: &dyn Stage, options: &Options) -> Outcome {
     if let Err(skip) = by_row(stage) {

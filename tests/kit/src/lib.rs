@@ -145,6 +145,7 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     report.add("guards", || behaviour::guards(stage, options));
     report.add("threads", || behaviour::threads(stage, options));
     report.add("extremes", || behaviour::extremes(stage, options));
+    report.add("finite", || behaviour::finite(stage, options));
     report.add("poison rows", || behaviour::poison(stage, options));
     report.add("save and load", || behaviour::save_and_load(stage, options));
     report.add("no fault", || call::settle(stage.fault().err().map(|e| e.to_string()), "none was reported"));

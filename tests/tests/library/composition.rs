@@ -65,7 +65,9 @@ fn pipeline(encoder: &Value, [normalizers, masks]: &[Value; 2], field: &Value, p
 fn learns(name: &str, spec: &Value) -> usize {
     let (solution, records) = solve(spec, &scan(), &Weights::default()).unwrap_or_else(|e| panic!("{name}: {e}"));
     let (first, last) = (records.first().unwrap().loss.unwrap(), records.last().unwrap().loss.unwrap());
-    assert_eq!((records.len(), solution.steps), (6, 30), "{name}");
+    // A record every five steps, and others between them, so that there are at least ten.
+    assert_eq!(solution.steps, 30, "{name}");
+    assert!(records.len() >= 10, "{name}: {}", records.len());
     assert!(last < 0.5 * first, "{name}: the loss went from {first} to {last}");
     assert!(volume(&solution).data.iter().all(|x| x.is_finite()), "{name}");
     // A mask in the chain was decided on the way.

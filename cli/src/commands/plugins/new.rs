@@ -5,7 +5,7 @@ use clap::{Args, ValueEnum};
 use conefield_core::registry::{self, Kind};
 use conefield_core::{Error, Result};
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// Create a plugin: a stage, its test, and a spec that uses it. It builds without changes.
 #[derive(Args)]
@@ -146,7 +146,11 @@ impl New {
             folder.display(),
             files.len(),
             folder.display(),
-        ))
+        ))?;
+        match self.lang {
+            Language::Rust => out::say("The first build compiles conefield's crates too, which takes some minutes."),
+            Language::C => Ok(()),
+        }
     }
 
     fn rust(&self) -> Result<Start> {
@@ -204,7 +208,7 @@ impl New {
         let from = |package: &str, folder: &str| -> Result<String> {
             Ok(match self.sources()? {
                 Some(root) => {
-                    let path = toml::Value::String(root.join(folder).display().to_string());
+                    let path = toml::Value::String(self.relative(&root.join(folder)).display().to_string());
                     format!("{package} = {{ path = {path} }}")
                 }
                 None => format!("{package} = \"{}\"", env!("CARGO_PKG_VERSION")),
@@ -215,6 +219,17 @@ impl New {
             .replace("@kit@", &from("conefield-conformance", "tests/kit")?)
             .replace("@name@", &self.name)
             .replace("@crate@", &self.name.replace('-', "_")))
+    }
+
+    /// `target` as seen from the folder of the plugin; `target` itself where no such path leads.
+    fn relative(&self, target: &Path) -> PathBuf {
+        let Ok(from) = self.into.canonicalize().map(|into| into.join(&self.name)) else { return target.into() };
+        let shared = from.components().zip(target.components()).take_while(|(a, b)| a == b).count();
+        if shared == 0 {
+            return target.into();
+        }
+        let up = from.components().skip(shared).map(|_| Component::ParentDir);
+        up.chain(target.components().skip(shared)).collect()
     }
 
     /// The folder of conefield's sources.

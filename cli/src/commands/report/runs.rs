@@ -2,14 +2,16 @@
 
 use crate::run_folder::RunOnDisk;
 use conefield::explain::Explanation;
+use conefield::study::pictures::score_last;
 use conefield::tradeoff::json::read_json;
 use conefield::{method, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::error::ensure;
-use conefield_evaluation::report::page::{Notice, Page, PageRun};
+use conefield_evaluation::report::page::{Notice, Page, PageRun, PageSpread};
 use conefield_evaluation::report::text::stem;
 use serde::Deserialize;
+use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -70,6 +72,26 @@ fn cases(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(found)
 }
 
+/// Means and standard deviations over the seeds of the studies in `folders`.
+pub fn spreads(folders: &[PathBuf]) -> Result<Vec<PageSpread>> {
+    #[derive(Deserialize)]
+    struct Study {
+        #[serde(default)]
+        summary: Vec<Line>,
+    }
+    #[derive(Deserialize)]
+    struct Line {
+        case: String,
+        method: String,
+        figures: Value,
+    }
+    let tables = folders.iter().map(|f| f.join("table.json")).filter(|t| t.is_file());
+    let studies = tables.map(|t| read_json::<Study>(&t)).collect::<Result<Vec<_>>>()?;
+    let lines = studies.into_iter().flat_map(|s| s.summary);
+    let spread = |l: Line| PageSpread { name: format!("{}/{}", l.case, l.method), figures: l.figures };
+    Ok(lines.map(spread).collect())
+}
+
 /// The runs of the page, with unique names.
 pub fn page_runs(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun> {
     let names = names(found);
@@ -90,12 +112,21 @@ pub fn page_runs(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun
                 spec: run.spec().to_owned(),
                 plan: plan(run).ok(),
                 record: run.record().cloned(),
-                curves: run.curves().to_vec(),
+                curves: curves(run),
                 name,
                 ..PageRun::default()
             }
         })
         .collect()
+}
+
+/// The lines of the run's metrics; that of the result has the score of the record.
+fn curves(run: &RunOnDisk) -> Vec<Value> {
+    let mut lines = run.curves().to_vec();
+    if let Some(record) = run.record() {
+        score_last(&mut lines, record);
+    }
+    lines
 }
 
 /// Describes what the spec builds. Fails if its plugins are not loaded.

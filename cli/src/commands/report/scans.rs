@@ -19,6 +19,9 @@ use conefield_scans::diagnosis::survey;
 use ndarray::{Array3, Axis};
 use std::path::{Path, PathBuf};
 
+/// The name of the only reference; of several, each has its path added.
+pub const REFERENCE: &str = "reference";
+
 /// Default number of views.
 const VIEWS: usize = 6;
 
@@ -120,7 +123,7 @@ impl Group {
         coarser: usize,
         page: &mut Page,
         results: &mut [Option<PageVolume>],
-        references: &mut Vec<PageVolume>,
+        references: &mut Vec<(PathBuf, PageVolume)>,
     ) -> Result<()> {
         let first = &found[self.runs[0].0];
         let scan = self.scan.as_ref().map(|path| read(path, first, options, page)).transpose()?.flatten();
@@ -139,6 +142,7 @@ impl Group {
                 page.runs[i].views = Some(shown.predict(&volume, own, options)?);
             }
         }
+        let mut window_from = None;
         for (path, _) in &self.references {
             let volume = match (&scan, &self.scan) {
                 (Some(scan), Some(place)) => input::reference(path, place, scan)?,
@@ -146,10 +150,20 @@ impl Group {
                 // The truth in this scan is not the one of the run.
                 _ => continue,
             };
-            let several = self.references.len() > 1 || !references.is_empty();
-            let name = if several { format!("reference {}", path.display()) } else { "reference".into() };
-            let reference = PageVolume::new(&name, true, &volume, &own_grid(&volume, grid.as_ref()), coarser)?;
-            references.push(in_unit(reference, scan.as_ref().map(|s| &s.unit)));
+            let reference = PageVolume::new(REFERENCE, true, &volume, &own_grid(&volume, grid.as_ref()), coarser)?;
+            let reference = in_unit(reference, scan.as_ref().map(|s| &s.unit));
+            // The scans of several seeds have the same truth.
+            let listed = references.iter().position(|(_, r)| r.same_as(&reference));
+            let at = listed.unwrap_or_else(|| {
+                references.push((path.clone(), reference));
+                references.len() - 1
+            });
+            window_from.get_or_insert(at);
+        }
+        if let Some(at) = window_from {
+            for (i, _) in &self.runs {
+                results[*i] = results[*i].take().map(|r| r.in_window_of(&references[at].1));
+            }
         }
         if let (Some(scan), Some(shown), Some(place)) = (&scan, shown, &self.scan) {
             let survey = survey(scan);

@@ -81,7 +81,7 @@ impl PageVolume {
             high,
             window: MiddleSlices::of(volume).window(),
             coarser,
-            note: format!("{name}: {voxels}, values in steps of {slope:.2e}"),
+            note: format!("{voxels}, values in steps of {slope:.2e}"),
             packed,
         })
     }
@@ -91,9 +91,30 @@ impl PageVolume {
         Self { unit: unit.to_owned(), water, ..self }
     }
 
+    /// Sets its display name.
+    pub fn named(self, name: &str) -> Self {
+        Self { name: name.to_owned(), ..self }
+    }
+
+    /// Sets its automatic grey window to that of `other`, so that both are shown alike.
+    pub fn in_window_of(self, other: &Self) -> Self {
+        Self { window: other.window, ..self }
+    }
+
+    /// Whether both have the same voxels on the same grid.
+    pub fn same_as(&self, other: &Self) -> bool {
+        (&self.packed, self.slope, self.offset) == (&other.packed, other.slope, other.offset)
+            && (self.shape, self.spacing, self.center) == (other.shape, other.spacing, other.center)
+    }
+
     /// Its display name.
     pub fn name(&self) -> &str {
         &self.name
+    }
+
+    /// Whether it is a reference.
+    pub fn is_reference(&self) -> bool {
+        self.reference
     }
 
     /// Voxels of the page along x, y and z.

@@ -81,15 +81,17 @@ impl Callback for Opener {
     fn check(&self, pipeline: &Pipeline) -> Result<()> {
         let encoder = &pipeline.encoder;
         let ends = ends(encoder.as_ref());
+        let refused = |why: &str| {
+            let found = format!("coarse-to-fine with an encoder {why}: {}", encoder.describe());
+            let expected = "one encoder with tables of features, such as hash-grid; with this one, callbacks without coarse-to-fine";
+            Error::invalid("spec", "", found, expected)
+        };
         if ends.is_empty() || !encoder.coarse_to_fine() {
-            return Err(Error::unsupported(
-                encoder.describe(),
-                "coarse-to-fine: its channels are not ordered from coarse to fine",
-            ));
+            return Err(refused("whose channels are not ordered from coarse to fine"));
         }
         let most = ends.len();
         ensure(self.0.levels <= most, "spec", "levels", self.0.levels, format!("1 to {most}, as the encoder has"))?;
-        Opened::new(encoder.clone(), ends[self.0.levels - 1]).map(drop)
+        Opened::new(encoder.clone(), ends[self.0.levels - 1]).map(drop).map_err(|e| refused(&format!("({e})")))
     }
 
     fn before_step(&mut self, run: &mut Run<'_>) -> Result<()> {

@@ -139,10 +139,11 @@ impl Callback for Masker {
             return ensure(fits, "spec", "keep", format!("{keep:?}"), expected);
         }
         if self.settings.scope == Scope::Finer && !pipeline.encoder.coarse_to_fine() {
-            return Err(Error::unsupported(
-                "fft-mask with scope \"finer\"",
-                "this encoder's channels are not ordered from coarse to fine; use scope = \"channel\"",
-            ));
+            let found = format!(
+                "\"finer\" with an encoder whose channels are not ordered from coarse to fine: {}",
+                pipeline.encoder.describe()
+            );
+            return Err(Error::invalid("spec", "scope", found, "\"channel\" with this encoder"));
         }
         Ok(())
     }

@@ -79,7 +79,9 @@ impl Callback for Waiting {
 
     /// Ends the run after too many records without improvement.
     fn at_record(&mut self, record: &mut Record, run: &mut Run<'_>) -> Result<()> {
-        let Some(held_out) = record.held_out else { return Ok(()) };
+        // Short runs have records in between; they do not count.
+        let counts = run.step.is_multiple_of(run.report_every) || run.clock.done(run.step) >= 1.0;
+        let Some(held_out) = record.held_out.filter(|_| counts) else { return Ok(()) };
         let better = held_out.is_finite() && self.waited.best.is_none_or(|b| held_out < b.held_out);
         if better && self.keep(run)? {
             self.waited = Waited { best: Some(Best { step: record.step, held_out }), since: 0 };

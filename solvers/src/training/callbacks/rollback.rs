@@ -9,6 +9,7 @@
 //! to count: the run still ends, and uses other rays than those that caused the problem. Adam's update count is
 //! restored with its moments, whose bias it corrects.
 
+use crate::training::culprit;
 use crate::training::run::{HINT, Run, strayed};
 use crate::training::{Callback, CallbackSpec, Kept, State, Update};
 use conefield_core::arena::{Arena, Layout};
@@ -118,7 +119,10 @@ impl Callback for Guard {
     fn after_gradients(&mut self, work: &Work<'_>, stats: &StepStats, run: &mut Run<'_>) -> Result<Update> {
         if !(stats.loss.is_finite() && stats.prior.is_finite()) {
             let what = format!("the loss is {}, the prior {}", stats.loss, stats.prior);
-            return self.back(&what, run);
+            return match self.spent(&what, run) {
+                None => self.back(&what, run),
+                Some(what) => Err(culprit::diverged(run, work, &what)),
+            };
         }
         let empty: f64 = work.rays.iter().map(|r| self.of(0.0, f64::from(r.target))).sum();
         let empty = empty / work.rays.len().max(1) as f64;
@@ -233,16 +237,23 @@ impl Guard {
         Ok(Update::Take)
     }
 
+    /// Why the run cannot return to an earlier state after `what`, if so.
+    fn spent(&self, what: &str, run: &Run<'_>) -> Option<String> {
+        if self.copy.is_none() {
+            return Some(what.to_owned());
+        }
+        let spent = run.tally.rollbacks >= self.times;
+        spent.then(|| format!("{what}, after {} rollbacks with half the rate each time", self.times))
+    }
+
     /// Restores the last good state and reports it, or gives up.
     fn back(&mut self, what: &str, run: &mut Run<'_>) -> Result<Update> {
         let step = run.step;
-        let (Some(kept), Some([at, updates])) = (&self.copy, self.watched.kept) else {
+        let spent = self.spent(what, run);
+        let (Some(kept), Some([at, updates]), None) = (&self.copy, self.watched.kept, &spent) else {
+            let what = spent.unwrap_or_else(|| what.to_owned());
             return Err(Error::Diverged { step, what: format!("{what}; {HINT}") });
         };
-        if run.tally.rollbacks >= self.times {
-            let what = format!("{what}, after {} rollbacks with half the rate each time", self.times);
-            return Err(Error::Diverged { step, what: format!("{what}; {HINT}") });
-        }
         let Arena { params, grads, first, second } = &mut run.model.arena;
         [params, first, second].into_iter().zip(kept).for_each(|(p, k)| copy(p, k));
         grads.fill(0.0);
