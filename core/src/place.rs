@@ -11,8 +11,8 @@ mod map;
 mod penalty;
 mod views;
 
-pub use map::{ADD, DIVIDE, FLOOR, INVERT, Map, RELAX, Reduction, squares};
-pub use penalty::{Dual, Guide, Kernels, Penalty, Update};
+pub use map::{ADD, CLIP, DIVIDE, INVERT, Map, RELAX, Reduction, squares};
+pub use penalty::{Bounds, Dual, Guide, Kernels, Penalty, Update};
 pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 
 use crate::allowance;

@@ -2,7 +2,7 @@
 
 use crate::error::{Result, ensure};
 use crate::geometry::VoxelGrid;
-pub use crate::place::{Dual, Guide, Kernels, Penalty, Update};
+pub use crate::place::{Bounds, Dual, Guide, Kernels, Penalty, Update};
 use crate::space::Space;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

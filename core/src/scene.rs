@@ -9,7 +9,9 @@ use std::sync::Arc;
 
 mod settings;
 
-pub use settings::{AttenuationScale, CoarseSurround, LevelRule, SceneSettings, SupportRule, SurroundRule, VoxelScene};
+pub use settings::{
+    AttenuationScale, BoundsSettings, CoarseSurround, LevelRule, SceneSettings, SupportRule, SurroundRule, VoxelScene,
+};
 
 /// Maps lengths to cube sides and attenuation to order one, based on the scan only.
 #[derive(Debug, Clone, PartialEq)]

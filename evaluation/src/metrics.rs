@@ -1,5 +1,5 @@
 //! Distance between a reconstructed volume and its reference: PSNR, RMSE and the three common SSIMs; and overlap of two
-//! label maps: Dice.
+//! label maps: Dice; and agreement of two volumes about where material is: Matthews correlation.
 //!
 //! Three definitions of SSIM are published under one name and differ by several hundredths. Each has its own function
 //! here ([`ssim_2d`], [`ssim_3d`], [`ssim_skimage`]), and [`evaluate`] reports all of them by name. All sums are in
@@ -11,6 +11,7 @@
 mod check;
 mod dice;
 mod error;
+mod material;
 mod peak;
 mod score;
 mod ssim;
@@ -18,6 +19,7 @@ mod window;
 
 pub use dice::{Dice, LabelDice, dice, label_map};
 pub use error::{Axis, WorstSlice, psnr, rmse, worst_slices};
+pub use material::{Agreement, Threshold, agreement, otsu};
 pub use peak::{other_unit, peak_of};
 pub use score::{Scores, evaluate};
 pub use ssim::{ssim_2d, ssim_3d, ssim_skimage};

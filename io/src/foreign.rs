@@ -19,6 +19,8 @@ const ZEISS: &str = "export the projections as TIFF and describe them in a scann
 const EXPORT: &str = "export TIFF, NumPy, MetaImage or NIfTI files, and describe projections in a scanner.toml \
                       (docs/guide/formats.md)";
 
+const MAT: &str = "save a volume as .npy, and describe projections in a scanner.toml (docs/guide/formats.md)";
+
 /// First bytes of a file, the format's name and what to do.
 const FORMATS: &[(&[u8], &str, &str)] = &[
     (b"VARIAN_VA_INTERNAL_HND", "Varian's HND, projections of an On-Board Imager", RTK),
@@ -27,7 +29,7 @@ const FORMATS: &[(&[u8], &str, &str)] = &[
     // Type 0x7000, a header of 68 bytes, whose image part has another 32.
     (b"\x00\x70\x44\x00", "HIS, projections of an Elekta or PerkinElmer detector", RTK),
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "an OLE file such as Zeiss' TXRM and TXM", ZEISS),
-    (b"MATLAB 5.0 MAT-file", "MATLAB's MAT file of version 5", "save it with -v7.3, which is HDF5, or as .npy"),
+    (b"MATLAB ", "MATLAB's MAT file", MAT),
     (b"SIMPLE  =", "FITS", EXPORT),
     (b"\x89PNG\r\n", "PNG", EXPORT),
     (b"\xff\xd8\xff", "JPEG", EXPORT),

@@ -75,6 +75,12 @@ impl Input {
         Self { path: self.path, reader, size, packed: Some(packed), at: 0 }
     }
 
+    /// Ends after the next `bytes` bytes.
+    pub fn part(self, bytes: u64) -> Self {
+        let size = if self.packed.is_none() { self.size.min(self.at.saturating_add(bytes)) } else { self.size };
+        Self { reader: Box::new(self.reader.take(bytes)), size, ..self }
+    }
+
     /// Remaining bytes of a plain file; `None` for a compressed one, where only decompression shows them.
     pub fn left(&self) -> Option<u64> {
         self.packed.is_none().then(|| self.size.saturating_sub(self.at))

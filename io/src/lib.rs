@@ -32,6 +32,7 @@ mod hdf5;
 mod input;
 mod lease;
 mod lock;
+mod mat;
 mod memory;
 mod metaimage;
 mod naf;

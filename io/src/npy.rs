@@ -19,11 +19,11 @@ const LONGEST_HEADER: usize = 1 << 16;
 
 /// The header's entries.
 #[derive(Debug, PartialEq)]
-struct Header {
-    number: Number,
-    order: ByteOrder,
-    fortran: bool,
-    shape: Vec<usize>,
+pub(crate) struct Header {
+    pub number: Number,
+    pub order: ByteOrder,
+    pub fortran: bool,
+    pub shape: Vec<usize>,
 }
 
 /// Reads an array with the named axes as `f32` in C order; refuses values that are not finite.
@@ -44,6 +44,11 @@ pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
 /// Like [`read_one_of`], with the type of the numbers in the file.
 pub(crate) fn read_counts(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<(ArrayD<f32>, Number)> {
     let header = read_header(input, start)?;
+    array(input, &header, sets)
+}
+
+/// The array that `header` describes, of one of the sets of axes; `input` has its data and nothing after it.
+pub(crate) fn array(input: &mut Input, header: &Header, sets: &[&[&str]]) -> Result<(ArrayD<f32>, Number)> {
     let expected = || {
         let each: Vec<String> = sets.iter().map(|a| format!("{} axes ({})", a.len(), a.join(", "))).collect();
         each.join(" or ")
@@ -74,6 +79,11 @@ pub(crate) fn read_counts(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -
 /// [`read_from`].
 pub(crate) fn read_exact(input: &mut Input, start: Vec<u8>) -> Result<(Vec<usize>, Vec<f64>)> {
     let header = read_header(input, start)?;
+    exact(input, &header)
+}
+
+/// Like [`read_exact`], for the array that `header` describes.
+pub(crate) fn exact(input: &mut Input, header: &Header) -> Result<(Vec<usize>, Vec<f64>)> {
     let count = header.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
     let fits = count.filter(|n| (1..=2).contains(&header.shape.len()) && *n > 0 && *n < 1 << 32);
     let count = fits.ok_or_else(|| {
@@ -84,7 +94,7 @@ pub(crate) fn read_exact(input: &mut Input, start: Vec<u8>) -> Result<(Vec<usize
         (true, &[rows, columns]) => (0..count).map(|i| values[i % columns * rows + i / columns]).collect(),
         _ => values,
     };
-    Ok((header.shape, values))
+    Ok((header.shape.clone(), values))
 }
 
 /// Writes `array` as little-endian `f32` in C order.

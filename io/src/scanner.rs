@@ -6,7 +6,7 @@
 //! version = 1
 //!
 //! [files]                            # beside or below this file
-//! projections = "scan.npz:counts"    # TIFF, .npy, .npz:ARRAY, .mha, a folder of images, or a list of those
+//! projections = "scan.npz:counts"    # TIFF, .npy, .npz:ARRAY, .mat:ARRAY, .mha, a folder of images, or a list of those
 //! flat = "scan.npz:flat"             # optional: the open beam; several images are averaged
 //! dark = "scan.npz:dark"             # optional: no beam
 //!
@@ -21,7 +21,7 @@
 //! direction = "counterclockwise"     # of the source, seen from +z; that of a turning object is the opposite
 //!
 //! [layout]                           # how the arrays lie; this is the default
-//! axes = ["view", "row", "column"]
+//! axes = ["view", "row", "column"]      # two of them if the arrays have no third
 //! flip_rows = false                  # true: the first row is the lowest
 //! flip_columns = false
 //!
@@ -181,7 +181,9 @@ fn refuse_images(path: &Path) -> Result<()> {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
     let found = match &extension[..] {
         _ if path.is_dir() => "a folder".to_owned(),
-        "tif" | "tiff" | "npy" | "npz" | "mha" | "h5" | "hdf5" | "nxs" => format!("a .{extension} file of projections"),
+        "tif" | "tiff" | "npy" | "npz" | "mat" | "mha" | "h5" | "hdf5" | "nxs" => {
+            format!("a .{extension} file of projections")
+        }
         _ => return foreign::refuse_file(path),
     };
     if path.is_dir() {
@@ -265,14 +267,14 @@ struct Cil {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct LayoutTable {
-    axes: [StackAxis; 3],
+    axes: Vec<StackAxis>,
     flip_rows: bool,
     flip_columns: bool,
 }
 
 impl Default for LayoutTable {
     fn default() -> Self {
-        Self { axes: [StackAxis::View, StackAxis::Row, StackAxis::Column], flip_rows: false, flip_columns: false }
+        Self { axes: vec![StackAxis::View, StackAxis::Row, StackAxis::Column], flip_rows: false, flip_columns: false }
     }
 }
 
@@ -398,9 +400,14 @@ fn straightened(place: &str, mut geometry: Geometry, mut projections: Array3<f32
 
 fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
     let all = [StackAxis::View, StackAxis::Row, StackAxis::Column];
-    let expected = "each of \"view\", \"row\" and \"column\" once";
-    ensure(all.iter().all(|a| table.axes.contains(a)), place, "layout.axes", format!("{:?}", table.axes), expected)?;
-    Ok(StackLayout { axes: table.axes, flip_rows: table.flip_rows, flip_columns: table.flip_columns })
+    let lacked: Vec<StackAxis> = all.into_iter().filter(|a| !table.axes.contains(a)).collect();
+    let axes = <[StackAxis; 3]>::try_from([&table.axes[..], &lacked].concat()).ok();
+    let Some(axes) = axes.filter(|_| lacked.len() < 2) else {
+        let expected = "each of \"view\", \"row\" and \"column\" once, or two of them";
+        return Err(Error::invalid(place, "layout.axes", format!("{:?}", table.axes), expected));
+    };
+    let lacked = lacked.first().copied().unwrap_or(StackAxis::View);
+    Ok(StackLayout { axes, lacked, flip_rows: table.flip_rows, flip_columns: table.flip_columns })
 }
 
 /// The single open-beam value, or `None` if there is a flat field. Refuses contradictions.

@@ -1,9 +1,9 @@
-//! Stacks of projections and single fields from TIFF, `.npy`, `.npz`, MetaImage and HDF5, reordered to
+//! Stacks of projections and single fields from TIFF, `.npy`, `.npz`, `.mat`, MetaImage and HDF5, reordered to
 //! `[view, row, column]`.
 
 use crate::hdf5::{self, ScanPart};
 use crate::input::Input;
-use crate::{folder, foreign, memory, metaimage, npy, npz, text, tiff};
+use crate::{folder, foreign, mat, memory, metaimage, npy, npz, text, tiff};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, ArrayD, Axis, Ix3};
 use serde::{Deserialize, Serialize};
@@ -24,8 +24,10 @@ pub(crate) enum StackAxis {
 /// The order of axes in a file's arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct StackLayout {
-    /// The meaning of a stack's three axes; an image has two of them, in the same order.
+    /// The meaning of a stack's three axes; an array with two has them in the same order, without `lacked`.
     pub axes: [StackAxis; 3],
+    /// The axis that arrays with two axes lack: the view of an image, the row of a sinogram.
+    pub lacked: StackAxis,
     /// Whether the first row is the lowest along v.
     pub flip_rows: bool,
     pub flip_columns: bool,
@@ -34,8 +36,7 @@ pub(crate) struct StackLayout {
 impl StackLayout {
     /// Reorders the file's three-dimensional array to `[view, row, column]`.
     fn arrange(&self, place: &str, a: Array3<f32>) -> Result<Array3<f32>> {
-        let at = |axis| self.axes.iter().position(|&x| x == axis).unwrap_or(0);
-        let mut a = a.permuted_axes([at(StackAxis::View), at(StackAxis::Row), at(StackAxis::Column)]);
+        let mut a = a.permuted_axes([StackAxis::View, StackAxis::Row, StackAxis::Column].map(|axis| self.at(axis)));
         if self.flip_rows {
             a.invert_axis(Axis(1));
         }
@@ -45,9 +46,9 @@ impl StackLayout {
         memory::in_order(place, "image", a)
     }
 
-    /// Index of the view axis.
-    fn views(&self) -> usize {
-        self.axes.iter().position(|&x| x == StackAxis::View).unwrap_or(0)
+    /// Index of an axis.
+    fn at(&self, axis: StackAxis) -> usize {
+        self.axes.iter().position(|&x| x == axis).unwrap_or(0)
     }
 }
 
@@ -59,7 +60,7 @@ pub(crate) enum Names {
     Many(Vec<String>),
 }
 
-/// A file and, for `.npz` and HDF5, the array in it.
+/// A file and, for `.npz`, `.mat` and HDF5, the array in it.
 struct StackFile {
     path: PathBuf,
     array: Option<String>,
@@ -85,7 +86,7 @@ pub(crate) fn read(
     let single = sources.len() == 1;
     let mut numbers = None;
     for source in &sources {
-        let (stack, stored) = raw(source, part, layout.views())?;
+        let (stack, stored) = raw(source, part, layout)?;
         let stack = layout.arrange(&source.path.display().to_string(), stack)?;
         if single {
             return Ok(stack);
@@ -125,6 +126,8 @@ pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> 
             tiff::values(&path)?
         } else if head.starts_with(npy::MAGIC) {
             product(&npy::shape(&mut input, head)?)
+        } else if mat::is_mat(&head) {
+            product(&mat::shape(&path, array.as_deref())?)
         } else if head == hdf5::MAGIC {
             product(&hdf5::shape(&path, array.as_deref(), ScanPart::Projections)?)
         } else if is_metaimage(&mut input, &head)? {
@@ -156,13 +159,17 @@ pub(crate) fn read_field(
     stack.mean_axis(Axis(0)).ok_or_else(|| Error::invalid(place, field, "no image", "at least one"))
 }
 
-/// The file's three-dimensional array in its own order, and how a TIFF or `.npy` stores a number; an image gets a view
-/// axis of length one at `views`.
-fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<(Array3<f32>, Option<String>)> {
+/// The file's three-dimensional array in its own order, and how a TIFF or `.npy` stores a number; an array with
+/// two axes gets the one that `layout` says it lacks, of length one.
+fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array3<f32>, Option<String>)> {
     let path = &source.path;
     let place = path.display().to_string();
     let three = |a: ArrayD<f32>| {
-        let a = if a.ndim() == 2 { a.insert_axis(Axis(views)) } else { a };
+        if a.ndim() == 3 && layout.lacked != StackAxis::View {
+            let found = format!("{:?}", a.shape());
+            return Err(Error::invalid(&place, "shape", found, "two axes, as layout.axes says"));
+        }
+        let a = if a.ndim() == 2 { a.insert_axis(Axis(layout.at(layout.lacked))) } else { a };
         a.into_dimensionality::<Ix3>().map_err(|e| Error::invalid(&place, "shape", e, "two or three axes"))
     };
     let sets: &[&[&str]] = &[&["view", "row", "column"], &["row", "column"]];
@@ -171,8 +178,11 @@ fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<(Array3<f32>,
     if head.starts_with(npz::MAGIC) {
         return Ok((three(npz::read(path, source.array.as_deref(), sets)?)?, None));
     }
+    if mat::is_mat(&head) {
+        return Ok((three(mat::read(path, source.array.as_deref(), sets)?)?, None));
+    }
     // Pages, slices of MetaImage and frames of a scan in HDF5 are always views: they move to the layout's view axis.
-    let pages = |a: Array3<f32>| match views {
+    let pages = |a: Array3<f32>| match layout.at(StackAxis::View) {
         1 => a.permuted_axes([1, 0, 2]),
         2 => a.permuted_axes([1, 2, 0]),
         _ => a,
@@ -182,7 +192,7 @@ fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<(Array3<f32>,
         return three(stored.values).map(|a| (if stored.frames_first { pages(a) } else { a }, None));
     }
     if let Some(array) = &source.array {
-        let expected = "an .npz archive or an HDF5 file, whose arrays have names";
+        let expected = "an .npz archive, a .mat file or an HDF5 file, whose arrays have names";
         return Err(Error::invalid(place, "array", format!("the name \"{array}\""), expected));
     }
     if head.starts_with(npy::MAGIC) {
@@ -198,8 +208,8 @@ fn raw(source: &StackFile, part: ScanPart, views: usize) -> Result<(Array3<f32>,
         return Ok((pages(metaimage::read(path)?.data.reversed_axes()), None));
     }
     foreign::refuse(path, &head)?;
-    let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), HDF5 \
-                    (89 48 44 46) or MetaImage (NDims = 3)";
+    let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), \
+                    MATLAB's .mat (4d 41 54 4c), HDF5 (89 48 44 46) or MetaImage (NDims = 3)";
     Err(Error::invalid(place, "format", format!("{head:02x?} at the start"), expected))
 }
 
@@ -223,8 +233,9 @@ fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<(Ve
 }
 
 fn source(folder: &Path, place: &str, field: &str, name: &str, oddities: &mut Vec<String>) -> Result<Vec<StackFile>> {
-    let (file, array) = match name.split_once(".npz:") {
-        Some((stem, array)) => (format!("{stem}.npz"), Some(array.to_string())),
+    let named = [".npz:", ".mat:"].iter().find_map(|end| Some((name.split_once(end)?, end.trim_end_matches(':'))));
+    let (file, array) = match named {
+        Some(((stem, array), end)) => (format!("{stem}{end}"), Some(array.to_string())),
         None => {
             let (file, array) = hdf5::split(name);
             (file.to_string(), array.map(str::to_owned))
@@ -258,6 +269,7 @@ mod tests {
 
     const PLAIN: StackLayout = StackLayout {
         axes: [StackAxis::View, StackAxis::Row, StackAxis::Column],
+        lacked: StackAxis::View,
         flip_rows: false,
         flip_columns: false,
     };
@@ -268,7 +280,7 @@ mod tests {
         let want = Array3::from_shape_fn((2, 3, 4), |(v, r, c)| (100 * v + 10 * r + c) as f32);
         for axes in [[View, Row, Column], [View, Column, Row], [Row, View, Column], [Column, Row, View]] {
             for (flip_rows, flip_columns) in [(false, false), (true, false), (false, true), (true, true)] {
-                let layout = StackLayout { axes, flip_rows, flip_columns };
+                let layout = StackLayout { axes, lacked: View, flip_rows, flip_columns };
                 let mut a = want.clone();
                 if flip_rows {
                     a.invert_axis(Axis(1));
@@ -280,6 +292,24 @@ mod tests {
                 assert_eq!(layout.arrange("a", a.permuted_axes(order)).unwrap(), want, "{layout:?}");
             }
         }
+    }
+
+    #[test]
+    fn an_array_with_two_axes_gets_the_one_it_lacks() {
+        use StackAxis::{Column, Row, View};
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("a.npy"), npy_bytes("|u1", false, "(2, 3)", &[0, 1, 2, 3, 4, 5])).unwrap();
+        let name = Names::One("a.npy".into());
+        let read = |axes, lacked| {
+            let layout = StackLayout { axes, lacked, ..PLAIN };
+            super::read(dir.path(), "s.toml", "files.projections", ScanPart::Projections, &name, layout).unwrap()
+        };
+        let image = read([View, Row, Column], View);
+        assert_eq!((image.dim(), image[[0, 1, 0]]), ((1, 2, 3), 3.0));
+        let sinogram = read([View, Column, Row], Row);
+        assert_eq!((sinogram.dim(), sinogram[[1, 0, 0]]), ((2, 1, 3), 3.0));
+        let turned = read([Column, View, Row], Row);
+        assert_eq!((turned.dim(), turned[[1, 0, 0]]), ((3, 1, 2), 1.0));
     }
 
     #[test]

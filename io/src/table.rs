@@ -1,8 +1,8 @@
-//! Per-view numbers in a separate file: text (such as CSV), NumPy's arrays or HDF5.
+//! Per-view numbers in a separate file: text (such as CSV), arrays of NumPy or MATLAB, or HDF5.
 
 use crate::input::Input;
 use crate::text::read_foreign;
-use crate::{folder, hdf5, npy, npz};
+use crate::{folder, hdf5, mat, npy, npz};
 use conefield_core::{Error, Result};
 use serde::Deserialize;
 use std::path::Path;
@@ -16,7 +16,7 @@ const LONGEST: u64 = 64 << 20;
 pub(crate) enum Numbers<T> {
     /// A list in the description.
     List(Vec<T>),
-    /// `FILE`, `FILE.npz:ARRAY`, `FILE.h5:/PATH` or `FILE.csv:COLUMN`.
+    /// `FILE`, `FILE.npz:ARRAY`, `FILE.mat:ARRAY`, `FILE.h5:/PATH` or `FILE.csv:COLUMN`.
     File(String),
 }
 
@@ -34,6 +34,10 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: u
     let packed = head.starts_with(npz::MAGIC);
     if head == hdf5::MAGIC {
         let (shape, values) = hdf5::read_exact(&path, part)?;
+        return finite(&path, arrayed(&path, &shape, values, width)?);
+    }
+    if mat::is_mat(&head) {
+        let (shape, values) = mat::read_exact(&path, part)?;
         return finite(&path, arrayed(&path, &shape, values, width)?);
     }
     let rows = match (packed || head.starts_with(npy::MAGIC), part) {
@@ -70,7 +74,8 @@ fn split(name: &str) -> (&str, Option<&str>) {
 
 fn arrayed(path: &Path, shape: &[usize], values: Vec<f64>, width: usize) -> Result<Vec<Vec<f64>>> {
     let fits = match *shape {
-        [_] => width == 1,
+        // MATLAB keeps a list as a row.
+        [_] | [1, _] if width == 1 => true,
         [_, w] => w == width,
         _ => false,
     };

@@ -15,7 +15,7 @@ use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::place::StatePart;
 use conefield_core::prior::{Blocks, Prior};
-use conefield_core::regularizer::{Penalty, Regularizer};
+use conefield_core::regularizer::{Bounds, Penalty, Regularizer};
 use conefield_core::settings::{Initializer, LossSpec};
 use conefield_core::simd::Real;
 use conefield_core::space::Space;
@@ -1031,7 +1031,7 @@ fn every_fault_of_a_basis_fails_its_property() {
     assert_eq!(check_basis(&BasisFault::Doubles).failed(), ["samples"]);
 }
 
-/// What is wrong with a regularizer: `½‖x‖²` otherwise, whose proximal map is `max(0, v/(1 + τ))`.
+/// What is wrong with a regularizer: `½‖x‖²` otherwise, whose proximal map is `v/(1 + τ)` within the bounds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum RegularizerFault {
     None,
@@ -1047,6 +1047,8 @@ enum RegularizerFault {
     LessWithNoise,
     /// What is below 0 stays.
     Negative,
+    /// It takes bounds and ignores them.
+    Unbounded,
     /// A weight of 0 shrinks as well.
     ShrinksAlways,
     /// The map adds to what is there.
@@ -1063,6 +1065,7 @@ enum RegularizerFault {
 
 struct PenaltyOn {
     fault: RegularizerFault,
+    bounds: Bounds,
     calls: u64,
     state: Vec<f32>,
 }
@@ -1070,7 +1073,7 @@ struct PenaltyOn {
 impl Regularizer for RegularizerFault {
     fn on(&self, grid: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
         let held = if *self == Self::Uncounted { grid.shape.iter().product() } else { 0 };
-        Ok(Box::new(PenaltyOn { fault: *self, calls: 0, state: vec![0.0; held] }))
+        Ok(Box::new(PenaltyOn { fault: *self, bounds: Bounds::default(), calls: 0, state: vec![0.0; held] }))
     }
     fn weight(&self, _: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
         Ok(if *self == Self::LessWithNoise { 1.0 / (1.0 + noise(1.0)) } else { noise(1.0) })
@@ -1101,9 +1104,16 @@ impl Penalty for PenaltyOn {
             _ => 1.0 + tau,
         };
         for (u, v) in u.iter_mut().zip(v) {
-            let x = if self.fault == RegularizerFault::Negative { v / shrink } else { (v / shrink).max(0.0) };
+            let x = if self.fault == RegularizerFault::Negative { v / shrink } else { self.bounds.clip(v / shrink) };
             *u = if self.fault == RegularizerFault::Adds { *u + x } else { x };
         }
+    }
+
+    fn confine(&mut self, bounds: Bounds) -> Result<()> {
+        if self.fault != RegularizerFault::Unbounded {
+            self.bounds = bounds;
+        }
+        Ok(())
     }
 
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
@@ -1124,6 +1134,7 @@ fn every_fault_of_a_regularizer_fails_its_property() {
         (RegularizerFault::NotANumber, "value"),
         (RegularizerFault::LessWithNoise, "weight"),
         (RegularizerFault::Negative, "not negative"),
+        (RegularizerFault::Unbounded, "bounds"),
         (RegularizerFault::ShrinksAlways, "weight of 0"),
         (RegularizerFault::Adds, "overwrites"),
         (RegularizerFault::Forgets, "state"),

@@ -9,12 +9,13 @@ use conefield::score::{peak, same_shape, score};
 use conefield::{files, parse};
 use conefield_core::Result;
 use conefield_core::scan::Volume;
-use conefield_evaluation::metrics::{Dice, Scores, dice, label_map};
+use conefield_evaluation::metrics::{Agreement, Dice, Scores, Threshold, agreement, dice, label_map};
 use conefield_evaluation::report::MiddleSlices;
 use serde::Serialize;
 use std::path::PathBuf;
 
-/// Score a volume (PSNR, RMSE, three SSIMs) or label maps (Dice) against a reference.
+/// Score a volume (PSNR, RMSE, three SSIMs), its material (Matthews correlation) or label maps (Dice) against a
+/// reference.
 ///
 /// ssim_2d: 11x11 Gaussian window on slices of three axes (R2-Gaussian). ssim_3d: 11x11x11 Gaussian window (NI-NeRF).
 /// ssim_skimage: 7x7 uniform window on slices of three axes (scikit-image, NAF).
@@ -44,6 +45,12 @@ pub struct EvaluateArgs {
     /// Hounsfield units of the values 0 and 1, for the segmenter's input.
     #[arg(long, value_name = "LO,HI", value_parser = parse::hu, requires = "segmenter", allow_hyphen_values = true)]
     hu: Option<[f64; 2]>,
+    /// Score only where material is: values above this threshold, or above Otsu's. Computes Matthews correlation (MCC;
+    /// 0 for an empty volume) and Dice. A reference with two values, of which one is 0, is a mask; any other gets a
+    /// threshold too.
+    #[arg(long, value_name = "otsu|NUMBER", allow_hyphen_values = true)]
+    #[arg(conflicts_with_all = ["peak", "png", "labels", "segmenter"])]
+    threshold: Option<Threshold>,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -59,6 +66,8 @@ struct Evaluation {
     peak: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     dice: Option<Dice>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    material: Option<Agreement>,
 }
 
 impl EvaluateArgs {
@@ -69,13 +78,27 @@ impl EvaluateArgs {
         let (volume, reference) = (volume?, reference?);
         let maps = if self.segmenter.is_some() { &[volume, reference][..] } else { &[] };
         Memory::of_volumes(&[&[volume, reference], maps].concat()).check(|_| vec![])?;
-        let report = if self.labels { self.label_maps()? } else { self.volumes()? };
+        let report = match self.threshold {
+            Some(threshold) => self.material(threshold)?,
+            None if self.labels => self.label_maps()?,
+            None => self.volumes()?,
+        };
         if self.json {
             return out::json(&report);
         }
         let range = |scores: &Scores| format!("{}\npeak          {}", lines(scores), report.peak.unwrap_or(1.0));
-        let parts = [report.scores.as_ref().map(range), report.dice.as_ref().map(dice_lines)];
+        let material = report.material.as_ref().map(ToString::to_string);
+        let parts = [report.scores.as_ref().map(range), report.dice.as_ref().map(dice_lines), material];
         out::say(&parts.into_iter().flatten().collect::<Vec<_>>().join("\n\n"))
+    }
+
+    /// The agreement about material.
+    fn material(&self, threshold: Threshold) -> Result<Evaluation> {
+        let volume = conefield_io::read_volume(&self.volume)?.data;
+        let reference = conefield_io::read_volume(&self.reference)?.data;
+        same_shape(&self.volume.display().to_string(), volume.shape(), reference.shape())?;
+        let material = Some(agreement(volume.view(), reference.view(), threshold)?);
+        Ok(Evaluation { scores: None, peak: None, dice: None, material })
     }
 
     /// The Dice scores of two label maps.
@@ -84,7 +107,7 @@ impl EvaluateArgs {
             |path: &PathBuf| label_map(&path.display().to_string(), conefield_io::read_volume(path)?.data.view());
         let (volume, reference) = (read(&self.volume)?, read(&self.reference)?);
         same_shape(&self.volume.display().to_string(), volume.shape(), reference.shape())?;
-        Ok(Evaluation { scores: None, peak: None, dice: Some(dice(volume.view(), reference.view())?) })
+        Ok(Evaluation { scores: None, peak: None, dice: Some(dice(volume.view(), reference.view())?), material: None })
     }
 
     /// The scores of a volume, with the Dice of the segmentations of volume and reference.
@@ -109,7 +132,7 @@ impl EvaluateArgs {
                 Some(dice(volume.view(), reference.view())?)
             }
         };
-        Ok(Evaluation { scores: Some(scores), peak: Some(peak), dice })
+        Ok(Evaluation { scores: Some(scores), peak: Some(peak), dice, material: None })
     }
 
     /// `volume` as input of the segmenter.

@@ -124,6 +124,22 @@ fn labels(path: &Path, from: usize) -> String {
 }
 
 #[test]
+fn material_is_scored_by_its_place_and_an_empty_volume_scores_0() {
+    let dir = tempdir().unwrap();
+    let (a, b) = (labels(&dir.path().join("a.npy"), 2), labels(&dir.path().join("b.npy"), 4));
+    let found = json(&["evaluate", &a, &b, "--threshold", "0.5", "--json"]);
+    // Of twelve planes 6 have material in both, 2 each in one, 2 in none: (6·2 − 2·2)/√(8·8·4·4) and 12/16.
+    let material = &found["material"];
+    assert_eq!([&material["mcc"], &material["dice"]], [0.25, 0.75], "{found}");
+    assert_eq!(material["voxels"], 8 * 144);
+    assert!(done(&["evaluate", &a, &b, "--threshold", "0.5"]).starts_with("mcc        0.2500"));
+    let empty = dir.path().join("empty.npy");
+    ndarray_npy::write_npy(&empty, &Array3::<f32>::zeros((12, 12, 12))).unwrap();
+    let found = json(&["evaluate", &text(&empty), &a, "--threshold", "otsu", "--json"]);
+    assert_eq!([&found["material"]["mcc"], &found["material"]["dice"]], [0.0, 0.0], "{found}");
+}
+
+#[test]
 fn label_maps_are_scored_by_dice() {
     let dir = tempdir().unwrap();
     let (a, b) = (labels(&dir.path().join("a.npy"), 2), labels(&dir.path().join("b.npy"), 4));

@@ -66,20 +66,21 @@ pub const INVERT: Map = Map {
     },
 };
 
-/// `a` where `o < a`. A NaN stays.
-pub const FLOOR: Map = Map {
-    name: "floor",
+/// `a` where `o < a`, `b` where `o > b`. A NaN stays.
+pub const CLIP: Map = Map {
+    name: "clip",
     inputs: 0,
-    wgsl: "select(o, a, o < a)",
-    host: |[a, _], out, _| {
-        let a = a as f32;
-        out.iter_mut().for_each(|o| *o = if *o < a { a } else { *o });
+    wgsl: "select(select(o, b, o > b), a, o < a)",
+    host: |[a, b], out, _| {
+        let [a, b] = [a as f32, b as f32];
+        let clip = |o: f32| if o > b { b } else { o };
+        out.iter_mut().for_each(|o| *o = if *o < a { a } else { clip(*o) });
     },
 };
 
 impl Map {
     /// All maps.
-    pub const ALL: [&'static Map; 5] = [&ADD, &DIVIDE, &RELAX, &INVERT, &FLOOR];
+    pub const ALL: [&'static Map; 5] = [&ADD, &DIVIDE, &RELAX, &INVERT, &CLIP];
 
     /// Overwrites `out` on the host; all arrays have the same shape and are in standard order.
     pub fn run(&self, factors: [f64; 2], out: &mut Array3<f32>, inputs: &[CowArray<'_, f32, Ix3>]) {

@@ -1,10 +1,40 @@
 //! A penalty of coefficients, as a place works with it: its proximal map, and the update around that.
 
 use super::{Array, StatePart};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::wgsl::Fragment;
 use ndarray::ArrayView3;
 use rayon::prelude::*;
+
+/// Bounds of coefficients: none is below `low` or above `high`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bounds {
+    /// The lower bound.
+    pub low: f32,
+    /// The upper bound; infinity if there is none.
+    pub high: f32,
+}
+
+/// Not negative.
+impl Default for Bounds {
+    fn default() -> Self {
+        Self { low: 0.0, high: f32::INFINITY }
+    }
+}
+
+impl Bounds {
+    /// The number within the bounds that is closest to `x`.
+    #[inline(always)]
+    pub fn clip(self, x: f32) -> f32 {
+        x.max(self.low).min(self.high)
+    }
+}
+
+impl std::fmt::Display for Bounds {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} to {}", self.low, self.high)
+    }
+}
 
 /// A penalty `R` on one grid. It keeps the state from which the next call of [`Penalty::prox`] starts.
 pub trait Penalty: Send {
@@ -26,6 +56,17 @@ pub trait Penalty: Send {
     /// Overwrites `u` with `argmin_{u ≥ 0} ½‖u − v‖² + tau·R(u)`, or approaches it with each call for the same `v`.
     /// Both are in the grid's standard order. The result does not depend on the number of threads.
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]);
+
+    /// Makes `bounds` those of `u` in [`Penalty::prox`], in place of `u ≥ 0`. Called before the first update, unless
+    /// they are the default.
+    ///
+    /// # Errors
+    /// A penalty without this method keeps coefficients from being negative and knows no other bounds. Clipping its
+    /// result is no proximal map.
+    fn confine(&mut self, bounds: Bounds) -> Result<()> {
+        let expected = "0 and no upper bound: this prior has no other bounds";
+        Err(Error::invalid("spec", "scene.bounds", format!("{bounds} (in 1/mm)"), expected))
+    }
 
     /// The whole update, with [`Penalty::prox`] for `tau`. A penalty whose proximal map is a single pass over the
     /// volume can fuse the rest into it.
@@ -51,14 +92,14 @@ pub trait Penalty: Send {
 
 /// A penalty for a place with kernels.
 pub enum Kernels<'a> {
-    /// No penalty: the proximal map is `u = max(0, v)`.
-    Clip,
+    /// No penalty: the proximal map clips `v` to the bounds.
+    Clip(Bounds),
     /// A penalty of differences.
     Dual(Dual<'a>),
 }
 
 /// A penalty of differences, `R(x) = Σ_j stage_cost(∇x_j, guide_j)`. ∇ takes forward differences times `weights`, 0 at
-/// the far faces. The proximal map takes steps on dual variables `p`: `u = max(0, v − τ·∇ᵀp)`. Each step replaces every
+/// the far faces. The proximal map takes steps on dual variables `p`: `u = clip(v − τ·∇ᵀp)`. Each step replaces every
 /// voxel's `p` by `stage_ascend(p, ∇u/(L·τ), guide)`, with `L = 4·Σ weights²`, a bound of `‖∇‖²`.
 pub struct Dual<'a> {
     /// `stage_ascend` and `stage_cost`; see [`crate::wgsl`].
@@ -67,6 +108,8 @@ pub struct Dual<'a> {
     pub weights: [f32; 3],
     /// Steps per update.
     pub steps: usize,
+    /// Bounds of `u`.
+    pub bounds: Bounds,
     /// The dual variables along x, y and z, from the previous update.
     pub p: [&'a mut Array; 3],
     /// A vector per voxel; 0 if there are none.
@@ -130,7 +173,7 @@ impl<'a> Update<'a> {
             }
         }
         if let Some(inside) = self.inside {
-            // Values far below 0 stay at 0, whatever their neighbours are.
+            // Values far below the lower bound stay there, whatever their neighbours are.
             v.iter_mut().zip(&inside[part]).for_each(|(v, inside)| *v = if *inside { *v } else { f32::MIN });
         }
     }

@@ -1,6 +1,7 @@
 //! Scene settings of a spec.
 
 use crate::error::{Result, ensure};
+use crate::place::Bounds;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -144,10 +145,54 @@ pub struct VoxelScene {
     /// What lies beyond the volume.
     #[serde(skip_serializing_if = "SurroundRule::is_none")]
     pub surround: SurroundRule,
+    /// Bounds of attenuation.
+    #[serde(skip_serializing_if = "BoundsSettings::are_default")]
+    pub bounds: BoundsSettings,
 }
 
 impl Default for VoxelScene {
     fn default() -> Self {
-        Self { support: SupportRule::Box, surround: SurroundRule::None }
+        let bounds = BoundsSettings::default();
+        Self { support: SupportRule::Box, surround: SurroundRule::None, bounds }
+    }
+}
+
+impl VoxelScene {
+    /// Refuses invalid settings.
+    pub fn validate(&self) -> Result<()> {
+        self.surround.validate()?;
+        let BoundsSettings { low, high } = self.bounds;
+        ensure(low.is_finite(), "spec", "scene.bounds.low", low, "a finite number")?;
+        if let Some(high) = high {
+            let expected = format!("a finite number above scene.bounds.low, which is {low}");
+            ensure(high.is_finite() && high > low, "spec", "scene.bounds.high", high, expected)?;
+        }
+        // Voxels outside the support are 0.
+        let free = low == 0.0 || self.support == SupportRule::Box;
+        ensure(free, "spec", "scene.bounds.low", low, "0, because scene.support is \"carve\"")
+    }
+}
+
+/// Bounds of attenuation, in 1/unit of the scan.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct BoundsSettings {
+    /// Lowest attenuation. A method with the key `nonnegative` ignores it if that is false.
+    pub low: f64,
+    /// Highest attenuation: that of the densest material, if it is known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub high: Option<f64>,
+}
+
+impl BoundsSettings {
+    /// Whether they are 0 and no upper bound.
+    pub fn are_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// The bounds in 1/mm, for a scan in units of `mm` millimetres.
+    pub fn in_mm(self, mm: f64) -> Bounds {
+        let of = |x: f64| (x / mm) as f32;
+        Bounds { low: of(self.low), high: self.high.map_or(f32::INFINITY, of) }
     }
 }

@@ -193,7 +193,8 @@ fn hostile_descriptions_and_files_are_refused_in_words() {
     edit("step_deg = 14.4", "step_deg = inf", &["circle.step_deg", "inf"]);
     edit("step_deg = 14.4", "step = 14.4", &["step", "`step_deg`"]);
     edit("[volume]", "[layout]\naxes = [\"view\", \"row\", \"row\"]\n[volume]", &["layout.axes", "once"]);
-    edit("[volume]", "[layout]\naxes = [\"view\", \"row\"]\n[volume]", &["axes", "array of length 3"]);
+    edit("[volume]", "[layout]\naxes = [\"view\"]\n[volume]", &["layout.axes", "two of them"]);
+    edit("[volume]", "[layout]\naxes = [\"view\", \"row\"]\n[volume]", &["shape", "two axes, as layout.axes says"]);
     edit("[volume]", "[values]\ni0 = \"dark\"\n[volume]", &["values.i0", "\"dark\"", "\"air\""]);
     edit("[volume]", "[values]\ni0 = 7\n[volume]", &["values.i0", "files.flat", "one of them"]);
     edit("[volume]", "[values]\nkind = \"line-integrals\"\n[volume]", &["files.flat", "line-integrals"]);

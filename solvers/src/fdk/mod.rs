@@ -20,7 +20,7 @@ use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, dot, norm, sub};
 use conefield_core::method::{
     Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
 };
-use conefield_core::place::{Array, FLOOR, FilteredViews, Host, Place, RowWeights};
+use conefield_core::place::{Array, CLIP, FilteredViews, Host, Place, RowWeights};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::SurroundRule;
 use conefield_core::space::Space;
@@ -108,7 +108,7 @@ impl Plan for Fdk {
         let space = Space::new(scan.header(), place);
         let (mut volume, place) = run.all(&space, start, observer)?;
         if self.nonnegative {
-            place.map(&FLOOR, [0.0; 2], &mut volume, &[])?;
+            place.map(&CLIP, [0.0, f64::INFINITY], &mut volume, &[])?;
         }
         let monitor = VolumeMonitor::new(job);
         let mut train_s = start.elapsed().as_secs_f64();

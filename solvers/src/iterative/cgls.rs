@@ -11,7 +11,7 @@ use conefield_core::error::Result;
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Reconstruction, Solution};
-use conefield_core::place::{ADD, Array, StatePart};
+use conefield_core::place::{ADD, Array, Bounds, StatePart};
 use conefield_core::scan::ScanHeader;
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
@@ -37,7 +37,7 @@ pub struct Cgls {
     pub start: Option<InputFile>,
     /// Stopping criteria.
     pub stop: Stop,
-    /// Set negative attenuation to 0 at the end.
+    /// Raise attenuation to `scene.bounds.low`, by default 0, at the end.
     pub nonnegative: bool,
 }
 
@@ -68,6 +68,14 @@ struct Built {
     nonnegative: bool,
 }
 
+impl Built {
+    /// Bounds of the volume in the scan's unit.
+    fn bounds(&self) -> Bounds {
+        let bounds = self.shared.scene.bounds.in_mm(1.0);
+        if self.nonnegative { bounds } else { Bounds { low: f32::NEG_INFINITY, ..bounds } }
+    }
+}
+
 impl Iterative for Built {
     fn kind(&self) -> &'static str {
         "cgls"
@@ -87,8 +95,9 @@ impl Iterative for Built {
         problem.settle()?;
         iterate.prepare(&problem)?;
         let mut solution = drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)?;
-        if let (true, Reconstruction::Volume(volume)) = (self.nonnegative, &mut solution.result) {
-            volume.data.par_mapv_inplace(|x| x.max(0.0));
+        if let Reconstruction::Volume(volume) = &mut solution.result {
+            let bounds = self.bounds();
+            volume.data.par_mapv_inplace(|x| bounds.clip(x));
         }
         Ok(solution)
     }

@@ -1,4 +1,4 @@
-//! Ordered-subset FISTA: `min_{x ≥ 0} D(p − A·B·x) + λ·R(x)` with any basis B, data term D and prior R (Beck and
+//! Ordered-subset FISTA: `min_{l ≤ x ≤ h} D(p − A·B·x) + λ·R(x)` with bounds l and h, by default 0 and ∞, and any basis B, data term D and prior R (Beck and
 //! Teboulle, SIAM J. Imaging Sci. 2(1), 2009; ordered subsets with momentum as in Kim, Ramani and Fessler, IEEE Trans.
 //! Med. Imaging 34(1), 2015).
 //!
@@ -28,7 +28,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, DIVIDE, ProximalStep, Reduction, StatePart};
+use conefield_core::place::{Array, Bounds, DIVIDE, ProximalStep, Reduction, StatePart};
 use conefield_core::random::stream;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader};
@@ -208,6 +208,9 @@ impl Iterative for Built {
         let start = self.shared.known(job, &space)?;
         let mut arrays = Arrays::new(self, expansion, &voxels, &space, start)?;
         arrays.begin(&problem)?;
+        if problem.bounds != Bounds::default() {
+            arrays.penalty.confine(problem.bounds)?;
+        }
         problem.settle()?;
         let mut iterate = Iterate::new(self, &problem, data, arrays)?;
         observer.note(&iterate.description());

@@ -5,7 +5,7 @@ use super::problem::{Problem, copy};
 use conefield_core::basis::Expansion;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::place::{ADD, Array, FLOOR, Mask, Place};
+use conefield_core::place::{ADD, Array, Mask, Place};
 use conefield_core::space::Space;
 use ndarray::Array3;
 
@@ -90,12 +90,12 @@ impl Model {
         self.expansion.coefficients()
     }
 
-    /// The volume of coefficients: 0 where samples overshoot below 0, and outside the object's support.
+    /// The volume of coefficients: clipped where samples overshoot the bounds, and 0 outside the object's support.
     pub(super) fn volume<'a>(&'a mut self, problem: &Problem<'_>, x: &'a Array) -> Result<&'a Array> {
         let Some(voxels) = &mut self.voxels else { return Ok(x) };
         expand(problem.place, self.expansion.as_ref(), x, voxels)?;
         if self.expansion.are_samples() {
-            problem.place.map(&FLOOR, [0.0; 2], voxels, &[])?;
+            problem.clip(voxels)?;
         } else {
             problem.outside(voxels, 0.0)?;
         }

@@ -4,7 +4,7 @@ use crate::shadow::{air_level, shadow};
 use conefield_core::data_term::Misfit;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
-use conefield_core::place::{ADD, Array, INVERT, Mask, MeasuredViews, Place, Reduction, Weighing};
+use conefield_core::place::{ADD, Array, Bounds, CLIP, INVERT, Mask, MeasuredViews, Place, Reduction, Weighing};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::space::Space;
 use conefield_core::voxel::VoxelProjector;
@@ -27,6 +27,8 @@ pub struct Problem<'a> {
     pub projector: &'a dyn VoxelProjector,
     /// Seed of all randomness.
     pub seed: u64,
+    /// Bounds of the attenuation, in 1/mm.
+    pub bounds: Bounds,
     /// The voxels that may be nonzero, if not all.
     pub(super) inside: Option<&'a Mask>,
     /// The object's shadow, if the other pixels count as 0.
@@ -92,6 +94,12 @@ impl Problem<'_> {
     /// Sets the voxels outside the object's support to `value`.
     pub fn outside(&self, x: &mut Array, value: f32) -> Result<()> {
         self.inside.map_or(Ok(()), |inside| self.place.keep(x, inside, value))
+    }
+
+    /// Clips `x` to the bounds.
+    pub fn clip(&self, x: &mut Array) -> Result<()> {
+        let Bounds { low, high } = self.bounds;
+        self.place.map(&CLIP, [low, high].map(f64::from), x, &[])
     }
 
     /// Sets the voxels inside the object's support to 1 and the others to 0.

@@ -12,7 +12,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, RELAX, StatePart};
+use conefield_core::place::{Array, CLIP, RELAX, StatePart};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
@@ -46,7 +46,7 @@ pub struct Sart {
     pub decay: f64,
     /// Order of the subsets.
     pub order: Order,
-    /// Set negative attenuation to 0 after each update.
+    /// Raise attenuation to `scene.bounds.low`, by default 0, after each update.
     pub nonnegative: bool,
 }
 
@@ -212,7 +212,8 @@ impl Sweep {
     pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64) -> Result<f64> {
         let Updates { relaxation, decay, order, nonnegative, .. } = self.updates;
         let relaxation = f64::from((relaxation * decay.powi(pass.min(1 << 20) as i32)) as f32);
-        let floor = f64::from(if nonnegative { 0.0 } else { f32::MIN });
+        let floor = f64::from(if nonnegative { problem.bounds.low } else { f32::MIN });
+        let high = f64::from(problem.bounds.high);
         let mut square = 0.0;
         for s in order.of(self.subsets.len(), problem.seed, pass) {
             let views = &self.subsets[s];
@@ -222,6 +223,9 @@ impl Sweep {
                 column_sums(problem, views, &mut self.pixels, &mut self.columns)?;
             }
             problem.place.map(&RELAX, [relaxation, floor], &mut self.x, &[&self.columns, &self.work])?;
+            if high < f64::INFINITY {
+                problem.place.map(&CLIP, [floor, high], &mut self.x, &[])?;
+            }
         }
         Ok(square)
     }

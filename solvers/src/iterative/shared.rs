@@ -11,7 +11,7 @@ use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::{Job, Observer};
-use conefield_core::place::{Array, Mask, MeasuredViews, Place};
+use conefield_core::place::{Array, Bounds, Mask, MeasuredViews, Place};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::VoxelScene;
 use conefield_core::settings::KnownVolume;
@@ -40,7 +40,7 @@ impl Shared {
         stop: &Stop,
     ) -> Result<Self> {
         stop.validate()?;
-        scene.surround.validate()?;
+        scene.validate()?;
         let projector_kind = projector.typetag_name();
         let projector = projector.build().map_err(|e| e.within("projector"))?;
         Ok(Self { projector: projector.into(), projector_kind, scene, start: start.clone(), stop: stop.clone() })
@@ -106,7 +106,8 @@ impl Shared {
         let binned = (bin > 1).then(|| Within::job(within.as_ref(), job).scan.binned(bin));
         let seen = binned.as_ref().map_or(g, |scan| &scan.geometry);
         let geometry = Geometry { volume: grid, ..seen.clone() };
-        Ok(Opened { place, projector: self.projector.clone(), inside, within, binned, geometry })
+        let bounds = self.scene.bounds.in_mm(job.scan.unit.mm);
+        Ok(Opened { place, projector: self.projector.clone(), bounds, inside, within, binned, geometry })
     }
 
     /// Adds the memory of the driver and of the projector for a subset to the method's own arrays in `space`; returns
@@ -123,6 +124,7 @@ impl Shared {
 pub(super) struct Opened {
     place: Arc<dyn Place>,
     projector: Arc<dyn VoxelProjector>,
+    bounds: Bounds,
     /// The object's support, if known.
     inside: Option<Mask>,
     /// The scan without attenuation beyond the volume.
@@ -153,6 +155,7 @@ impl Opened {
             place: self.place.as_ref(),
             projector: self.projector.as_ref(),
             seed: job.seed,
+            bounds: self.bounds,
             inside: self.inside.as_ref(),
             shadow: None,
             views: MeasuredViews { measured: &scan.projections, here: None },

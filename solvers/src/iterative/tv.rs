@@ -9,7 +9,7 @@ use super::edges::Edges;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::place::{ADD, Array, Place, VariationSlope};
-use conefield_core::regularizer::{Dual, Update};
+use conefield_core::regularizer::{Bounds, Dual, Update};
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
 use conefield_core::space::Space;
 use conefield_core::wgsl::Fragment;
@@ -88,10 +88,10 @@ impl Op for Variation<'_> {
     }
 }
 
-/// The proximal map of total variation with `x ≥ 0`, by gradient steps on its dual, warm-started from the previous
+/// The proximal map of total variation within bounds l and h, by default 0 and ∞, by gradient steps on its dual, warm-started from the previous
 /// call.
 ///
-/// `argmin_{u ≥ 0} ½‖u − v‖² + τ·TV(u)`, with `u = max(0, v − τ·∇ᵀp)` and `|p_j| ≤ 1` (Beck and Teboulle, IEEE Trans.
+/// `argmin_{l ≤ u ≤ h} ½‖u − v‖² + τ·TV(u)`, with `u = min(h, max(l, v − τ·∇ᵀp))` and `|p_j| ≤ 1` (Beck and Teboulle, IEEE Trans.
 /// Image Process. 18(11), 2009; without their momentum, which a warm start does not need).
 ///
 /// All steps pass through the volume in one sweep (`Sweep::sweep`), so that memory is read and written once for all of
@@ -99,6 +99,7 @@ impl Op for Variation<'_> {
 pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
+    bounds: Bounds,
     /// The dual variable along x, y and z; with edges it is `D·p`.
     dual: [Array; 3],
     /// Edges across which slopes cost less.
@@ -114,12 +115,17 @@ impl TvProx {
             space.hold((planes * (shape[1] + 1) * (shape[2] + 1) * size_of::<f32>()) as u64);
         });
         let dual = || space.array(shape);
-        Ok(Self { shape, g, dual: [dual()?, dual()?, dual()?], edges: None })
+        Ok(Self { shape, g, bounds: Bounds::default(), dual: [dual()?, dual()?, dual()?], edges: None })
     }
 
     /// Reduces the cost of slopes across `edges`, which are initially 0.
     pub fn with_edges(self, edges: Edges) -> Self {
         Self { edges: Some(edges), ..self }
+    }
+
+    /// Replaces the bounds.
+    pub fn confine(&mut self, bounds: Bounds) {
+        self.bounds = bounds;
     }
 
     /// Updates the edges from `x`, if they are in use. Returns the total variation of `x` if that changes it.
@@ -142,7 +148,7 @@ impl TvProx {
     pub fn kernels(&mut self, steps: usize) -> Dual<'_> {
         let fragment = Fragment::new(&[if self.edges.is_some() { ALONG_EDGES } else { PLAIN }]);
         let guide = self.edges.as_mut().map(Edges::guide);
-        Dual { fragment, weights: self.g, steps, p: self.dual.each_mut(), guide }
+        Dual { fragment, weights: self.g, steps, bounds: self.bounds, p: self.dual.each_mut(), guide }
     }
 
     /// The dual along x, y and z, for a checkpoint.
@@ -150,11 +156,12 @@ impl TvProx {
         self.dual.each_mut()
     }
 
-    /// Overwrites `u` with the proximal map of `v` after `steps` dual steps. With a weight of 0, only clips negative
-    /// values.
+    /// Overwrites `u` with the proximal map of `v` after `steps` dual steps. With a weight of 0, only clips to
+    /// the bounds.
     pub fn apply(&mut self, v: &[f32], tau: f32, steps: usize, u: &mut [f32]) {
         if tau < f32::MIN_POSITIVE {
-            return u.par_iter_mut().zip(v).for_each(|(u, v)| *u = v.max(0.0));
+            let bounds = self.bounds;
+            return u.par_iter_mut().zip(v).for_each(|(u, v)| *u = bounds.clip(*v));
         }
         let mut left = steps;
         loop {
@@ -225,7 +232,7 @@ impl TvProx {
             let edges = edges.map(|n| n.map(|n| &n[first..first + planes.0[0].len() * plane]));
             slabs.push(Sweep { planes, own, lines, v, edges, line: nz, steps: split.reach });
         }
-        let scale = Scale::new(self.g, tau);
+        let scale = Scale::new(self.g, tau, self.bounds);
         slabs.into_par_iter().for_each(|slab| run(Sweeping(slab, scale)));
     }
 }
@@ -264,19 +271,20 @@ impl Split {
     }
 }
 
-/// Factors of differences.
+/// Factors of differences, and bounds of the primal.
 #[derive(Clone, Copy)]
 struct Scale {
     /// For the primal: `g·τ`.
     down: [f32; 3],
     /// For a dual step: `g/(L·τ)`, L a bound on `‖∇‖²`.
     up: [f32; 3],
+    bounds: Bounds,
 }
 
 impl Scale {
-    fn new(g: [f32; 3], tau: f32) -> Self {
+    fn new(g: [f32; 3], tau: f32, bounds: Bounds) -> Self {
         let bound = Dual::bound(g);
-        Self { down: g.map(|g| g * tau), up: g.map(|g| g / (bound * tau)) }
+        Self { down: g.map(|g| g * tau), up: g.map(|g| g / (bound * tau)), bounds }
     }
 }
 
@@ -387,7 +395,7 @@ impl<L: Lines> Sweep<'_, L> {
                     if known {
                         let v = &given[given_at(i, j)..][..nz];
                         let fresh = &mut kept[at(i, j)..][..stride];
-                        primal(s, self.planes.beside(i, j, &zeros), v, scale.down, &mut fresh[..nz]);
+                        primal(s, self.planes.beside(i, j, &zeros), v, scale, &mut fresh[..nz]);
                         fresh[nz] = fresh[nz - 1];
                     }
                     if i > 0 && i <= count {
@@ -400,7 +408,7 @@ impl<L: Lines> Sweep<'_, L> {
                     }
                 }
                 let Some(i) = front.checked_sub(self.steps).filter(|i| self.own.contains(i)) else { continue };
-                primal(s, self.planes.beside(i, j, &zeros), &given[given_at(i, j)..][..nz], scale.down, &mut map);
+                primal(s, self.planes.beside(i, j, &zeros), &given[given_at(i, j)..][..nz], scale, &mut map);
                 self.lines.write((i - self.own.start) * plane + j * nz, &map);
             }
         }
@@ -449,11 +457,12 @@ fn whole<S: Simd>(s: S, line: &[f32], k: usize) -> S::f32s {
     S::f32s::from_slice(s, &line[k..k + S::f32s::LEN])
 }
 
-/// `u = max(0, v − τ·∇ᵀp)` along a line.
+/// `u = min(h, max(l, v − τ·∇ᵀp))` along a line.
 #[inline(always)]
-fn primal<S: Simd>(s: S, Beside { p: [px, py, pz], before }: Beside<'_>, v: &[f32], scale: [f32; 3], u: &mut [f32]) {
+fn primal<S: Simd>(s: S, Beside { p: [px, py, pz], before }: Beside<'_>, v: &[f32], scale: Scale, u: &mut [f32]) {
     let (n, len) = (u.len(), S::f32s::LEN);
-    let scale = scale.map(|x| S::f32s::splat(s, x));
+    let within = [scale.bounds.low, scale.bounds.high].map(|x| S::f32s::splat(s, x));
+    let scale = scale.down.map(|x| S::f32s::splat(s, x));
     let [bx, by] = before;
     // There is no difference before the first voxel along z.
     let mut first = [0.0; 32];
@@ -465,23 +474,23 @@ fn primal<S: Simd>(s: S, Beside { p: [px, py, pz], before }: Beside<'_>, v: &[f3
         let bz = if k == 0 { first } else { &pz[k - 1..k - 1 + len] };
         let p = [whole(s, px, k), whole(s, py, k), whole(s, pz, k)];
         let behind = [whole(s, bx, k), whole(s, by, k), whole(s, bz, 0)];
-        descent(s, behind, p, whole(s, v, k), scale).store_slice(&mut u[k..k + len]);
+        descent(behind, p, whole(s, v, k), scale, within).store_slice(&mut u[k..k + len]);
         k += len;
     }
     if k < n {
         let bz = if k == 0 { whole(s, first, 0) } else { load(s, pz, k - 1) };
         let p = [load(s, px, k), load(s, py, k), load(s, pz, k)];
         let behind = [load(s, bx, k), load(s, by, k), bz];
-        store::<S, f32>(descent(s, behind, p, load(s, v, k), scale), u, k);
+        store::<S, f32>(descent(behind, p, load(s, v, k), scale, within), u, k);
     }
 }
 
 /// The primal of a vector of voxels.
 #[inline(always)]
-fn descent<S: Simd>(s: S, behind: [S::f32s; 3], p: [S::f32s; 3], v: S::f32s, scale: [S::f32s; 3]) -> S::f32s {
+fn descent<V: SimdFloat<S>, S: Simd>(behind: [V; 3], p: [V; 3], v: V, scale: [V; 3], [low, high]: [V; 2]) -> V {
     let [x, y, z] = [behind[0] - p[0], behind[1] - p[1], behind[2] - p[2]];
     let turn = x * scale[0] + y * scale[1] + z * scale[2];
-    (v - turn).max(S::f32s::splat(s, 0.0))
+    (v - turn).max(low).min(high)
 }
 
 /// `p ← p + D·∇u/(L·τ)` along a line, then projection onto the unit ball. `u` has its last number doubled; `after` are
@@ -706,8 +715,8 @@ mod tests {
 
     /// The same steps one after another, voxel by voxel; `dual` is `D·p`.
     fn plain(prox: &mut TvProx, v: &Array3<f32>, tau: f32, steps: usize) -> Array3<f32> {
-        let TvProx { shape, g, dual, edges } = prox;
-        let (shape, g, dual) = (*shape, *g, &mut dual.each_mut().map(|p| p.on_host_mut().unwrap()));
+        let TvProx { shape, g, bounds, dual, edges } = prox;
+        let (shape, g, bounds, dual) = (*shape, *g, *bounds, &mut dual.each_mut().map(|p| p.on_host_mut().unwrap()));
         let moved = |at: [usize; 3], k: usize, by: isize| {
             let mut to = at;
             to[k] = to[k].wrapping_add_signed(by);
@@ -718,7 +727,7 @@ mod tests {
                 let at = [x, y, z];
                 let behind = |k: usize| if at[k] > 0 { dual[k][moved(at, k, -1)] } else { 0.0 };
                 let turn: f32 = (0..3).map(|k| (behind(k) - dual[k][at]) * g[k] * tau).sum();
-                (v[at] - turn).max(0.0)
+                bounds.clip(v[at] - turn)
             })
         };
         let bound = 4.0 * g.iter().map(|g| g * g).sum::<f32>();
@@ -757,7 +766,11 @@ mod tests {
         ] {
             let v = noisy(shape);
             for directional in [false, true] {
-                let made = || if directional { with_edges(shape, g, &v) } else { prox(shape, g) };
+                let made = || {
+                    let mut made = if directional { with_edges(shape, g, &v) } else { prox(shape, g) };
+                    made.confine(Bounds { low: 0.02, high: 0.9 });
+                    made
+                };
                 let on = |threads: usize| {
                     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
                     pool.install(|| {

@@ -116,6 +116,43 @@ fn attenuation_is_not_negative_unless_asked_for() {
     }
 }
 
+#[test]
+fn attenuation_keeps_its_bounds() {
+    let scan = noisy();
+    for (kind, settings) in ALL.into_iter().filter(|(kind, _)| *kind != "asd-pocs") {
+        let range = |more: &str| {
+            let (volume, _) = Case::of(&scan).volume(&spec(kind, &format!("{settings}\n{}\n{more}", passes(5))));
+            volume.data.iter().fold([f32::INFINITY, f32::NEG_INFINITY], |[a, b], &x| [a.min(x), b.max(x)])
+        };
+        // The scan's own unit, whatever it is.
+        let [low, high] = [0.1, 0.6].map(|share| share * range("")[1]);
+        let bounds = |low: f32, high: f32| format!("scene.bounds = {{ low = {low}, high = {high} }}");
+        let [least, most] = range(&bounds(low, high));
+        assert!((least / low - 1.0).abs() < 1e-5 && (most / high - 1.0).abs() < 1e-5, "{kind}: {least} to {most}");
+        let [least, most] = range(&bounds(-low, high));
+        assert!(least < 0.0 && least >= -1.00001 * low && most <= 1.00001 * high, "{kind}: {least} to {most}");
+    }
+}
+
+/// With the attenuation of the densest material known, few views are enough for a volume of one material.
+#[test]
+fn a_known_material_helps() {
+    let body = [bodies()[0]];
+    let mut g = geometry(24);
+    g.views.truncate(6);
+    let truth = ellipsoids(&body, &g.volume);
+    let top = truth.data.iter().fold(0.0f32, |m, &x| m.max(x));
+    let scan = with_noise(scan_ellipsoids(&body, g));
+    for (kind, settings) in [("fista-tv", "subsets = 2\nprior.weight = { fixed = 0.02 }"), ("sart", "")] {
+        let of = |more: &str| {
+            psnr(&Case::of(&scan).volume(&spec(kind, &format!("{settings}\n{}\n{more}", passes(30)))).0, &truth)
+        };
+        let (without, with) = (of(""), of(&format!("scene.bounds.high = {top}")));
+        println!("{kind}: {without:.1} dB, with its bound {with:.1} dB");
+        assert!(with > without + 1.0, "{kind}: {without:.1} and {with:.1} dB");
+    }
+}
+
 /// Noise clipped at 0 has a mean above it, which causes a haze around the object unless air is set to 0.
 #[test]
 fn air_is_taken_for_empty() {

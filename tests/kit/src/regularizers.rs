@@ -5,7 +5,7 @@ use crate::{Outcome, Report};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::place::Host;
 use conefield_core::random::{mix, unit};
-use conefield_core::regularizer::{Penalty, Regularizer};
+use conefield_core::regularizer::{Bounds, Penalty, Regularizer};
 use conefield_core::scan::ScanHeader;
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
@@ -28,6 +28,7 @@ pub fn check_regularizer(regularizer: &dyn Regularizer) -> Report {
     report.add("proximal map", || proximal(regularizer));
     report.add("nonexpansive", || nonexpansive(regularizer));
     report.add("not negative", || not_negative(regularizer));
+    report.add("bounds", || bounds(regularizer));
     report.add("weight of 0", || no_weight(regularizer));
     report.add("overwrites", || overwrites(regularizer));
     report.add("state", || state(regularizer));
@@ -114,17 +115,36 @@ fn weight(regularizer: &dyn Regularizer) -> Outcome {
 
 /// No other coefficients have a smaller objective: a search from the map's result gains almost nothing.
 fn proximal(regularizer: &dyn Regularizer) -> Outcome {
+    least(regularizer, Bounds::default())
+}
+
+/// The same within bounds, unless the regularizer refuses them.
+fn bounds(regularizer: &dyn Regularizer) -> Outcome {
+    let bounds = Bounds { low: -0.15, high: 0.4 };
+    if on(regularizer, &grids()[0]).confine(bounds).is_err() {
+        return settle(None, "only 0 and none above, others are refused");
+    }
+    least(regularizer, bounds)
+}
+
+fn least(regularizer: &dyn Regularizer, bounds: Bounds) -> Outcome {
     let mut worst = 0.0f64;
     let mut complaint = None;
     for grid in grids() {
         for tau in TAUS {
             let v = noise(&grid, 3);
             let mut penalty = on(regularizer, &grid);
+            if bounds != Bounds::default() {
+                penalty.confine(bounds).unwrap_or_else(|e| panic!("{e}"));
+            }
             let u = prox(penalty.as_mut(), &v, tau);
             let of = |x: &[f32]| objective(penalty.as_ref(), &grid, &v, tau, x);
-            let clipped: Vec<f32> = v.iter().map(|v| v.max(0.0)).collect();
+            let clipped: Vec<f32> = v.iter().map(|v| bounds.clip(*v)).collect();
             let (found, start) = (of(&u), of(&clipped));
-            let least = search(&of, u).min(search(&of, clipped));
+            if let Some(out) = u.iter().find(|u| bounds.clip(**u) != **u) {
+                complaint = complaint.or(Some(format!("{:?}, weight {tau}: {out} is not {bounds}", grid.shape)));
+            }
+            let least = search(&of, bounds, u).min(search(&of, bounds, clipped));
             let gain = (found - least) / start.max(1e-30);
             worst = worst.max(gain);
             if gain.is_nan() || gain > GAIN {
@@ -137,7 +157,7 @@ fn proximal(regularizer: &dyn Regularizer) -> Outcome {
 }
 
 /// The minimum found by steps along single coefficients, along all of them, and in random directions.
-fn search(of: &dyn Fn(&[f32]) -> f64, mut x: Vec<f32>) -> f64 {
+fn search(of: &dyn Fn(&[f32]) -> f64, bounds: Bounds, mut x: Vec<f32>) -> f64 {
     let mut least = of(&x);
     let mut seed = 0;
     for step in [0.3f32, 0.1, 0.03, 0.01, 3e-3, 1e-3] {
@@ -152,7 +172,8 @@ fn search(of: &dyn Fn(&[f32]) -> f64, mut x: Vec<f32>) -> f64 {
                     d if d < 2 * n + 2 => 1.0 - 2.0 * (d % 2) as f32,
                     _ => drawn(i),
                 };
-                let other: Vec<f32> = x.iter().enumerate().map(|(i, x)| (x + step * along(i)).max(0.0)).collect();
+                let moved = |(i, x): (usize, &f32)| bounds.clip(x + step * along(i));
+                let other: Vec<f32> = x.iter().enumerate().map(moved).collect();
                 let value = of(&other);
                 if value < least {
                     (least, x) = (value, other);

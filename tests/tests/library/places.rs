@@ -11,7 +11,7 @@ use conefield_core::method::{Job, Observer, Record};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::place::{Array, Host, Map, Place, ProximalStep, Reduction, StatePart, Weighing};
 use conefield_core::random::{mix, unit};
-use conefield_core::regularizer::{Dual, Kernels, Penalty, RegularizerSpec};
+use conefield_core::regularizer::{Bounds, Dual, Kernels, Penalty, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::space::Space;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};
@@ -261,7 +261,7 @@ fn data_terms_are_those_of_the_host() {
 fn updates_differ(
     place: &Arc<dyn Place>,
     prior: &Value,
-    [pulled, masked]: [bool; 2],
+    [pulled, masked, bounded]: [bool; 3],
     tau: f32,
     change: fn(Box<dyn Penalty>) -> Box<dyn Penalty>,
 ) -> conefield_core::Result<f64> {
@@ -269,7 +269,11 @@ fn updates_differ(
     let on = |place: &Arc<dyn Place>| {
         let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: g.volume.shape }, place.clone());
         let spec: Box<dyn RegularizerSpec> = serde_json::from_value(prior.clone()).unwrap();
-        spec.build().unwrap().on(&g.volume, &space)
+        let mut penalty = spec.build().unwrap().on(&g.volume, &space)?;
+        if bounded {
+            penalty.confine(Bounds { low: -0.1, high: 0.3 })?;
+        }
+        Ok(penalty)
     };
     let run = |place: &Arc<dyn Place>, mut penalty: Box<dyn Penalty>| -> conefield_core::Result<Vec<Array3<f32>>> {
         let adopt = |seed| place.adopt(numbers(g.volume.shape, seed).mapv(|v| v as f32));
@@ -317,16 +321,25 @@ fn updates_in_a_place_are_those_of_the_host() {
     ];
     for (name, place) in places("updates") {
         for prior in &priors {
-            for [pulled, masked] in [[false, false], [true, false], [false, true], [true, true]] {
+            for which in (0..8).map(|k| [1, 2, 4].map(|bit| k & bit != 0)) {
+                let [pulled, masked, bounded] = which;
                 for tau in [0.0, 0.2] {
-                    let off = updates_differ(&place, prior, [pulled, masked], tau, |p| p).unwrap();
-                    println!("{}, pull {pulled}, mask {masked}, weight {tau}, {name}: {off:.1e}", prior["type"]);
-                    assert!(off < LIMIT, "{prior}, pull {pulled}, mask {masked}, weight {tau}, {name}: {off}");
+                    let off = updates_differ(&place, prior, which, tau, |p| p).unwrap();
+                    println!(
+                        "{}, pull {pulled}, mask {masked}, bounds {bounded}, weight {tau}, {name}: {off:.1e}",
+                        prior["type"]
+                    );
+                    assert!(
+                        off < LIMIT,
+                        "{prior}, pull {pulled}, mask {masked}, bounds {bounded}, weight {tau}, {name}: {off}"
+                    );
                     // On the host in between, as a penalty without WGSL; the arrays of others are on the device.
                     if place.device().is_none() || prior["type"] == "none" {
-                        let off =
-                            updates_differ(&place, prior, [pulled, masked], tau, |p| Box::new(OnHost(p))).unwrap();
-                        assert!(off < LIMIT, "{prior}, pull {pulled}, mask {masked}, weight {tau}, {name}: {off}");
+                        let off = updates_differ(&place, prior, which, tau, |p| Box::new(OnHost(p))).unwrap();
+                        assert!(
+                            off < LIMIT,
+                            "{prior}, pull {pulled}, mask {masked}, bounds {bounded}, weight {tau}, {name}: {off}"
+                        );
                     }
                 }
             }
@@ -372,7 +385,7 @@ impl Penalty for Rewritten {
             Kernels::Dual(dual) => {
                 Kernels::Dual(Dual { fragment: Fragment { source: change(&dual.fragment.source) }, ..dual })
             }
-            Kernels::Clip => Kernels::Clip,
+            Kernels::Clip(bounds) => Kernels::Clip(bounds),
         })
     }
 }
@@ -381,7 +394,7 @@ impl Penalty for Rewritten {
 fn a_perturbed_prior_is_found_and_one_without_wgsl_travels() {
     let Some((_, backend)) = crate::device::backends("negative controls").into_iter().next() else { return };
     let (place, prior) = (backend.place(), json!({"type": "total-variation"}));
-    let differ = |change| updates_differ(&place, &prior, [false; 2], 0.2, change);
+    let differ = |change| updates_differ(&place, &prior, [false; 3], 0.2, change);
     let wrong = differ(|p| Box::new(Rewritten(p, |s| s.replace("p + d", "p + 1.01 * d"))));
     assert!(wrong.unwrap() > LIMIT);
     let wrong = differ(|p| Box::new(Rewritten(p, |s| s.replace("return length(d)", "return 1.01 * length(d)"))));

@@ -1,4 +1,4 @@
-// max(0, v - τ ∇ᵀp) at voxel i; v is the gradient's buffer.
+// v - τ ∇ᵀp within the bounds at voxel i; v is the gradient's buffer.
 fn primal_of(i: u32) -> f32 {
     var d = -vec3<f32>(dual_x[i], dual_y[i], dual_z[i]);
     let plane = stencil.shape.y * stencil.shape.z;
@@ -8,5 +8,5 @@ fn primal_of(i: u32) -> f32 {
     }
     if at.y > 0u { d.y += dual_y[i - stencil.shape.z]; }
     if at.z > 0u { d.z += dual_z[i - 1u]; }
-    return max(0.0, gradient[i] - dot(d, stencil.down));
+    return min(stencil.high, max(stencil.low, gradient[i] - dot(d, stencil.down)));
 }

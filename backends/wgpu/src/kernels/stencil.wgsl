@@ -13,6 +13,9 @@ struct Stencil {
     step: f32,
     momentum: f32,
     pull: f32,
+    // Bounds of the primal.
+    low: f32,
+    high: f32,
 }
 
 // Position of voxel i of the buffer.

@@ -33,9 +33,9 @@ pub(super) fn words(flags: &ArrayView3<'_, bool>) -> Vec<u32> {
     flags.as_slice().unwrap_or_default().chunks(32).map(word).collect()
 }
 
-/// Factors for a kernel: -∞ becomes the lowest number.
+/// Factors for a kernel: ±∞ become the lowest and the highest number.
 fn uniform([a, b]: [f64; 2]) -> (&'static str, impl Fn(u32, u32) -> Elements) {
-    let [a, b] = [a, b].map(|x| (x as f32).max(f32::MIN));
+    let [a, b] = [a, b].map(|x| (x as f32).clamp(f32::MIN, f32::MAX));
     ("elements", move |begin, end| Elements { begin, end, a, b })
 }
 

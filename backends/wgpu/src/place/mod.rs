@@ -254,7 +254,7 @@ impl Place for DevicePlace {
 
     fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {
         match penalty.kernels() {
-            Some(Kernels::Clip) => Ok(0.0),
+            Some(Kernels::Clip(_)) => Ok(0.0),
             Some(Kernels::Dual(dual)) => stencils::value(&self.shared, &mut self.room(), &dual, x),
             None => Ok(penalty.value(self.read(x)?.view())),
         }

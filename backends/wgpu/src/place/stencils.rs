@@ -12,7 +12,7 @@ use crate::source::{Access, Source};
 use Access::{Read, Write};
 use conefield_core::error::Result;
 use conefield_core::place::{ProximalStep, VariationSlope};
-use conefield_core::regularizer::{Dual, Guide, Kernels};
+use conefield_core::regularizer::{Bounds, Dual, Guide, Kernels};
 
 /// `Stencil` in `kernels/stencil.wgsl`.
 #[repr(C)]
@@ -28,6 +28,9 @@ struct Stencil {
     step: f32,
     momentum: f32,
     pull: f32,
+    low: f32,
+    high: f32,
+    unused: [u32; 2],
 }
 
 /// Names of the dual variables and of the vectors that guide the penalty, along x, y and z.
@@ -139,16 +142,18 @@ impl<'a> Volume<'a> {
     }
 }
 
-/// A volume with the factors of a step.
-fn of_step<'a>(shared: &'a Shared, step: &ProximalStep<'_>) -> Volume<'a> {
+/// A volume with the factors of a step, whose result is within `bounds`.
+fn of_step<'a>(shared: &'a Shared, step: &ProximalStep<'_>, bounds: Bounds) -> Volume<'a> {
     let mut volume = Volume::new(shared, step.x);
     let pull = step.towards.map_or(0.0, |(_, share)| share);
-    volume.whole = Stencil { step: step.step, momentum: step.momentum, pull, ..volume.whole };
+    // A shader need not know infinity.
+    let [low, high] = [bounds.low, bounds.high].map(|x| x.clamp(f32::MIN, f32::MAX));
+    volume.whole = Stencil { step: step.step, momentum: step.momentum, pull, low, high, ..volume.whole };
     volume
 }
 
 /// Overwrites the gradient with the argument of the proximal map.
-fn argument(shared: &Shared, room: &mut Room, step: &ProximalStep<'_>) -> Result<()> {
+fn argument(shared: &Shared, room: &mut Room, step: &ProximalStep<'_>, bounds: Bounds) -> Result<()> {
     let mut bindings = vec![("gradient", Write), ("ahead", Read)];
     let mut v = "let z = ahead[i];\n        var v = z + stencil.step * gradient[i];\n".to_owned();
     if step.towards.is_some() {
@@ -157,11 +162,11 @@ fn argument(shared: &Shared, room: &mut Room, step: &ProximalStep<'_>) -> Result
     }
     if step.inside.is_some() {
         bindings.push(("inside", Read));
-        // Values far below 0 stay at 0, whatever their neighbours are.
+        // Values far below the lower bound stay there, whatever their neighbours are.
         v += &format!("        if !{} {{ v = -3.4e38; }}\n", flag("inside", "i"));
     }
     let source = kernel(&bindings, &[], &(v + "        gradient[i] = v;"));
-    let volume = of_step(shared, step);
+    let volume = of_step(shared, step, bounds);
     for (k, part) in parts(step.gradient).iter().enumerate() {
         let mut bind = Volume::bind(k, &[("gradient", step.gradient), ("ahead", step.ahead)]);
         bind.extend(step.towards.map(|(towards, _)| ("towards", &parts(towards)[k].buffer)));
@@ -178,21 +183,22 @@ fn extrapolation(u: &str) -> String {
 }
 
 /// Ends an update without a penalty: the proximal map only clips.
-fn finish(shared: &Shared, room: &mut Room, step: ProximalStep<'_>) -> Result<()> {
+fn finish(shared: &Shared, room: &mut Room, step: ProximalStep<'_>, bounds: Bounds) -> Result<()> {
     let flat = [("gradient", Read), ("x", Write), ("ahead", Write)];
-    let source = kernel(&flat, &[], &extrapolation("max(0.0, gradient[i])"));
+    let source = kernel(&flat, &[], &extrapolation("min(stencil.high, max(stencil.low, gradient[i]))"));
     let arrays: [(&str, &Array); 3] = [("gradient", step.gradient), ("x", step.x), ("ahead", step.ahead)];
-    of_step(shared, &step).run(room, ("extrapolation", &source), &arrays, None)
+    of_step(shared, &step, bounds).run(room, ("extrapolation", &source), &arrays, None)
 }
 
 /// A whole update with a penalty that has kernels.
 pub(super) fn update(shared: &Shared, room: &mut Room, step: ProximalStep<'_>, kernels: Kernels<'_>) -> Result<()> {
-    argument(shared, room, &step)?;
-    let Kernels::Dual(dual) = kernels else { return finish(shared, room, step) };
+    let (Kernels::Clip(bounds) | Kernels::Dual(Dual { bounds, .. })) = kernels;
+    argument(shared, room, &step, bounds)?;
+    let Kernels::Dual(dual) = kernels else { return finish(shared, room, step, bounds) };
     if step.tau < f32::MIN_POSITIVE {
-        return finish(shared, room, step);
+        return finish(shared, room, step, bounds);
     }
-    let mut volume = of_step(shared, &step);
+    let mut volume = of_step(shared, &step, bounds);
     let bound = Dual::bound(dual.weights);
     volume.whole.down = dual.weights.map(|g| g * step.tau);
     volume.whole.up = dual.weights.map(|g| g / (bound * step.tau));

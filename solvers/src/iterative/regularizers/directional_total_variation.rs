@@ -4,9 +4,9 @@
 //! the edges come from another image of the object. Here they come from the volume itself and are updated before each
 //! pass.
 
-use super::total_variation::{On, lambda, validate};
+use super::total_variation::{On, are_equal, lambda, said, validate, weighted};
 use crate::iterative::edges::Edges;
-use crate::iterative::tv::{TvProx, anisotropy};
+use crate::iterative::tv::TvProx;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Weight};
@@ -27,11 +27,15 @@ pub struct DirectionalTotalVariation {
     pub strength: f64,
     /// Threshold of a clear edge: η, as a multiple of the root mean square of all slopes.
     pub edge: f64,
+    /// Factors of differences along x, y and z, for voxels of any shape. With a larger one, edges across that axis cost
+    /// more.
+    #[serde(skip_serializing_if = "are_equal")]
+    pub weights: [f64; 3],
 }
 
 impl Default for DirectionalTotalVariation {
     fn default() -> Self {
-        Self { weight: Weight::Noise(0.7), inner: 4, strength: 0.97, edge: 1.0 }
+        Self { weight: Weight::Noise(0.7), inner: 4, strength: 0.97, edge: 1.0, weights: [1.0; 3] }
     }
 }
 
@@ -45,7 +49,7 @@ conefield_core::stage_type!(
 #[typetag::serde(name = "directional-total-variation")]
 impl RegularizerSpec for DirectionalTotalVariation {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
-        validate(self.weight, self.inner)?;
+        validate(self.weight, self.inner, self.weights)?;
         let strength = self.strength;
         ensure((0.0..=0.999).contains(&strength), "spec", "strength", strength, "0 to 0.999")?;
         ensure((1e-3..=1e3).contains(&self.edge), "spec", "edge", self.edge, "0.001 to 1000")?;
@@ -55,7 +59,7 @@ impl RegularizerSpec for DirectionalTotalVariation {
 
 impl Regularizer for DirectionalTotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
-        let g = anisotropy(grid);
+        let g = weighted(grid, self.weights);
         let edges = Edges::new(grid.shape, self.strength as f32, self.edge, space)?;
         Ok(Box::new(On { prox: TvProx::new(grid.shape, g, space)?.with_edges(edges), inner: self.inner }))
     }
@@ -65,9 +69,10 @@ impl Regularizer for DirectionalTotalVariation {
     }
 
     fn describe(&self) -> String {
-        let Self { weight, inner, strength, edge } = self;
+        let Self { weight, inner, strength, edge, weights } = self;
+        let axes = said(*weights);
         format!(
-            "directional-total-variation: weight {weight}, {inner} dual steps per update, strength {strength}, edge {edge}"
+            "directional-total-variation: weight {weight}{axes}, {inner} dual steps per update, strength {strength}, edge {edge}"
         )
     }
 }

@@ -1,8 +1,8 @@
-//! No regularizer except that attenuation is not negative.
+//! No regularizer except the bounds of attenuation.
 
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::{Kernels, Penalty, Regularizer, RegularizerSpec};
+use conefield_core::regularizer::{Bounds, Kernels, Penalty, Regularizer, RegularizerSpec};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use rayon::prelude::*;
@@ -25,7 +25,7 @@ impl RegularizerSpec for Nonnegative {
 
 impl Regularizer for Nonnegative {
     fn on(&self, _: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
-        Ok(Box::new(*self))
+        Ok(Box::new(On(Bounds::default())))
     }
 
     fn weight(&self, _: &VoxelGrid, _: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
@@ -37,16 +37,24 @@ impl Regularizer for Nonnegative {
     }
 }
 
-impl Penalty for Nonnegative {
+/// The bounds alone.
+struct On(Bounds);
+
+impl Penalty for On {
     fn value(&self, _: ArrayView3<'_, f32>) -> f64 {
         0.0
     }
 
     fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
-        u.par_iter_mut().zip(v).for_each(|(u, v)| *u = v.max(0.0));
+        u.par_iter_mut().zip(v).for_each(|(u, v)| *u = self.0.clip(*v));
+    }
+
+    fn confine(&mut self, bounds: Bounds) -> Result<()> {
+        self.0 = bounds;
+        Ok(())
     }
 
     fn kernels(&mut self) -> Option<Kernels<'_>> {
-        Some(Kernels::Clip)
+        Some(Kernels::Clip(self.0))
     }
 }

@@ -4,7 +4,7 @@ use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::place::StatePart;
-use conefield_core::regularizer::{Kernels, Penalty, Regularizer, RegularizerSpec, Update, Weight};
+use conefield_core::regularizer::{Bounds, Kernels, Penalty, Regularizer, RegularizerSpec, Update, Weight};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use schemars::JsonSchema;
@@ -18,10 +18,30 @@ pub struct TotalVariation {
     pub weight: Weight,
     /// Dual steps per update.
     pub inner: usize,
+    /// Factors of differences along x, y and z, for voxels of any shape. With a larger one, edges across that axis cost
+    /// more.
+    #[serde(skip_serializing_if = "are_equal")]
+    pub weights: [f64; 3],
 }
 
-/// Refuses an invalid weight or number of dual steps.
-pub(super) fn validate(weight: Weight, inner: usize) -> Result<()> {
+/// Whether all axes have the factor 1.
+pub(super) fn are_equal(weights: &[f64; 3]) -> bool {
+    *weights == [1.0; 3]
+}
+
+/// Weights of differences along x, y and z on `grid`, with factors for the axes.
+pub(super) fn weighted(grid: &VoxelGrid, weights: [f64; 3]) -> [f32; 3] {
+    let g = anisotropy(grid);
+    std::array::from_fn(|k| weights[k] as f32 * g[k])
+}
+
+/// Refuses an invalid weight, number of dual steps, or factor of an axis.
+pub(super) fn validate(weight: Weight, inner: usize, weights: [f64; 3]) -> Result<()> {
+    let some = weights.iter().any(|w| *w > 0.0);
+    for w in weights {
+        let expected = "three numbers from 0.001 to 1000 or 0, not all 0";
+        ensure(some && (w == 0.0 || (1e-3..=1e3).contains(&w)), "spec", "weights", w, expected)?;
+    }
     ensure((1..=1000).contains(&inner), "spec", "inner", inner, "1 to 1000")?;
     weight.validate()
 }
@@ -33,7 +53,7 @@ pub(super) fn lambda(weight: Weight, grid: &VoxelGrid, noise: &mut dyn FnMut(f64
 
 impl Default for TotalVariation {
     fn default() -> Self {
-        Self { weight: Weight::Noise(1.2), inner: 4 }
+        Self { weight: Weight::Noise(1.2), inner: 4, weights: [1.0; 3] }
     }
 }
 
@@ -42,14 +62,14 @@ conefield_core::stage_type!(Regularizer, "total-variation", TotalVariation, "fla
 #[typetag::serde(name = "total-variation")]
 impl RegularizerSpec for TotalVariation {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
-        validate(self.weight, self.inner)?;
+        validate(self.weight, self.inner, self.weights)?;
         Ok(Box::new(*self))
     }
 }
 
 impl Regularizer for TotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
-        Ok(Box::new(On { prox: TvProx::new(grid.shape, anisotropy(grid), space)?, inner: self.inner }))
+        Ok(Box::new(On { prox: TvProx::new(grid.shape, weighted(grid, self.weights), space)?, inner: self.inner }))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
@@ -57,8 +77,14 @@ impl Regularizer for TotalVariation {
     }
 
     fn describe(&self) -> String {
-        format!("total-variation: weight {}, {} dual steps per update", self.weight, self.inner)
+        let axes = said(self.weights);
+        format!("total-variation: weight {}{axes}, {} dual steps per update", self.weight, self.inner)
     }
+}
+
+/// The factors of the axes for `explain`, if they are not 1.
+pub(super) fn said(weights: [f64; 3]) -> String {
+    if are_equal(&weights) { String::new() } else { format!(" times {weights:?} along x, y, z") }
 }
 
 /// Total variation on one grid.
@@ -82,6 +108,11 @@ impl Penalty for On {
 
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
         self.prox.apply(v, tau, self.inner, u);
+    }
+
+    fn confine(&mut self, bounds: Bounds) -> Result<()> {
+        self.prox.confine(bounds);
+        Ok(())
     }
 
     fn update(&mut self, update: Update<'_>, tau: f32) {
