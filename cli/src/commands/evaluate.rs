@@ -14,8 +14,9 @@ use conefield_evaluation::report::MiddleSlices;
 use serde::Serialize;
 use std::path::PathBuf;
 
-/// Score a volume (PSNR, RMSE, three SSIMs), its material (Matthews correlation) or label maps (Dice) against a
-/// reference.
+/// Score a volume, its material or label maps against a reference.
+///
+/// A volume gets PSNR, RMSE and three SSIMs, material the Matthews correlation coefficient, label maps Dice.
 ///
 /// ssim_2d: 11x11 Gaussian window on slices of three axes (R2-Gaussian). ssim_3d: 11x11x11 Gaussian window (NI-NeRF).
 /// ssim_skimage: 7x7 uniform window on slices of three axes (scikit-image, NAF).

@@ -128,11 +128,11 @@ fn material_is_scored_by_its_place_and_an_empty_volume_scores_0() {
     let dir = tempdir().unwrap();
     let (a, b) = (labels(&dir.path().join("a.npy"), 2), labels(&dir.path().join("b.npy"), 4));
     let found = json(&["evaluate", &a, &b, "--threshold", "0.5", "--json"]);
-    // Of twelve planes 6 have material in both, 2 each in one, 2 in none: (6·2 − 2·2)/√(8·8·4·4) and 12/16.
+    // Of 1728 voxels 672 are material in both, 96 each in one, 864 in none: (672·864 − 96·96)/(768·960) and 1344/1536.
     let material = &found["material"];
-    assert_eq!([&material["mcc"], &material["dice"]], [0.25, 0.75], "{found}");
-    assert_eq!(material["voxels"], 8 * 144);
-    assert!(done(&["evaluate", &a, &b, "--threshold", "0.5"]).starts_with("mcc        0.2500"));
+    assert_eq!([&material["mcc"], &material["dice"]], [0.775, 0.875], "{found}");
+    assert_eq!(material["voxels"], 768);
+    assert!(done(&["evaluate", &a, &b, "--threshold", "0.5"]).starts_with("mcc        0.7750"));
     let empty = dir.path().join("empty.npy");
     ndarray_npy::write_npy(&empty, &Array3::<f32>::zeros((12, 12, 12))).unwrap();
     let found = json(&["evaluate", &text(&empty), &a, "--threshold", "otsu", "--json"]);

@@ -628,7 +628,9 @@ impl Backend for LittleCpu {
 /// one is told.
 #[test]
 fn a_volume_larger_than_its_place_is_computed_in_slabs() {
-    let scan = larger();
+    // Few views, whose images take less than the volume.
+    let aside: Vec<usize> = (0..24).filter(|v| v % 3 > 0).collect();
+    let (scan, _) = larger().split(&aside).unwrap();
     let run = |backend: &dyn Backend| {
         let (solution, _) = solve_on(backend, &json!({"type": "fdk"}), &scan, &Weights::default())?;
         Ok::<_, conefield_core::Error>(solution.result.volume(backend)?.data)
