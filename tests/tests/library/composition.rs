@@ -182,7 +182,7 @@ fn finer_channels_without_an_order_are_refused() {
         if ordered {
             learns(name, &spec);
         } else {
-            refused(name, &spec, &["fft-mask", "coarse to fine", "scope = \"channel\""]);
+            refused(name, &spec, &["callbacks.0.scope", "coarse to fine", "\"channel\""]);
         }
     }
 }
