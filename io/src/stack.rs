@@ -4,6 +4,7 @@
 use crate::hdf5::{self, ScanPart};
 use crate::input::Input;
 use crate::{folder, foreign, mat, memory, metaimage, npy, npz, text, tiff};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, ArrayD, Axis, Ix3};
 use serde::{Deserialize, Serialize};
@@ -164,10 +165,13 @@ pub(crate) fn read_field(
 fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array3<f32>, Option<String>)> {
     let path = &source.path;
     let place = path.display().to_string();
+    let third = |shape: &[usize]| {
+        let expected = "two axes, as layout.axes says";
+        ensure(layout.lacked == StackAxis::View, &place, "shape", format!("{shape:?}"), expected)
+    };
     let three = |a: ArrayD<f32>| {
-        if a.ndim() == 3 && layout.lacked != StackAxis::View {
-            let found = format!("{:?}", a.shape());
-            return Err(Error::invalid(&place, "shape", found, "two axes, as layout.axes says"));
+        if a.ndim() == 3 {
+            third(a.shape())?;
         }
         let a = if a.ndim() == 2 { a.insert_axis(Axis(layout.at(layout.lacked))) } else { a };
         a.into_dimensionality::<Ix3>().map_err(|e| Error::invalid(&place, "shape", e, "two or three axes"))
@@ -182,14 +186,18 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
         return Ok((three(mat::read(path, source.array.as_deref(), sets)?)?, None));
     }
     // Pages, slices of MetaImage and frames of a scan in HDF5 are always views: they move to the layout's view axis.
-    let pages = |a: Array3<f32>| match layout.at(StackAxis::View) {
-        1 => a.permuted_axes([1, 0, 2]),
-        2 => a.permuted_axes([1, 2, 0]),
-        _ => a,
+    let pages = |a: Array3<f32>| {
+        third(a.shape())?;
+        Ok::<_, Error>(match layout.at(StackAxis::View) {
+            1 => a.permuted_axes([1, 0, 2]),
+            2 => a.permuted_axes([1, 2, 0]),
+            _ => a,
+        })
     };
     if head == hdf5::MAGIC {
         let stored = hdf5::read(path, source.array.as_deref(), part)?;
-        return three(stored.values).map(|a| (if stored.frames_first { pages(a) } else { a }, None));
+        let values = three(stored.values)?;
+        return Ok((if stored.frames_first { pages(values)? } else { values }, None));
     }
     if let Some(array) = &source.array {
         let expected = "an .npz archive, a .mat file or an HDF5 file, whose arrays have names";
@@ -201,11 +209,11 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
     }
     if tiff::is_tiff(&head) {
         let stack = tiff::read(path)?;
-        return Ok((pages(stack.values), Some(stack.numbers)));
+        return Ok((pages(stack.values)?, Some(stack.numbers)));
     }
     if is_metaimage(&mut input, &head)? {
         // Columns are its x, rows its y.
-        return Ok((pages(metaimage::read(path)?.data.reversed_axes()), None));
+        return Ok((pages(metaimage::read(path)?.data.reversed_axes())?, None));
     }
     foreign::refuse(path, &head)?;
     let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), \

@@ -188,7 +188,7 @@ fn the_page_of_a_study_has_one_reference_and_means_over_the_seeds() {
     let dir = tempdir().unwrap();
     let at = |name: &str| text(&dir.path().join(name));
     let study =
-        "volumes = ['phantom:head:16']\nspecs = ['fdk', 'cgls']\nseeds = [1, 2]\nviews = 8\n[protocol]\nsteps = 2\n";
+        "volumes = ['phantom:head:16']\nspecs = ['fdk', 'cgls']\nseeds = [1, 2]\nviews = [8]\n[protocol]\nsteps = 2\n";
     fs::write(at("s.toml"), study).unwrap();
     done(&["study", &at("s.toml"), "-o", &at("study")]);
     done(&["report", &at("study"), "-o", &at("page.html")]);

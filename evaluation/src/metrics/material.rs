@@ -43,8 +43,7 @@ impl Threshold {
 const BINS: usize = 256;
 
 /// The threshold that maximizes the variance between two classes, in a histogram of 256 equal bins from the smallest to
-/// the largest value: the centre of the last bin of the lower class, as in scikit-image (Otsu, IEEE Trans. Syst. Man
-/// Cybern. 9(1), 1979). `None` if all values are equal or there are none.
+/// the largest value (Otsu, IEEE Trans. Syst. Man Cybern. 9(1), 1979). `None` if all values are equal or there are none.
 pub fn otsu(volume: ArrayView3<f32>) -> Option<f64> {
     let (low, high) = volume.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), &x| (a.min(x), b.max(x)));
     let (low, high) = (f64::from(low), f64::from(high));
@@ -57,7 +56,8 @@ pub fn otsu(volume: ArrayView3<f32>) -> Option<f64> {
     let moment = |bin: usize| counts[bin] as f64 * bin as f64;
     let (all, sum) = (volume.len() as f64, (0..BINS).map(moment).sum::<f64>());
     let (mut below, mut sum_below) = (0.0, 0.0);
-    let mut best = (0.0, 0);
+    // Bins between the classes are empty and equally good: the threshold is in their middle.
+    let mut best = (0.0, 0, 0);
     for (bin, &count) in counts.iter().enumerate().take(BINS - 1) {
         below += count as f64;
         sum_below += moment(bin);
@@ -65,10 +65,12 @@ pub fn otsu(volume: ArrayView3<f32>) -> Option<f64> {
         // The variance between the classes, times the square of the number of values.
         let between = below * above * (sum_below / below - (sum - sum_below) / above).powi(2);
         if between > best.0 {
-            best = (between, bin);
+            best = (between, bin, bin);
+        } else if between == best.0 {
+            best.2 = bin;
         }
     }
-    Some(low + (best.1 as f64 + 0.5) * width)
+    Some(low + (0.5 * (best.1 + best.2) as f64 + 1.0) * width)
 }
 
 /// Where two volumes have material.
@@ -185,8 +187,7 @@ mod tests {
         // Three clusters: the cut is between the two that are further apart.
         let found = otsu(volume(&[0.0, 0.0, 0.1, 0.1, 1.0, 1.0]).view()).unwrap();
         assert!(found > 0.1 && found < 1.0, "{found}");
-        // The centre of the last bin of the lower class.
-        assert_eq!(otsu(volume(&[0.0, 1.0]).view()), Some(0.5 / 256.0));
+        assert_eq!(otsu(volume(&[0.0, 1.0]).view()), Some(0.5));
         assert_eq!(otsu(volume(&[3.0, 3.0]).view()), None);
         assert_eq!("otsu".parse(), Ok(Threshold::Otsu));
         assert_eq!("-0.5".parse(), Ok(Threshold::Value(-0.5)));
