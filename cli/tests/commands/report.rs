@@ -196,7 +196,7 @@ fn the_page_of_a_study_has_one_reference_and_means_over_the_seeds() {
     // Each seed has a scan with a file of its own, but the truth is the same.
     assert_eq!((page.names("volumes").len(), page.names("volumes")[4]), (5, "reference"));
     assert_eq!(page.data["beside"], Value::Null);
-    assert_eq!(page.names("spreads"), ["head-16/fdk", "head-16/cgls"]);
+    assert_eq!(page.names("spreads"), ["head-16-8views/fdk", "head-16-8views/cgls"]);
     let table: Value = serde_json::from_str(&fs::read_to_string(at("study/table.json")).unwrap()).unwrap();
     assert_eq!(page.data["spreads"][0]["figures"], table["summary"][0]["figures"]);
     assert!(page.data["spreads"][0]["figures"]["psnr"]["sd"].is_number());
