@@ -102,10 +102,12 @@ pub struct General {
     /// Worker threads [default: one per core].
     #[arg(long, global = true, value_name = "N", help_heading = "General options", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
-    /// Memory limit, such as 8GiB [default: available memory]. Arrays beyond it live in scratch files.
+    /// Memory limit, such as 8GiB [default: available memory]. A command that needs more uses scratch files if it may, and
+    /// else is refused.
     #[arg(long, global = true, value_name = "SIZE", help_heading = "General options", value_parser = conefield::parse::bytes)]
     pub memory: Option<u64>,
-    /// Folder for scratch files, on a fast disk [default: where the output goes; commands without one use none].
+    /// Folder for scratch files, on a fast disk [default: "reconstruct" uses the folder in which RUN is, other commands
+    /// use none].
     #[arg(long, global = true, value_name = "FOLDER", help_heading = "General options")]
     pub scratch: Option<PathBuf>,
     /// Load this plugin, or every plugin in this folder; repeatable.

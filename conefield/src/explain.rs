@@ -107,7 +107,8 @@ fn text(r: &Explanation) -> String {
         lines.push(format!("this scan: {views} views of {rows} x {columns}, volume {x} x {y} x {z}{samples}"));
         lines.extend(s.findings.lines.iter().map(|line| format!("  {line}")));
         lines.push(format!("memory for this scan: {}", s.memory.line()));
-        if let Some([limit, beside]) = s.memory.beside() {
+        let limit = memory::limit();
+        if let Some(beside) = s.memory.beside(limit) {
             let (limit, beside) = (bytes(limit), bytes(beside));
             lines.push(format!(
                 "it stays below {limit}, with scratch files of up to {beside} on the disk of the output"

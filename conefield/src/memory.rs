@@ -85,44 +85,46 @@ impl Memory {
         format!("{}: {}", bytes(self.total), parts.collect::<Vec<_>>().join(", "))
     }
 
-    /// Bytes for scratch files if the estimate does not fit into the limit, and arrays may leave memory.
-    pub fn beside(&self) -> Option<[u64; 2]> {
-        let limit = BUDGET.get().copied().unwrap_or_else(available);
+    /// Bytes for scratch files if the estimate does not fit into `limit`, and arrays may leave memory.
+    pub fn beside(&self, limit: u64) -> Option<u64> {
         // What is read and written at random stays in memory.
         let stays = self.model + self.optimizer;
         let fits = self.total <= limit || limit < scratch::LEAST || stays > limit / 4 || !cfg!(target_os = "linux");
-        (!fits).then_some([limit, self.total + self.total / 8])
+        (!fits).then_some(self.total + self.total / 8)
     }
 
     /// Moves arrays to the disk if the estimate does not fit and a folder is allowed for them. Else refuses it, with
     /// figures; `smaller` lists what would fit into the given bytes.
     pub fn check(&self, smaller: impl FnOnce(u64) -> Vec<String>) -> Result<()> {
-        let (available, whose) = match BUDGET.get() {
-            Some(bytes) => (*bytes, "--memory allows"),
-            None => (available(), "are available"),
-        };
-        if self.total <= available {
+        let limit = limit();
+        if self.total <= limit {
             return Ok(());
         }
-        if let (Some([limit, beside]), Some(folder)) = (self.beside(), SCRATCH.get()) {
+        let beside = self.beside(limit);
+        if let (Some(beside), Some(folder)) = (beside, SCRATCH.get()) {
             scratch::begin(folder, limit, beside)?;
             allowance::set_memory(limit.saturating_add(beside), scratch::allocated);
             let (limit, place) = (bytes(limit), folder.display());
-            info!("needs {}: stays below {limit} of memory; scratch files in {place} hold the rest", self.line());
+            info!("more than {limit} of memory: scratch files in {place} hold the rest of {}", self.line());
             return Ok(());
         }
-        let mut smaller = smaller(available);
-        smaller.extend(self.beside().map(|_| "a run with --scratch FOLDER on a disk with room".to_owned()));
+        let mut smaller = smaller(limit);
+        smaller.extend(beside.map(|_| "a run with --scratch FOLDER on a disk with room".to_owned()));
         let hint = match smaller.as_slice() {
             [] => "no single reduction would make it fit".to_owned(),
             all => format!("{} would fit", all.join(" or ")),
         };
         let there = match BUDGET.get() {
-            Some(_) => format!("{whose} {}", bytes(available)),
-            None => format!("{} {whose}", bytes(available)),
+            Some(_) => format!("--memory allows {}", bytes(limit)),
+            None => format!("{} are available", bytes(limit)),
         };
         Err(Error::unsupported("memory", format!("needs {}; {there}; {hint}", self.line())))
     }
+}
+
+/// The limit of `--memory`, else the available memory, in bytes.
+pub fn limit() -> u64 {
+    BUDGET.get().copied().unwrap_or_else(available)
 }
 
 /// Bytes available to this process: the machine's available memory, less if a control group limits it; no limit if the

@@ -18,7 +18,7 @@ pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 use crate::allowance;
 use crate::error::Result;
 use crate::geometry::Geometry;
-use crate::voxel::VoxelProjector;
+use crate::voxel::{VoxelOperator, VoxelProjector};
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, Zip, s};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -312,7 +312,7 @@ pub trait Place: Send + Sync {
         let volume = self.read(volume)?;
         let operator = projector.operator();
         self.change(images, &mut |images| {
-            operator.forward(geometry, views, volume.view(), images.slice_mut(s![..views.len(), .., ..]));
+            project(operator, geometry, views, volume.view(), images.slice_mut(s![..views.len(), .., ..]));
         })?;
         operator.fault()
     }
@@ -454,37 +454,6 @@ impl Place for Host {
         penalty.fault()
     }
 
-    /// A volume that memory does not hold is projected in slabs, so that each is read once for all views, not once for
-    /// each view. Sums of slabs round differently.
-    fn forward(
-        &self,
-        projector: &dyn VoxelProjector,
-        geometry: &Geometry,
-        views: &[usize],
-        volume: &Array,
-        images: &mut Array,
-    ) -> Result<()> {
-        let (operator, volume) = (projector.operator(), self.read(volume)?);
-        let mut images = images.on_host_mut().map(|all| all.slice_mut(s![..views.len(), .., ..]));
-        let Some(images) = &mut images else { return Ok(()) };
-        let (bytes, nx) = (4 * volume.len() as u64, volume.len_of(Axis(0)));
-        // A room is a third of the memory or less.
-        if bytes / 3 <= allowance::room() || !operator.is_additive() {
-            operator.forward(geometry, views, volume.view(), images.view_mut());
-            return operator.fault();
-        }
-        let planes = ((nx as u64 * allowance::room() / bytes) as usize).max(1);
-        let mut part = Array3::zeros(images.raw_dim());
-        images.fill(0.0);
-        for first in (0..nx).step_by(planes) {
-            let planes = first..(first + planes).min(nx);
-            let geometry = Geometry { volume: geometry.volume.slab(planes.clone()), ..geometry.clone() };
-            operator.forward(&geometry, views, volume.slice(s![planes, .., ..]), part.view_mut());
-            Zip::from(&mut *images).and(&part).par_for_each(|sum, part| *sum += part);
-        }
-        operator.fault()
-    }
-
     fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()> {
         self.change(to, &mut |to| {
             let mut to = to.slice_mut(s![first..first + from.len_of(Axis(0)), .., ..]);
@@ -518,4 +487,29 @@ fn on_host<P: Place + ?Sized>(
     }
     work(&mut array);
     place.load(array.view(), x, 0)
+}
+
+/// Overwrites `images` with the line integrals of `volume`. A volume that memory does not hold is projected in slabs, so
+/// that each is read once for all views, not once for each view. Sums of slabs round differently.
+fn project(
+    operator: &dyn VoxelOperator<f32>,
+    geometry: &Geometry,
+    views: &[usize],
+    volume: ArrayView3<'_, f32>,
+    mut images: ArrayViewMut3<'_, f32>,
+) {
+    let (bytes, nx) = (4 * volume.len() as u64, volume.len_of(Axis(0)));
+    // A room is a third of the memory or less.
+    if bytes / 3 <= allowance::room() || !operator.is_additive() {
+        return operator.forward(geometry, views, volume, images);
+    }
+    let planes = ((nx as u64 * allowance::room() / bytes) as usize).max(1);
+    let mut part = Array3::zeros(images.raw_dim());
+    images.fill(0.0);
+    for first in (0..nx).step_by(planes) {
+        let planes = first..(first + planes).min(nx);
+        let geometry = Geometry { volume: geometry.volume.slab(planes.clone()), ..geometry.clone() };
+        operator.forward(&geometry, views, volume.slice(s![planes, .., ..]), part.view_mut());
+        Zip::from(&mut images).and(&part).par_for_each(|sum, part| *sum += part);
+    }
 }

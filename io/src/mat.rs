@@ -59,8 +59,7 @@ pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>,
         let (mut shape, values) = hdf5::read_exact(path, Some(&data))?;
         shape.reverse();
         let [rows, columns] = shape[..] else { return Ok((shape, values)) };
-        let values = (0..values.len()).map(|i| values[i % columns * rows + i / columns]).collect();
-        return Ok((shape, values));
+        return Ok((shape, npy::in_c_order(&values, [rows, columns])));
     }
     let (mut input, header) = open(path, name)?;
     npy::exact(&mut input, &header)

@@ -91,10 +91,15 @@ pub(crate) fn exact(input: &mut Input, header: &Header) -> Result<(Vec<usize>, V
     })?;
     let values = input.numbers("data", count, header.number, header.order, |x| x)?;
     let values = match (header.fortran, &header.shape[..]) {
-        (true, &[rows, columns]) => (0..count).map(|i| values[i % columns * rows + i / columns]).collect(),
+        (true, &[rows, columns]) => in_c_order(&values, [rows, columns]),
         _ => values,
     };
     Ok((header.shape.clone(), values))
+}
+
+/// The numbers of an array of this shape, which are in Fortran order, in C order.
+pub(crate) fn in_c_order(values: &[f64], [rows, columns]: [usize; 2]) -> Vec<f64> {
+    (0..values.len()).map(|i| values[i % columns * rows + i / columns]).collect()
 }
 
 /// Writes `array` as little-endian `f32` in C order.

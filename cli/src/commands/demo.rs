@@ -1,5 +1,6 @@
 //! `conefield demo`
 
+use super::reconstruct;
 use crate::boundary::refuse_existing;
 use crate::progress::Progress;
 use crate::run_folder::RunFolder;
@@ -8,10 +9,10 @@ use clap::Args;
 use conefield::input::Input;
 use conefield::record::{RunRecord, ScanRecord};
 use conefield::score::{SCORES, cells_of};
-use conefield::session::{InMemory, Request, Session};
-use conefield::{files, memory, parse, specs};
+use conefield::session::{Request, Session};
+use conefield::{memory, parse, specs};
 use conefield_backend_cpu::Cpu;
-use conefield_core::method::{Limits, Reconstruction, Solution};
+use conefield_core::method::{Limits, Solution};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
@@ -73,7 +74,7 @@ struct Entry {
     export_s: f64,
     scores: Scores,
     #[serde(skip)]
-    volume: Volume,
+    slices: MiddleSlices,
 }
 
 impl DemoArgs {
@@ -120,8 +121,7 @@ impl DemoArgs {
         let methods: Vec<Value> = entries.iter().map(|e| json!({ "name": e.run })).collect();
         conefield_io::write_text_atomic(folder.join("table.json"), &out::to_json(&json!({ "methods": methods }))?)?;
         let captions: Vec<String> = entries.iter().map(|e| format!("{} {:.2} dB", e.name, e.scores.psnr)).collect();
-        let slices: Vec<MiddleSlices> = entries.iter().map(|e| MiddleSlices::of(&e.volume)).collect();
-        let results: Vec<_> = captions.iter().map(|c| &c[..]).zip(&slices).collect();
+        let results: Vec<_> = captions.iter().map(|c| &c[..]).zip(entries.iter().map(|e| &e.slices)).collect();
         let picture = folder.join("compare.png");
         let truth = MiddleSlices::of(&truth);
         conefield_evaluation::report::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
@@ -186,16 +186,9 @@ impl Shared<'_> {
         folder.begin()?;
         let loaded = &method.method.loaded;
         conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
-        let notes = specs::notes(loaded, self.seed)?;
         let mut progress = Progress::new(name, Some(folder.metrics()?));
         let solved = method.solve(None, None, &mut progress)?;
-        if let Some(field) = solved.solution.result.field() {
-            files::write_field(folder.file("weights.safetensors"), field, notes)?;
-        }
-        let InMemory { volume, written } = method.in_memory(&solved, Reconstruction::volume)?;
-        conefield_io::write_volume(folder.file("volume.nii.gz"), &volume)?;
-        let slices = [self.truth, &volume].map(MiddleSlices::of);
-        files::picture(folder.file("slices.png"), Some(&slices[0]), &slices[1])?;
+        let (written, slices) = reconstruct::write(&folder, &method, &solved, self.seed, &Cpu::new())?;
         let Solution { steps, train_s, .. } = solved.solution;
         let (scores, export_s) = (written.scores.clone(), written.export_s);
         let record = RunRecord {
@@ -206,6 +199,6 @@ impl Shared<'_> {
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
         folder.finish()?;
         let scores = scores.ok_or_else(|| Error::unsupported("demo", "the phantom is not scored"))?;
-        Ok(Entry { name, run, steps, train_s, export_s, scores, volume })
+        Ok(Entry { name, run, steps, train_s, export_s, scores, slices })
     }
 }

@@ -174,7 +174,7 @@ impl ReconstructArgs {
         let board = progress.take_board();
         drop(progress);
 
-        let written = self.write(&folder, &run, &solved, backend.as_ref())?;
+        let (written, _) = write(&folder, &run, &solved, self.protocol.seed, backend.as_ref())?;
         if let Some(mut board) = board {
             board.picture(solved.solution.steps, "slices", &folder.file("slices.png"))?;
         }
@@ -256,28 +256,6 @@ impl ReconstructArgs {
             .reporting(board.transpose()?))
     }
 
-    /// Writes and scores the result.
-    fn write(&self, folder: &RunFolder, run: &Run<'_>, solved: &Solved, backend: &dyn Backend) -> Result<Written> {
-        let (reference, result) = (run.input.reference.as_ref(), &solved.solution.result);
-        let place = folder.file("volume.nii.gz");
-        let start = Instant::now();
-        let parameters = session::parameters(result);
-        if let Some(field) = result.field() {
-            let notes = specs::notes(&run.method.loaded, self.protocol.seed)?;
-            files::write_field(folder.file("weights.safetensors"), field, notes)?;
-        }
-        let mut voxels = result.voxels(backend)?;
-        let affine = reference.and_then(|r| r.affine);
-        let WrittenVolume { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
-        let export_s = start.elapsed().as_secs_f64();
-        let start = Instant::now();
-        files::picture(folder.file("slices.png"), reference.map(MiddleSlices::of).as_ref(), &slices)?;
-        let picture_s = start.elapsed().as_secs_f64();
-        let start = Instant::now();
-        let scores = whole.map(|v| run.scores(&place.display().to_string(), &v)).transpose()?.flatten();
-        Ok(Written { parameters, export_s, picture_s, score_s: start.elapsed().as_secs_f64(), scores })
-    }
-
     /// The requested spec and its changed settings. A resumed run reads its choice from its folder.
     fn asked(&self) -> Option<(String, Vec<String>)> {
         match &self.spec {
@@ -293,6 +271,35 @@ impl ReconstructArgs {
         let metrics = folder.metrics_until(resume.standing.recorded)?;
         Ok((metrics, resume))
     }
+}
+
+/// Writes the result of a run with this `seed` to its folder, and scores it. Returns its middle slices too.
+pub fn write(
+    folder: &RunFolder,
+    run: &Run<'_>,
+    solved: &Solved,
+    seed: u64,
+    backend: &dyn Backend,
+) -> Result<(Written, MiddleSlices)> {
+    let (reference, result) = (run.input.reference.as_ref(), &solved.solution.result);
+    let place = folder.file("volume.nii.gz");
+    let start = Instant::now();
+    let parameters = session::parameters(result);
+    if let Some(field) = result.field() {
+        let notes = specs::notes(&run.method.loaded, seed)?;
+        files::write_field(folder.file("weights.safetensors"), field, notes)?;
+    }
+    let mut voxels = result.voxels(backend)?;
+    let affine = reference.and_then(|r| r.affine);
+    let WrittenVolume { slices, whole } = outgoing::write(&place, voxels.as_mut(), affine, reference.is_some())?;
+    let export_s = start.elapsed().as_secs_f64();
+    let start = Instant::now();
+    files::picture(folder.file("slices.png"), reference.map(MiddleSlices::of).as_ref(), &slices)?;
+    let picture_s = start.elapsed().as_secs_f64();
+    let start = Instant::now();
+    let scores = whole.map(|v| run.scores(&place.display().to_string(), &v)).transpose()?.flatten();
+    let score_s = start.elapsed().as_secs_f64();
+    Ok((Written { parameters, export_s, picture_s, score_s, scores }, slices))
 }
 
 /// Properties that must match to resume a run or to count it as finished.

@@ -190,8 +190,9 @@ impl Backprojection<'_> {
         for first in (0..nx).step_by(planes) {
             let mut slab = space.array([planes.min(nx - first), ny, nz])?;
             for views in all.chunks(at_once) {
+                let share = done as f64 / whole as f64;
                 if observer.cancelled() {
-                    return Err(Error::Interrupted { step: 0 });
+                    return Err(Error::Interrupted { step: (share * all.len() as f64) as u64 });
                 }
                 self.load(space, views, &mut images)?;
                 place.filtered(self, views, &mut images, &mut slab, first)?;
