@@ -234,7 +234,7 @@ impl Run {
         let splitting = Memory { scan: if self.split { 2 * projections } else { 0 }, reference, ..Memory::default() };
         let surrounding = Memory { scan: projections, reference, buffers: needs.surround, ..Memory::default() };
         let solving = Memory {
-            scan: projections + needs.subtracted,
+            scan: projections + needs.corrected,
             volume: iterate,
             reference,
             model: needs.model,

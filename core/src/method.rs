@@ -503,8 +503,8 @@ pub struct Findings {
 pub struct Needs {
     /// The reconstruction of the surroundings of the volume, before everything else.
     pub surround: u64,
-    /// A copy of the scan without the contribution of the surroundings.
-    pub subtracted: u64,
+    /// A copy of the scan without beam hardening or the contribution of the surroundings.
+    pub corrected: u64,
     /// Parameters and gradients.
     pub model: u64,
     /// Moments, and copies of parameters kept by callbacks.
@@ -527,7 +527,7 @@ impl Needs {
     pub fn most(self, other: Self) -> Self {
         Self {
             surround: self.surround.max(other.surround),
-            subtracted: self.subtracted.max(other.subtracted),
+            corrected: self.corrected.max(other.corrected),
             model: self.model.max(other.model),
             optimizer: self.optimizer.max(other.optimizer),
             backend: self.backend.max(other.backend),

@@ -10,7 +10,8 @@ use std::sync::Arc;
 mod settings;
 
 pub use settings::{
-    AttenuationScale, BoundsSettings, CoarseSurround, LevelRule, SceneSettings, SupportRule, SurroundRule, VoxelScene,
+    AttenuationScale, BoundsSettings, CoarseSurround, CuboidSettings, CylinderSettings, LevelRule, SceneSettings,
+    SupportRule, SurroundRule, VoxelScene,
 };
 
 /// Maps lengths to cube sides and attenuation to order one, based on the scan only.

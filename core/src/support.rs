@@ -1,43 +1,114 @@
-//! Where the object can be: cells of a regular grid over the volume, found before training.
+//! Where the object can be: found or given before a reconstruction starts.
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ensure};
 use crate::geometry::{Ray, Vec3, VoxelGrid};
 use serde::{Deserialize, Serialize};
 
-/// Cells that may contain the object; all others are air.
+/// A region that may contain the object; all else is air.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Written", into = "Written")]
 pub struct Support {
-    /// The cells.
-    grid: VoxelGrid,
-    /// `[x][y][z]`.
-    occupied: Vec<bool>,
-    /// The bounding box of the occupied cells, mm.
+    shape: Shape,
+    /// The bounding box of the region, mm.
     bounds: [Vec3; 2],
 }
 
-/// File format: lengths of runs of cells, starting with empty ones.
+#[derive(Debug, Clone, PartialEq)]
+enum Shape {
+    /// The occupied cells of a grid.
+    Cells(Cells),
+    /// The bounding box.
+    Cuboid,
+    /// The part of a cylinder along z in the bounding box.
+    Cylinder(Cylinder),
+}
+
+/// A circle in the plane of x and y, and all points above and below it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Cylinder {
+    /// x and y of the axis, mm.
+    pub center: [f64; 2],
+    /// mm.
+    pub radius: f64,
+}
+
+impl Cylinder {
+    fn holds(&self, p: Vec3) -> bool {
+        (p[0] - self.center[0]).hypot(p[1] - self.center[1]) <= self.radius
+    }
+
+    /// Range (mm along the ray) inside; `None` if the ray misses it.
+    pub fn clip(&self, ray: &Ray) -> Option<[f64; 2]> {
+        let [dx, dy, _] = ray.direction;
+        let from = [ray.origin[0] - self.center[0], ray.origin[1] - self.center[1]];
+        let square = dx * dx + dy * dy;
+        if square == 0.0 {
+            return self.holds(ray.origin).then_some([f64::NEG_INFINITY, f64::INFINITY]);
+        }
+        let middle = -(from[0] * dx + from[1] * dy) / square;
+        let half = (self.radius.powi(2) - (from[0] * dy - from[1] * dx).powi(2) / square) / square;
+        (half > 0.0).then(|| [middle - half.sqrt(), middle + half.sqrt()])
+    }
+}
+
+/// Cells of a regular grid.
+#[derive(Debug, Clone, PartialEq)]
+struct Cells {
+    grid: VoxelGrid,
+    /// `[x][y][z]`.
+    occupied: Vec<bool>,
+}
+
+/// File format.
+#[derive(Serialize, Deserialize)]
+#[serde(untagged)]
+enum Written {
+    Cells(WrittenCells),
+    Shape(WrittenShape),
+}
+
+/// Lengths of runs of cells, starting with empty ones.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Written {
+struct WrittenCells {
     grid: VoxelGrid,
     runs: Vec<u32>,
 }
 
+/// A box, or the part of a cylinder in it.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct WrittenShape {
+    bounds: [Vec3; 2],
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    cylinder: Option<Cylinder>,
+}
+
 impl From<Support> for Written {
     fn from(s: Support) -> Self {
+        let bounds = s.bounds;
+        let Cells { grid, occupied } = match s.shape {
+            Shape::Cells(cells) => cells,
+            Shape::Cuboid => return Self::Shape(WrittenShape { bounds, cylinder: None }),
+            Shape::Cylinder(cylinder) => return Self::Shape(WrittenShape { bounds, cylinder: Some(cylinder) }),
+        };
         let mut runs = vec![];
-        if s.occupied.first() == Some(&true) {
+        if occupied.first() == Some(&true) {
             runs.push(0);
         }
-        runs.extend(s.occupied.chunk_by(|a, b| a == b).map(|run| run.len() as u32));
-        Self { grid: s.grid, runs }
+        runs.extend(occupied.chunk_by(|a, b| a == b).map(|run| run.len() as u32));
+        Self::Cells(WrittenCells { grid, runs })
     }
 }
 
 impl TryFrom<Written> for Support {
     type Error = Error;
     fn try_from(w: Written) -> Result<Self> {
+        let w = match w {
+            Written::Cells(w) => w,
+            Written::Shape(WrittenShape { bounds, cylinder }) => return Self::from_shape(bounds, cylinder),
+        };
         w.grid.validate("support")?;
         let cells = w.grid.shape.iter().try_fold(1usize, |n, &k| n.checked_mul(k)).filter(|&n| n <= MOST);
         let total: u64 = w.runs.iter().map(|&n| u64::from(n)).sum();
@@ -68,19 +139,95 @@ impl Support {
         }
         let lower = grid.bounds()[0];
         let corner = |n: [usize; 3]| std::array::from_fn(|k| lower[k] + n[k] as f64 * grid.spacing[k]);
-        Some(Self { bounds: [corner(low), corner(high)], grid, occupied })
+        Some(Self { bounds: [corner(low), corner(high)], shape: Shape::Cells(Cells { grid, occupied }) })
     }
 
-    /// The bounding box of the occupied cells, mm.
+    /// The part of a box (mm) in `volume`; `None` if there is none.
+    pub fn cuboid([low, high]: [Vec3; 2], volume: &VoxelGrid) -> Option<Self> {
+        let [from, to] = volume.bounds();
+        let low: Vec3 = std::array::from_fn(|k| from[k].max(low[k]));
+        let high: Vec3 = std::array::from_fn(|k| to[k].min(high[k]));
+        (0..3).all(|k| low[k] < high[k]).then_some(Self { shape: Shape::Cuboid, bounds: [low, high] })
+    }
+
+    /// The part of a cylinder in `volume`; `None` if there is none.
+    pub fn cylinder(cylinder: Cylinder, volume: &VoxelGrid) -> Option<Self> {
+        let Cylinder { center, radius } = cylinder;
+        let [from, to] = volume.bounds();
+        let low = [center[0] - radius, center[1] - radius, from[2]];
+        let high = [center[0] + radius, center[1] + radius, to[2]];
+        let nearest: [f64; 2] = std::array::from_fn(|k| center[k].clamp(from[k], to[k]));
+        let meets = cylinder.holds([nearest[0], nearest[1], 0.0]);
+        let part = Self::cuboid([low, high], volume).filter(|_| meets)?;
+        Some(Self { shape: Shape::Cylinder(cylinder), ..part })
+    }
+
+    fn from_shape(bounds: [Vec3; 2], cylinder: Option<Cylinder>) -> Result<Self> {
+        let [low, high] = bounds;
+        let ordered = (0..3).all(|k| low[k].is_finite() && high[k].is_finite() && low[k] < high[k]);
+        ensure(ordered, "support", "bounds", format!("{bounds:?}"), "finite corners of a box, the lower one first")?;
+        let shape = match cylinder {
+            None => Shape::Cuboid,
+            Some(c) => {
+                let right = c.center.iter().all(|x| x.is_finite()) && c.radius.is_finite() && c.radius > 0.0;
+                ensure(right, "support", "cylinder", format!("{c:?}"), "a finite centre and a positive radius")?;
+                Shape::Cylinder(c)
+            }
+        };
+        Ok(Self { shape, bounds })
+    }
+
+    /// The bounding box of the region, mm.
     pub fn bounds(&self) -> [Vec3; 2] {
         self.bounds
     }
 
-    /// Share of the cells that are occupied.
-    pub fn share(&self) -> f64 {
-        self.occupied.iter().filter(|o| **o).count() as f64 / self.occupied.len() as f64
+    /// Its share of `volume`.
+    pub fn share(&self, volume: &VoxelGrid) -> f64 {
+        let sides: Vec3 = std::array::from_fn(|k| self.bounds[1][k] - self.bounds[0][k]);
+        let size = match &self.shape {
+            Shape::Cells(Cells { grid, occupied }) => {
+                let cell: f64 = grid.spacing.iter().product();
+                cell * occupied.iter().filter(|o| **o).count() as f64
+            }
+            Shape::Cuboid => sides.iter().product(),
+            Shape::Cylinder(c) => std::f64::consts::PI * c.radius.powi(2) * sides[2],
+        };
+        size / volume.size().iter().product::<f64>()
     }
 
+    /// Whether the object can be at `p` (mm).
+    pub fn holds(&self, p: Vec3) -> bool {
+        let within = || (0..3).all(|k| (self.bounds[0][k]..=self.bounds[1][k]).contains(&p[k]));
+        match &self.shape {
+            Shape::Cells(cells) => cells.at(cells.cell(cells.place(p))),
+            Shape::Cuboid => within(),
+            Shape::Cylinder(cylinder) => within() && cylinder.holds(p),
+        }
+    }
+
+    /// Range (mm along the ray) from the first to the last point of the region, including holes in between; `None` if
+    /// there is none.
+    pub fn clip(&self, ray: &Ray) -> Option<[f64; 2]> {
+        let [near, far] = ray.clip(self.bounds)?;
+        match &self.shape {
+            Shape::Cells(cells) => {
+                let forth = cells.first(ray, near, far, 1.0)?;
+                // From the other end; it meets at least the cell found above.
+                let back = cells.first(ray, far, near, -1.0).unwrap_or(far);
+                Some([forth, back.max(forth)])
+            }
+            Shape::Cuboid => Some([near, far]),
+            Shape::Cylinder(cylinder) => {
+                let [first, last] = cylinder.clip(ray)?;
+                let (near, far) = (near.max(first), far.min(last));
+                (near < far).then_some([near, far])
+            }
+        }
+    }
+}
+
+impl Cells {
     fn at(&self, cell: [usize; 3]) -> bool {
         let [_, ny, nz] = self.grid.shape;
         self.occupied[(cell[0] * ny + cell[1]) * nz + cell[2]]
@@ -95,21 +242,6 @@ impl Support {
     fn place(&self, p: Vec3) -> Vec3 {
         let lower = self.grid.bounds()[0];
         std::array::from_fn(|k| (p[k] - lower[k]) / self.grid.spacing[k])
-    }
-
-    /// Whether the object can be at `p` (mm).
-    pub fn holds(&self, p: Vec3) -> bool {
-        self.at(self.cell(self.place(p)))
-    }
-
-    /// Range (mm along the ray) from the first to the last occupied cell, including holes in between; `None` if there
-    /// is none.
-    pub fn clip(&self, ray: &Ray) -> Option<[f64; 2]> {
-        let [near, far] = ray.clip(self.bounds)?;
-        let forth = self.first(ray, near, far, 1.0)?;
-        // From the other end; it meets at least the cell found above.
-        let back = self.first(ray, far, near, -1.0).unwrap_or(far);
-        Some([forth, back.max(forth)])
     }
 
     /// First occupied cell on the way from `t` to `end`, forwards or backwards (Amanatides and Woo 1987).
@@ -186,6 +318,45 @@ mod tests {
         }
     }
 
+    /// Against small steps: a cylinder and a box, cut by the volume.
+    #[test]
+    fn shapes_cut_rays_and_hold_points() {
+        let disc = Cylinder { center: [10.0, -5.0], radius: 20.0 };
+        let shapes = [
+            Support::cylinder(disc, &grid()).unwrap(),
+            Support::cuboid([[-10.0, -99.0, -20.0], [20.0, 10.0, 9.0]], &grid()).unwrap(),
+        ];
+        for (s, share) in shapes.iter().zip([std::f64::consts::PI * 400.0 / 3600.0, 30.0 * 42.0 * 29.0 / 216_000.0]) {
+            assert!((s.share(&grid()) - share).abs() < 1e-9, "{}", s.share(&grid()));
+            let text = serde_json::to_string(s).unwrap();
+            assert_eq!(serde_json::from_str::<Support>(&text).unwrap(), *s, "{text}");
+            for i in 0..60 {
+                let draw = |k: u64| f64::from(unit(mix(7000 + i, k))) * 2.0 - 1.0;
+                let origin = [80.0 * draw(1), 90.0, 60.0 * draw(2)];
+                let towards: Vec3 = std::array::from_fn(|k| 25.0 * draw(3 + k as u64) - origin[k]);
+                let length = towards.iter().map(|x| x * x).sum::<f64>().sqrt();
+                let ray = Ray { origin, direction: towards.map(|x| x / length) };
+                let hits: Vec<f64> = (0..5000).map(|j| f64::from(j) * 0.05).filter(|&t| s.holds(ray.at(t))).collect();
+                match (s.clip(&ray), hits.first(), hits.last()) {
+                    (Some([a, b]), Some(first), Some(last)) => {
+                        assert!((a - first).abs() < 0.06 && (b - last).abs() < 0.06, "{a} {first} {b} {last}");
+                    }
+                    (Some([a, b]), None, None) => assert!(b - a < 0.06, "{a} {b}"),
+                    (found, first, _) => assert!(found.is_none() && first.is_none(), "{found:?} {first:?}"),
+                }
+            }
+        }
+        assert!(Support::cylinder(Cylinder { center: [50.0, -40.0], radius: 15.0 }, &grid()).is_none());
+        assert!(Support::cuboid([[40.0; 3], [50.0; 3]], &grid()).is_none());
+        for text in [
+            "{\"bounds\": [[0, 0, 0], [1, 1, 0]]}",
+            "{\"bounds\": [[0, 0, 0], [1, 1, 1]], \"cylinder\": {\"center\": [0, 0], \"radius\": -1}}",
+        ] {
+            let e = serde_json::from_str::<Support>(text).unwrap_err().to_string();
+            assert!(e.contains("expected"), "{e}");
+        }
+    }
+
     #[test]
     fn a_support_comes_back_from_its_text() {
         for seed in 1..10 {
@@ -197,7 +368,8 @@ mod tests {
         let text = serde_json::to_string(&all).unwrap();
         assert_eq!(serde_json::from_str::<Support>(&text).unwrap(), all);
         assert!(
-            all.bounds()[0].iter().zip(grid().bounds()[0]).all(|(a, b)| (a - b).abs() < 1e-9) && all.share() == 1.0
+            all.bounds()[0].iter().zip(grid().bounds()[0]).all(|(a, b)| (a - b).abs() < 1e-9)
+                && (all.share(&grid()) - 1.0).abs() < 1e-9
         );
         for (bad, words) in [("[0,121]", "121 cells"), ("[120]", "no occupied"), ("[4294967295,4294967295]", "cells")] {
             let broken = text.replace("[0,120]", bad);

@@ -12,7 +12,8 @@ use crate::pretrain::{Pretraining, learn, pretrain};
 use crate::priors::Places;
 use crate::rays::{Pixels, RayChoice, RaySource, Views, Windows};
 use crate::schedule::{Clock, Ends};
-use crate::surround::{self, Within};
+use crate::solid;
+use crate::surround::{self, Corrected};
 use crate::training::callbacks::{FieldMonitor, LiveSlices, Rollback};
 use crate::training::run::Tally;
 use crate::training::{Callback, CallbackSpec, Callbacks, Draw, Run, Task, checkpoint, train};
@@ -238,10 +239,10 @@ impl Plan for FieldPlan {
         let backend = self.outline.backend().scratch_bytes as u64;
         let learning = if self.loss.needs_scan() { noise::scratch(scan) } else { 0 };
         let known = if self.initializer.volume().is_some() { 8 * scan.voxels() } else { 0 };
-        let [surround, subtracted] = surround::bytes(self.scene.surround, scan);
+        let [surround, corrected] = surround::bytes(self.scene.surround, scan);
         Needs {
             surround,
-            subtracted,
+            corrected: corrected + solid::bytes(self.scene.support, scan),
             model: 8 * n,
             optimizer: 8 * n + kept,
             backend,
@@ -271,10 +272,10 @@ impl Plan for FieldPlan {
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         job.scan.validate("scan")?;
         let mut pipeline = self.pipeline.clone();
-        let Fitted { scene, needed, found, changed } = fit(job.scan, &self.scene, &mut pipeline)?;
+        let Fitted { scene, solid, needed, found, changed } = fit(job.scan, &self.scene, &mut pipeline)?;
         found.iter().for_each(|line| observer.note(line));
-        let within = Within::of(job, self.scene.surround, observer)?;
-        let job = &Within::job(within.as_ref(), job);
+        let corrected = Corrected::of(job, self.scene.surround, solid.as_ref(), observer)?;
+        let job = &Corrected::job(corrected.as_ref(), job);
         let Training { views, pixels, margin, windows, .. } = self.training;
         let source = RaySource::new(job.scan, &scene, &pipeline, RayChoice { views, pixels, margin, windows })?;
         observer.note(&format!("training uses {:.0}% of the pixels", 100.0 * source.share()));

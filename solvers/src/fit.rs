@@ -1,16 +1,19 @@
 //! Adapts a pipeline to a scan: the object's support, the resolution of the data, the distance of samples.
 
+use crate::solid::{self, Solid};
 use crate::support::carve;
-use conefield_core::error::Result;
+use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scan::Scan;
-use conefield_core::scene::{LevelRule, Scene, SceneSettings, SupportRule};
-use conefield_core::support::Support;
+use conefield_core::scene::{CuboidSettings, CylinderSettings, LevelRule, Scene, SceneSettings, SupportRule};
+use conefield_core::support::{Cylinder, Support};
 
 /// A scene, and the parts of a pipeline that it needs.
 pub struct Fitted {
     /// Maps between the world and the stages.
     pub scene: Scene,
+    /// The solid that the object is, if the settings look for one and there is one.
+    pub solid: Option<Solid>,
     /// The encoder's channels that are needed, if not all.
     pub needed: Option<Vec<usize>>,
     /// Findings, for the log.
@@ -19,22 +22,70 @@ pub struct Fitted {
     pub changed: bool,
 }
 
-/// The object's support, if the settings ask for it, and a log line.
-pub fn support(scan: &Scan, rule: SupportRule) -> (Option<Support>, Option<String>) {
+/// What the settings and the views say about the object.
+#[derive(Default)]
+pub struct Object {
+    /// Where it can be, if not everywhere.
+    pub support: Option<Support>,
+    /// The solid that it is, if the settings look for one and there is one.
+    pub solid: Option<Solid>,
+    /// Findings, for the log.
+    pub found: Vec<String>,
+}
+
+/// The object of a scan.
+///
+/// # Errors
+/// The views show no solid, or the given region lies outside the volume.
+pub fn object(scan: &Scan, rule: SupportRule) -> Result<Object> {
+    let (volume, mm) = (&scan.geometry.volume, scan.unit.mm);
+    let given = |key: &str, found: String, support: Option<Support>| {
+        let outside =
+            || Error::invalid("spec", format!("scene.support.{key}"), found, "a region that meets the volume");
+        Ok(Object { support: Some(support.ok_or_else(outside)?), ..Object::default() })
+    };
     match rule {
-        SupportRule::Box => (None, None),
-        SupportRule::Carve => {
-            let carved = carve(scan);
-            (carved.support, Some(format!("support: {}", carved.said)))
+        SupportRule::Box => Ok(Object::default()),
+        SupportRule::Carve => Ok(carved(scan, vec![])),
+        SupportRule::Cylinder(CylinderSettings { center, radius }) => {
+            let cylinder = Cylinder { center: center.map(|x| x * mm), radius: radius * mm };
+            given("cylinder", format!("{center:?}, {radius}"), Support::cylinder(cylinder, volume))
+        }
+        SupportRule::Cuboid(CuboidSettings { low, high }) => {
+            let corners = [low, high].map(|p| p.map(|x| x * mm));
+            given("cuboid", format!("{low:?} to {high:?}"), Support::cuboid(corners, volume))
+        }
+        SupportRule::Solid | SupportRule::SolidOrCarve => {
+            let fitted = solid::fit(scan).and_then(|solid| {
+                let support = Support::cylinder(solid.cylinder, volume);
+                support.map(|support| (solid, support)).ok_or_else(|| "the solid lies outside the volume".into())
+            });
+            match fitted {
+                Ok((solid, support)) => {
+                    let found = vec![solid.describe(&scan.unit)];
+                    Ok(Object { support: Some(support), solid: Some(solid), found })
+                }
+                Err(why) if rule == SupportRule::Solid => {
+                    let expected = "\"solid-or-carve\", \"carve\" or \"box\" for these views";
+                    Err(Error::invalid("spec", "scene.support", format!("\"solid\", but {why}"), expected))
+                }
+                Err(why) => Ok(carved(scan, vec![format!("support: no solid, because {why}")])),
+            }
         }
     }
+}
+
+/// The object as it is carved.
+fn carved(scan: &Scan, mut found: Vec<String>) -> Object {
+    let carved = carve(scan);
+    found.push(format!("support: {}", carved.said));
+    Object { support: carved.support, solid: None, found }
 }
 
 /// The scene of a scan under a spec's settings. Converts the lengths of `pipeline` to that scene.
 pub fn fit(scan: &Scan, settings: &SceneSettings, pipeline: &mut Pipeline) -> Result<Fitted> {
     let mut scene = Scene::new(scan, settings)?;
-    let (support, said) = support(scan, settings.support);
-    let mut found: Vec<String> = said.into_iter().collect();
+    let Object { support, solid, mut found } = object(scan, settings.support)?;
     if let Some(support) = support {
         scene = scene.within(support, settings);
     }
@@ -45,7 +96,7 @@ pub fn fit(scan: &Scan, settings: &SceneSettings, pipeline: &mut Pipeline) -> Re
         needed = pipeline.needed(cells);
         found.push(format!("levels: {}", levels(pipeline, needed.as_deref(), cells)?));
     }
-    Ok(Fitted { scene, needed, found, changed })
+    Ok(Fitted { scene, solid, needed, found, changed })
 }
 
 /// Finds the encoder's channels that are needed to resolve `cells`.

@@ -4,8 +4,8 @@
 //!   loop, with its callbacks; [`pretrain`] trains a field on known volumes, for weights that other scans reuse.
 //!   [`losses`], [`priors`] and [`optimizer`] hold the parts of training.
 //! - [`gaussians`] trains a sum of Gaussians on whole views, in the same loop.
-//! - [`fit`] adapts a pipeline to a scan, [`support`] finds the object's support, [`surround`] models attenuation
-//!   beyond the volume.
+//! - [`fit`] adapts a pipeline to a scan, [`support`] and [`solid`] find the object's support, [`surround`] models
+//!   attenuation beyond the volume.
 //! - [`fdk`] is filtered back-projection.
 //! - [`iterative`] refines voxels pass by pass: SART, CGLS, ASD-POCS, FISTA.
 //! - [`chain`] runs methods one after the other.
@@ -25,6 +25,7 @@ pub mod priors;
 pub mod rays;
 pub mod schedule;
 mod shadow;
+pub mod solid;
 pub mod support;
 pub mod surround;
 pub mod training;

@@ -149,7 +149,7 @@ pub fn carve(scan: &Scan) -> CarvedSupport {
             let all: f64 = g.volume.size().iter().product();
             let said = format!(
                 "{:.0}% of the volume, in a box of {:.0}%, from the air in {share} of {} views",
-                100.0 * support.share(),
+                100.0 * support.share(&g.volume),
                 100.0 * box_ / all,
                 g.views.len()
             );

@@ -9,6 +9,7 @@
 use crate::iterative::Stop;
 use crate::iterative::fista::Fista;
 use crate::iterative::regularizers::TotalVariation;
+use crate::solid::Solid;
 use crate::support::Blocks;
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::{Geometry, View, VoxelGrid, norm};
@@ -27,15 +28,26 @@ const TOGETHER: usize = 8;
 /// that axis.
 const ALONG: f64 = 0.1;
 
-/// A job's scan and held-out views, without attenuation beyond the volume.
-pub(crate) struct Within {
+/// A job's scan and held-out views as its method uses them: without attenuation beyond the volume, or corrected for the
+/// beam hardening of a solid.
+pub(crate) struct Corrected {
     scan: Scan,
     held_out: Option<Scan>,
 }
 
-impl Within {
-    /// Estimates attenuation beyond the volume if the spec asks for it; `None` if there is none to estimate.
-    pub(crate) fn of(job: &Job<'_>, rule: SurroundRule, observer: &mut dyn Observer) -> Result<Option<Self>> {
+impl Corrected {
+    /// Corrects the views for a solid, or estimates attenuation beyond the volume if the spec asks for it; `None` if
+    /// there is nothing to correct.
+    pub(crate) fn of(
+        job: &Job<'_>,
+        rule: SurroundRule,
+        solid: Option<&Solid>,
+        observer: &mut dyn Observer,
+    ) -> Result<Option<Self>> {
+        if let Some(solid) = solid {
+            let linear = |scan: &Scan| solid.linearize(scan);
+            return Ok(Some(Self { scan: linear(job.scan), held_out: job.held_out.map(linear) }));
+        }
         let SurroundRule::Coarse(settings) = rule else { return Ok(None) };
         let (around, said) = Around::of(job.scan, settings)?;
         observer.note(&format!("surround: {said}"));
@@ -56,9 +68,9 @@ impl Within {
         Ok(Some(Self { scan, held_out }))
     }
 
-    /// The job without attenuation beyond the volume.
-    pub(crate) fn job<'a>(within: Option<&'a Self>, job: &Job<'a>) -> Job<'a> {
-        match within {
+    /// The job with the corrected views.
+    pub(crate) fn job<'a>(corrected: Option<&'a Self>, job: &Job<'a>) -> Job<'a> {
+        match corrected {
             Some(Self { scan, held_out }) => Job { scan, held_out: held_out.as_ref(), ..*job },
             None => *job,
         }
@@ -68,7 +80,7 @@ impl Within {
 /// The scan of `job` without attenuation beyond the volume, as its method sees it; `None` if the spec does not ask for
 /// it or there is none to estimate.
 pub fn subtracted(job: &Job<'_>, rule: SurroundRule, observer: &mut dyn Observer) -> Result<Option<Scan>> {
-    Ok(Within::of(job, rule, observer)?.map(|within| within.scan))
+    Ok(Corrected::of(job, rule, None, observer)?.map(|corrected| corrected.scan))
 }
 
 /// Log lines about attenuation beyond the volume of this scan; none if the rule does not ask for it.

@@ -40,7 +40,7 @@ fn keeps(name: &str, volume: &Volume, views: usize, noise: DetectorNoise) -> f64
     println!("{name}: {}", found.said);
     let Some(support) = found.support else { return 1.0 };
     assert_eq!(lost(volume, &support), 0, "{name}: {}", found.said);
-    support.share()
+    support.share(&volume.grid)
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! Scene settings of a spec.
 
 use crate::error::{Result, ensure};
+use crate::geometry::Vec3;
 use crate::place::Bounds;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -38,7 +39,9 @@ impl SceneSettings {
         if let AttenuationScale::Fixed(x) | AttenuationScale::Relative(x) = self.attenuation {
             ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
         }
-        self.surround.validate()
+        self.support.validate()?;
+        self.surround.validate()?;
+        self.support.allows(&self.surround)
     }
 }
 
@@ -99,16 +102,78 @@ pub enum LevelRule {
     Needed,
 }
 
-/// Where the object can be inside the volume.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+/// Where the object can be inside the volume. Iterative methods keep other voxels at 0; for fields, the unit cube is
+/// fitted to the region, and rays are sampled inside it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum SupportRule {
     /// Anywhere.
     Box,
-    /// Without air: cells through which several views see only air are left out. The unit cube is fitted to the rest,
-    /// rays are sampled between the first and the last remaining cell, and iterative methods keep other voxels at 0.
-    /// Truncated views do not count.
+    /// Without air: cells through which several views see only air are left out. Truncated views do not count.
     Carve,
+    /// In a solid cylinder along z that is fitted to the views: one material with lighter parts inside. Its attenuation
+    /// is the upper bound of iterative methods, unless `scene.bounds.high` is given, and beam hardening of its line
+    /// integrals is corrected.
+    Solid,
+    /// In a solid cylinder if the views show one, else as with `carve`.
+    SolidOrCarve,
+    /// In a cylinder along z.
+    Cylinder(CylinderSettings),
+    /// In a box.
+    Cuboid(CuboidSettings),
+}
+
+/// A cylinder along z, in the unit of the scan.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CylinderSettings {
+    /// x and y of its axis.
+    #[serde(default)]
+    pub center: [f64; 2],
+    /// Its radius.
+    pub radius: f64,
+}
+
+/// A box along the axes, in the unit of the scan.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CuboidSettings {
+    /// Its lowest corner.
+    pub low: Vec3,
+    /// Its highest corner.
+    pub high: Vec3,
+}
+
+impl SupportRule {
+    /// Refuses invalid settings.
+    pub fn validate(&self) -> Result<()> {
+        match *self {
+            Self::Box | Self::Carve | Self::Solid | Self::SolidOrCarve => Ok(()),
+            Self::Cylinder(CylinderSettings { center, radius }) => {
+                let [center_key, radius_key] = ["center", "radius"].map(|k| format!("scene.support.cylinder.{k}"));
+                let finite = center.iter().all(|x| x.is_finite());
+                ensure(finite, "spec", &center_key, format!("{center:?}"), "finite numbers")?;
+                ensure(radius.is_finite() && radius > 0.0, "spec", &radius_key, radius, "a positive finite number")
+            }
+            Self::Cuboid(CuboidSettings { low, high }) => {
+                let right = (0..3).all(|k| low[k].is_finite() && high[k].is_finite() && low[k] < high[k]);
+                let found = format!("{low:?} and {high:?}");
+                ensure(right, "spec", "scene.support.cuboid", found, "finite corners low and high, low below high")
+            }
+        }
+    }
+
+    /// Whether the scan decides on the attenuation and hardening of a solid.
+    pub fn is_solid(&self) -> bool {
+        matches!(self, Self::Solid | Self::SolidOrCarve)
+    }
+
+    /// Refuses a solid whose views lose attenuation beyond the volume.
+    fn allows(&self, surround: &SurroundRule) -> Result<()> {
+        let found = if surround.is_none() { "none" } else { "coarse" };
+        let expected = "\"none\", because scene.support looks for a solid whose whole width is visible";
+        ensure(surround.is_none() || !self.is_solid(), "spec", "scene.surround", found, expected)
+    }
 }
 
 /// The attenuation that counts as 1 for the field.
@@ -160,7 +225,9 @@ impl Default for VoxelScene {
 impl VoxelScene {
     /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
+        self.support.validate()?;
         self.surround.validate()?;
+        self.support.allows(&self.surround)?;
         let BoundsSettings { low, high } = self.bounds;
         ensure(low.is_finite(), "spec", "scene.bounds.low", low, "a finite number")?;
         if let Some(high) = high {
@@ -169,7 +236,7 @@ impl VoxelScene {
         }
         // Voxels outside the support are 0.
         let free = low == 0.0 || self.support == SupportRule::Box;
-        ensure(free, "spec", "scene.bounds.low", low, "0, because scene.support is \"carve\"")
+        ensure(free, "spec", "scene.bounds.low", low, "0, because voxels outside scene.support are 0")
     }
 }
 
@@ -179,7 +246,7 @@ impl VoxelScene {
 pub struct BoundsSettings {
     /// Lowest attenuation. A method with the key `nonnegative` ignores it if that is false.
     pub low: f64,
-    /// Highest attenuation: that of the densest material, if it is known.
+    /// Highest attenuation: that of the densest material, if it is known. With `scene.support = "solid"` it is fitted.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub high: Option<f64>,
 }

@@ -12,7 +12,7 @@ pub mod weights;
 use crate::iterative::drive::finite;
 use crate::iterative::monitor::VolumeMonitor;
 use crate::support::Blocks;
-use crate::surround::{self, Within};
+use crate::surround::{self, Corrected};
 use axis::{Axis as OrbitAxis, upright};
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
@@ -92,8 +92,8 @@ impl Plan for Fdk {
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let start = Instant::now();
         job.scan.validate("scan")?;
-        let within = Within::of(job, self.scene.surround, observer)?;
-        let job = &Within::job(within.as_ref(), job);
+        let corrected = Corrected::of(job, self.scene.surround, None, observer)?;
+        let job = &Corrected::job(corrected.as_ref(), job);
         let axis = OrbitAxis::of(&job.scan.geometry);
         let upright = upright(&job.scan.geometry, axis.as_ref());
         let orbit = FdkOrbit::of(&upright);
@@ -148,8 +148,8 @@ impl Plan for Fdk {
         let at_once = views_at_once(header.detector, held(header));
         let _ = images(&space, header.detector, at_once);
         space.pass(column_major_bytes::<f32>(header.detector, at_once.min(header.views)));
-        let [surround, subtracted] = surround::bytes(self.scene.surround, header);
-        Needs { surround, subtracted, working: space.bytes(), volume: true, ..Needs::default() }
+        let [surround, corrected] = surround::bytes(self.scene.surround, header);
+        Needs { surround, corrected, working: space.bytes(), volume: true, ..Needs::default() }
     }
 }
 

@@ -28,7 +28,8 @@ use crate::iterative::known_volume;
 use crate::optimizer::Optimizer;
 use crate::priors::Places;
 use crate::schedule::{Clock, Ends};
-use crate::surround::{self, Quiet, Within};
+use crate::solid;
+use crate::surround::{self, Corrected, Quiet};
 use crate::training::callbacks::{FieldMonitor, LiveSlices};
 use crate::training::{CallbackSpec, Callbacks, Draw, Run, Task, checkpoint, train};
 use conefield_core::backend::Adam;
@@ -265,11 +266,11 @@ impl Plan for GaussianPlan {
         let bins = if self.bin > 1 { 4 * seen.pixels() } else { 0 };
         let begun = first().needs(scan).working + self.start.bytes(scan.voxels());
         let training = ViewTraining::bytes(&seen, self.most as u64);
-        let [surround, subtracted] = surround::bytes(self.scene.surround, scan);
+        let [surround, corrected] = surround::bytes(self.scene.surround, scan);
         let backend = self.outline.backend().scratch_bytes as u64;
         Needs {
             surround,
-            subtracted,
+            corrected: corrected + solid::bytes(self.scene.support, scan),
             model: 8 * n,
             optimizer: 8 * n + self.kept,
             backend,
@@ -295,13 +296,13 @@ impl Plan for GaussianPlan {
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         job.scan.validate("scan")?;
         let mut pipeline = self.pipeline.clone();
-        let Fitted { scene, found, .. } = fit(job.scan, &self.scene, &mut pipeline)?;
+        let Fitted { scene, solid, found, .. } = fit(job.scan, &self.scene, &mut pipeline)?;
         found.iter().for_each(|line| observer.note(line));
         let [rows, columns] = job.scan.geometry.detector;
         let room = format!("1 to {}, the detector's longer side", rows.max(columns));
         ensure(self.bin <= rows.max(columns), "spec", "bin", self.bin, room)?;
-        let within = Within::of(job, self.scene.surround, observer)?;
-        let job = &Within::job(within.as_ref(), job);
+        let corrected = Corrected::of(job, self.scene.surround, solid.as_ref(), observer)?;
+        let job = &Corrected::job(corrected.as_ref(), job);
         let widths = [NARROWEST * scene.voxel_mm() / scene.side, WIDEST];
         let widths = [widths[0].min(WIDEST / 2.0), widths[1]];
         let mut model = Model::random(pipeline, job.seed);

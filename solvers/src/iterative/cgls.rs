@@ -68,14 +68,6 @@ struct Built {
     nonnegative: bool,
 }
 
-impl Built {
-    /// Bounds of the volume in the scan's unit.
-    fn bounds(&self) -> Bounds {
-        let bounds = self.shared.scene.bounds.in_mm(1.0);
-        if self.nonnegative { bounds } else { Bounds { low: f32::NEG_INFINITY, ..bounds } }
-    }
-}
-
 impl Iterative for Built {
     fn kind(&self) -> &'static str {
         "cgls"
@@ -96,7 +88,9 @@ impl Iterative for Built {
         iterate.prepare(&problem)?;
         let mut solution = drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)?;
         if let Reconstruction::Volume(volume) = &mut solution.result {
-            let bounds = self.bounds();
+            // The volume is in the scan's unit.
+            let [low, high] = [problem.bounds.low, problem.bounds.high].map(|x| x * job.scan.unit.mm as f32);
+            let bounds = Bounds { low: if self.nonnegative { low } else { f32::NEG_INFINITY }, high };
             volume.data.par_mapv_inplace(|x| bounds.clip(x));
         }
         Ok(solution)

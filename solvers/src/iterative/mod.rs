@@ -37,8 +37,5 @@ pub use stop::Stop;
 
 /// Bytes of the object's support mask.
 pub fn mask_bytes(rule: SupportRule, header: &ScanHeader) -> u64 {
-    match rule {
-        SupportRule::Box => 0,
-        SupportRule::Carve => header.voxels(),
-    }
+    if rule == SupportRule::Box { 0 } else { header.voxels() }
 }

@@ -2,8 +2,8 @@
 
 use super::mask_bytes;
 use super::shared::Shared;
-use crate::fit::support;
-use crate::surround;
+use crate::fit::object;
+use crate::{solid, surround};
 use conefield_core::error::Result;
 use conefield_core::method::{Findings, Job, Line, Needs, Observer, Outline, Plan, Solution};
 use conefield_core::scan::{Scan, ScanHeader};
@@ -60,14 +60,15 @@ impl<T: Iterative> Plan for IterativePlan<T> {
     fn needs(&self, scan: &ScanHeader) -> Needs {
         let shared = self.0.shared();
         let working = self.0.bytes(scan) + mask_bytes(shared.scene.support, scan);
-        let [surround, subtracted] = surround::bytes(shared.scene.surround, scan);
-        Needs { surround, subtracted, working, resume: working + 4 * scan.voxels(), volume: true, ..Needs::default() }
+        let [surround, corrected] = surround::bytes(shared.scene.surround, scan);
+        let corrected = corrected + solid::bytes(shared.scene.support, scan);
+        Needs { surround, corrected, working, resume: working + 4 * scan.voxels(), volume: true, ..Needs::default() }
     }
 
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
         let scene = self.0.shared().scene;
         let mut lines = surround::found(scan, scene.surround)?;
-        lines.extend(support(scan, scene.support).1);
+        lines.extend(object(scan, scene.support)?.found);
         lines.extend(self.0.found(scan));
         Ok(Findings { lines, ..Findings::default() })
     }

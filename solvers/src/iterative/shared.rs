@@ -3,8 +3,8 @@
 use super::order::Subsets;
 use super::problem::Problem;
 use super::stop::Stop;
-use crate::fit::support;
-use crate::surround::Within;
+use crate::fit::{Object, object};
+use crate::surround::Corrected;
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
 use conefield_core::finite::stray;
@@ -94,20 +94,23 @@ impl Shared {
         let on = place.device().map(|device| format!(", on {device}")).unwrap_or_default();
         observer.note(&format!("{method}; {}{on}", self.projector.describe()));
         // Uses the views as measured: the attenuation subtracted later is too coarse for carving.
-        let (support, said) = support(job.scan, self.scene.support);
-        said.iter().for_each(|line| observer.note(line));
+        let Object { support, solid, found } = object(job.scan, self.scene.support)?;
+        found.iter().for_each(|line| observer.note(line));
         let inside = support.map(|support| {
             let mut inside = Array3::from_elem(grid.shape, false);
             Zip::indexed(&mut inside).par_for_each(|(x, y, z), i| *i = support.holds(grid.voxel([x, y, z])));
             place.mask(inside)
         });
         let inside = inside.transpose()?;
-        let within = Within::of(job, self.scene.surround, observer)?;
-        let binned = (bin > 1).then(|| Within::job(within.as_ref(), job).scan.binned(bin));
+        let corrected = Corrected::of(job, self.scene.surround, solid.as_ref(), observer)?;
+        let binned = (bin > 1).then(|| Corrected::job(corrected.as_ref(), job).scan.binned(bin));
         let seen = binned.as_ref().map_or(g, |scan| &scan.geometry);
         let geometry = Geometry { volume: grid, ..seen.clone() };
-        let bounds = self.scene.bounds.in_mm(job.scan.unit.mm);
-        Ok(Opened { place, projector: self.projector.clone(), bounds, inside, within, binned, geometry })
+        let mut bounds = self.scene.bounds.in_mm(job.scan.unit.mm);
+        if let (None, Some(solid)) = (self.scene.bounds.high, &solid) {
+            bounds.high = solid.attenuation as f32;
+        }
+        Ok(Opened { place, projector: self.projector.clone(), bounds, inside, corrected, binned, geometry })
     }
 
     /// Adds the memory of the driver and of the projector for a subset to the method's own arrays in `space`; returns
@@ -127,8 +130,8 @@ pub(super) struct Opened {
     bounds: Bounds,
     /// The object's support, if known.
     inside: Option<Mask>,
-    /// The scan without attenuation beyond the volume.
-    within: Option<Within>,
+    /// The scan without beam hardening or attenuation beyond the volume.
+    corrected: Option<Corrected>,
     /// The binned scan, if requested.
     binned: Option<Scan>,
     /// The geometry of the scan in use, with the grid of the unknowns.
@@ -136,9 +139,9 @@ pub(super) struct Opened {
 }
 
 impl Opened {
-    /// The job without attenuation beyond the volume.
+    /// The job with the views that the method uses.
     pub(super) fn job<'a>(&'a self, job: &Job<'a>) -> Job<'a> {
-        Within::job(self.within.as_ref(), job)
+        Corrected::job(self.corrected.as_ref(), job)
     }
 
     /// A space in the problem's place.

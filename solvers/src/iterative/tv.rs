@@ -23,17 +23,27 @@ pub fn anisotropy(grid: &VoxelGrid) -> [f32; 3] {
     grid.spacing.map(|s| (h / s) as f32)
 }
 
+/// Voxels of a line, the axis across lines and the one along them. Lines run along z; those of a single slice run along
+/// y, because lines of one voxel would leave vectors empty. The array is the same.
+fn along([_, ny, nz]: [usize; 3]) -> [usize; 3] {
+    if nz == 1 { [ny, 2, 1] } else { [nz, 1, 2] }
+}
+
 /// The total variation of `x`, which must be contiguous in standard order.
 pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3], edges: Option<&Edges>) -> f64 {
-    let (_, ny, nz) = x.dim();
-    let plane = ny * nz;
+    let plane = x.dim().1 * x.dim().2;
+    let [nz, y, z] = along(x.dim().into());
+    let g = [g[0], g[y], g[z]];
     let x = x.as_standard_layout();
     let Some(all) = x.as_slice() else { return 0.0 };
     let planes: Vec<f64> = all
         .par_chunks(plane.max(1))
         .enumerate()
         .map(|(i, x)| {
-            let n = edges.map(|edges| edges.vectors().map(|n| &n[i * plane..(i + 1) * plane]));
+            let n = edges.map(|edges| {
+                let n = edges.vectors();
+                [n[0], n[y], n[z]].map(|n| &n[i * plane..(i + 1) * plane])
+            });
             run(Variation { x, after: all.get((i + 1) * plane..(i + 2) * plane), n, g, nz })
         })
         .collect();
@@ -188,11 +198,12 @@ impl TvProx {
     /// Makes some steps in one sweep. The slabs of `split` run in parallel; near its ends each works on a copy of its
     /// neighbour's data, so that every number is computed from the same values whatever the split.
     fn steps(&mut self, lines: impl Lines, tau: f32, split: Split) {
-        let [nx, ny, nz] = self.shape;
-        let plane = ny * nz;
-        let bounds = split.bounds(nx);
-        let edges = self.edges.as_ref().map(Edges::vectors);
-        let dual = self.dual.each_mut().map(Array::slice_mut);
+        let [nz, y, z] = along(self.shape);
+        let plane = self.shape[1] * self.shape[2];
+        let bounds = split.bounds(self.shape[0]);
+        let edges = self.edges.as_ref().map(Edges::vectors).map(|n| [n[0], n[y], n[z]]);
+        let [px, py, pz] = self.dual.each_mut().map(Array::slice_mut);
+        let dual = if y == 1 { [px, py, pz] } else { [px, pz, py] };
         // Copies of the neighbour's planes on both sides of every inner bound.
         let mut halos: Vec<([Vec<f32>; 3], Vec<f32>)> = bounds[1..bounds.len() - 1]
             .iter()
@@ -232,7 +243,7 @@ impl TvProx {
             let edges = edges.map(|n| n.map(|n| &n[first..first + planes.0[0].len() * plane]));
             slabs.push(Sweep { planes, own, lines, v, edges, line: nz, steps: split.reach });
         }
-        let scale = Scale::new(self.g, tau, self.bounds);
+        let scale = Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.bounds);
         slabs.into_par_iter().for_each(|slab| run(Sweeping(slab, scale)));
     }
 }

@@ -7,6 +7,7 @@ mod fdk;
 mod iterative;
 mod kit;
 mod refusals;
+mod solid;
 mod surround;
 mod sweep;
 mod warm_start;

@@ -76,6 +76,20 @@ fn bounds_are_numbers_in_order_and_hold_0_outside_a_support() {
             ("bounds = { low = 0.5, high = 0.5 }", "scene.bounds.high: found 0.5, expected a finite number above"),
             ("bounds = { low = 0.1 }\nsupport = \"carve\"", "scene.bounds.low: found 0.1, expected 0, because"),
             ("bounds = { top = 0.1 }", "top"),
+            ("support = \"ball\"", "ball"),
+            (
+                "support = { cylinder = { radius = 0.0 } }",
+                "scene.support.cylinder.radius: found 0, expected a positive",
+            ),
+            ("support = { cylinder = { center = [nan, 0.0], radius = 1.0 } }", "found nan, expected a finite number"),
+            ("support = { cylinder = { center = [500.0, 0.0], radius = 1.0 } }", "a region that meets the volume"),
+            ("support = { cuboid = { low = [0, 0, 1], high = [1, 1, 0] } }", "scene.support.cuboid: found"),
+            ("support = { cuboid = { low = [500, 0, 0], high = [501, 1, 1] } }", "a region that meets the volume"),
+            (
+                "support = \"solid\"\nsurround = { coarse = {} }",
+                "scene.surround: found coarse, expected \"none\", because",
+            ),
+            ("support = \"solid\"", "scene.support: found \"solid\", but"),
         ] {
             let e = said(&method(kind, &format!("[scene]\n{scene}")));
             assert!(e.contains(says), "{kind}, {scene}: {e}");
