@@ -2,6 +2,7 @@
 
 use super::{Array, StatePart};
 use crate::error::{Error, Result};
+use crate::geometry::Vec3;
 use crate::wgsl::Fragment;
 use ndarray::ArrayView3;
 use rayon::prelude::*;
@@ -66,6 +67,12 @@ pub trait Penalty: Send {
     fn confine(&mut self, bounds: Bounds) -> Result<()> {
         let expected = "0 and no upper bound: this prior has no other bounds";
         Err(Error::invalid("spec", "scene.bounds", format!("{bounds} (in 1/mm)"), expected))
+    }
+
+    /// Tells the unit vector along the middle of an arc of less than half a turn, if the views cover such an arc: edges
+    /// across it are the ones that no ray is tangent to. Called before the first update.
+    fn limited(&mut self, middle: Vec3) {
+        let _ = middle;
     }
 
     /// The whole update, with [`Penalty::prox`] for `tau`. A penalty whose proximal map is a single pass over the

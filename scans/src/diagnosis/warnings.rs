@@ -220,8 +220,8 @@ fn angles(scan: &Scan, s: &Survey, warn: Warn) {
             WarningKind::Arc,
             format!("the views cover an arc of {:.1}°, less than {least:.1}°: {why}", a.covered_deg),
             format!(
-                "edges along the missing directions will be blurred; take views over {least:.0}°, or check the range of \
-                 the angles"
+                "edges along the missing directions will be blurred; take views over {least:.0}°, check the range of the \
+                 angles, or try --spec limited-angle"
             ),
         );
     }

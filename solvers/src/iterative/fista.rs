@@ -24,10 +24,11 @@ use conefield_core::Error;
 use conefield_core::basis::{Basis, BasisSpec, Expansion};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::VoxelGrid;
+use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
+use conefield_core::orbit::Arcs;
 use conefield_core::place::{Array, Bounds, DIVIDE, ProximalStep, Reduction, StatePart};
 use conefield_core::random::stream;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
@@ -41,6 +42,7 @@ use ndarray::Array3;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::f64::consts::PI;
 use std::time::Instant;
 
 /// Settings of `fista`.
@@ -211,6 +213,9 @@ impl Iterative for Built {
         if problem.bounds != Bounds::default() {
             arrays.penalty.confine(problem.bounds)?;
         }
+        if let Some(middle) = limited(problem.geometry) {
+            arrays.penalty.limited(middle);
+        }
         problem.settle()?;
         let mut iterate = Iterate::new(self, &problem, data, arrays)?;
         observer.note(&iterate.description());
@@ -266,6 +271,15 @@ impl Iterative for Built {
         let held = if self.pull > 0.0 { format!(", pull {} to a volume", self.pull) } else { String::new() };
         format!("fista: {}{held}", self.subsets)
     }
+}
+
+/// The unit vector along the middle of the arc of the sources about z, if the views cover less than half a turn.
+fn limited(geometry: &Geometry) -> Option<Vec3> {
+    let angles: Vec<f64> = geometry.views.iter().map(|view| view.source[1].atan2(view.source[0])).collect();
+    let arcs = Arcs::of(&angles).arcs;
+    let &[[start, length]] = arcs.as_slice() else { return None };
+    let (sin, cos) = (start + length / 2.0).sin_cos();
+    (length < PI).then_some([cos, sin, 0.0])
 }
 
 /// FISTA's working memory.

@@ -138,6 +138,11 @@ impl TvProx {
         self.bounds = bounds;
     }
 
+    /// Multiplies the weights of differences along x, y, z by `factors`.
+    pub fn weigh(&mut self, factors: [f32; 3]) {
+        self.g = std::array::from_fn(|k| self.g[k] * factors[k]);
+    }
+
     /// Updates the edges from `x`, if they are in use. Returns the total variation of `x` if that changes it.
     pub fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
         self.edges.as_mut()?.find(x, self.g);

@@ -1,9 +1,9 @@
 //! Every iterative method on a small scan in closed form: its accuracy, its end, and that its bits depend on the job
 //! only.
 
-use crate::kit::{Case, Heard, bodies, geometry, mean, method as spec, psnr, volume};
+use crate::kit::{Case, Heard, bodies, geometry, mean, method as spec, psnr, view, volume};
 use conefield_core::Error;
-use conefield_core::geometry::VoxelGrid;
+use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::method::Limits;
 use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
@@ -330,4 +330,24 @@ fn every_projector_serves_and_the_unit_is_the_scan_s() {
     let tenfold = of(&scan, "");
     let apart = plain.data.iter().zip(&tenfold.data).fold(0.0f32, |m, (a, b)| m.max((10.0 * a - b).abs()));
     assert!(apart < 1e-7, "{apart}");
+}
+
+/// A factor along the middle of an arc acts on the axis there; without such an arc it is ignored.
+#[test]
+fn differences_along_the_middle_of_an_arc_cost_less() {
+    let scan = |degrees: f64| {
+        let at = |i: usize| (degrees * (i as f64 / 23.0 - 0.5)).to_radians();
+        let views = (0..24).map(|i| view(at(i), [150.0, 220.0], [2.8, 2.8], [0.0, 0.0])).collect();
+        scan_ellipsoids(&bodies(), Geometry { views, ..geometry(1) })
+    };
+    let solved = |degrees: f64, prior: &str| {
+        let text = spec("fista-tv", &format!("prior = {{ {prior} }}\nstop = {{ passes = 4 }}"));
+        Case::of(&scan(degrees)).volume(&text).0.data
+    };
+    for kind in ["total-variation", "directional-total-variation"] {
+        let of = |degrees, factor: &str| solved(degrees, &format!("type = \"{kind}\"{factor}"));
+        let (arc, axes, plain) = (of(100.0, ", arc = 0.5"), of(100.0, ", weights = [0.5, 1, 1]"), of(100.0, ""));
+        assert!(arc == axes && arc != plain, "{kind}");
+        assert!(of(200.0, ", arc = 0.5") == of(200.0, ""), "{kind}");
+    }
 }

@@ -4,7 +4,7 @@
 //! the edges come from another image of the object. Here they come from the volume itself and are updated before each
 //! pass.
 
-use super::total_variation::{On, are_equal, lambda, said, validate, weighted};
+use super::total_variation::{On, are_equal, is_one, lambda, said, validate, weighted};
 use crate::iterative::edges::Edges;
 use crate::iterative::tv::TvProx;
 use conefield_core::error::{Result, ensure};
@@ -31,11 +31,14 @@ pub struct DirectionalTotalVariation {
     /// more.
     #[serde(skip_serializing_if = "are_equal")]
     pub weights: [f64; 3],
+    /// Factor of differences along the middle of an arc of less than half a turn; see `total-variation`.
+    #[serde(skip_serializing_if = "is_one")]
+    pub arc: f64,
 }
 
 impl Default for DirectionalTotalVariation {
     fn default() -> Self {
-        Self { weight: Weight::Noise(0.7), inner: 4, strength: 0.97, edge: 1.0, weights: [1.0; 3] }
+        Self { weight: Weight::Noise(0.7), inner: 4, strength: 0.97, edge: 1.0, weights: [1.0; 3], arc: 1.0 }
     }
 }
 
@@ -49,7 +52,7 @@ conefield_core::stage_type!(
 #[typetag::serde(name = "directional-total-variation")]
 impl RegularizerSpec for DirectionalTotalVariation {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
-        validate(self.weight, self.inner, self.weights)?;
+        validate(self.weight, self.inner, self.weights, self.arc)?;
         let strength = self.strength;
         ensure((0.0..=0.999).contains(&strength), "spec", "strength", strength, "0 to 0.999")?;
         ensure((1e-3..=1e3).contains(&self.edge), "spec", "edge", self.edge, "0.001 to 1000")?;
@@ -61,7 +64,8 @@ impl Regularizer for DirectionalTotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         let g = weighted(grid, self.weights);
         let edges = Edges::new(grid.shape, self.strength as f32, self.edge, space)?;
-        Ok(Box::new(On { prox: TvProx::new(grid.shape, g, space)?.with_edges(edges), inner: self.inner }))
+        let prox = TvProx::new(grid.shape, g, space)?.with_edges(edges);
+        Ok(Box::new(On { prox, inner: self.inner, arc: self.arc }))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
@@ -69,8 +73,8 @@ impl Regularizer for DirectionalTotalVariation {
     }
 
     fn describe(&self) -> String {
-        let Self { weight, inner, strength, edge, weights } = self;
-        let axes = said(*weights);
+        let Self { weight, inner, strength, edge, weights, arc } = self;
+        let axes = said(*weights, *arc);
         format!(
             "directional-total-variation: weight {weight}{axes}, {inner} dual steps per update, strength {strength}, edge {edge}"
         )

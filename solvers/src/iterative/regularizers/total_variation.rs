@@ -2,7 +2,7 @@
 
 use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::VoxelGrid;
+use conefield_core::geometry::{Vec3, VoxelGrid};
 use conefield_core::place::StatePart;
 use conefield_core::regularizer::{Bounds, Kernels, Penalty, Regularizer, RegularizerSpec, Update, Weight};
 use conefield_core::space::Space;
@@ -22,6 +22,16 @@ pub struct TotalVariation {
     /// more.
     #[serde(skip_serializing_if = "are_equal")]
     pub weights: [f64; 3],
+    /// Factor of differences along the middle of an arc of less than half a turn. Edges across it are the ones that the
+    /// views do not show; with a smaller factor they cost less. An axis at an angle α to the middle gets
+    /// `1 − (1 − arc)·cos²α`. Wider arcs ignore it.
+    #[serde(skip_serializing_if = "is_one")]
+    pub arc: f64,
+}
+
+/// Whether a factor changes nothing.
+pub(super) fn is_one(factor: &f64) -> bool {
+    *factor == 1.0
 }
 
 /// Whether all axes have the factor 1.
@@ -35,8 +45,9 @@ pub(super) fn weighted(grid: &VoxelGrid, weights: [f64; 3]) -> [f32; 3] {
     std::array::from_fn(|k| weights[k] as f32 * g[k])
 }
 
-/// Refuses an invalid weight, number of dual steps, or factor of an axis.
-pub(super) fn validate(weight: Weight, inner: usize, weights: [f64; 3]) -> Result<()> {
+/// Refuses an invalid weight, number of dual steps, or factor.
+pub(super) fn validate(weight: Weight, inner: usize, weights: [f64; 3], arc: f64) -> Result<()> {
+    ensure((1e-3..=1e3).contains(&arc), "spec", "arc", arc, "a number from 0.001 to 1000")?;
     let some = weights.iter().any(|w| *w > 0.0);
     for w in weights {
         let expected = "three numbers from 0.001 to 1000 or 0, not all 0";
@@ -53,7 +64,7 @@ pub(super) fn lambda(weight: Weight, grid: &VoxelGrid, noise: &mut dyn FnMut(f64
 
 impl Default for TotalVariation {
     fn default() -> Self {
-        Self { weight: Weight::Noise(1.2), inner: 4, weights: [1.0; 3] }
+        Self { weight: Weight::Noise(1.2), inner: 4, weights: [1.0; 3], arc: 1.0 }
     }
 }
 
@@ -62,14 +73,15 @@ conefield_core::stage_type!(Regularizer, "total-variation", TotalVariation, "fla
 #[typetag::serde(name = "total-variation")]
 impl RegularizerSpec for TotalVariation {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
-        validate(self.weight, self.inner, self.weights)?;
+        validate(self.weight, self.inner, self.weights, self.arc)?;
         Ok(Box::new(*self))
     }
 }
 
 impl Regularizer for TotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
-        Ok(Box::new(On { prox: TvProx::new(grid.shape, weighted(grid, self.weights), space)?, inner: self.inner }))
+        let prox = TvProx::new(grid.shape, weighted(grid, self.weights), space)?;
+        Ok(Box::new(On { prox, inner: self.inner, arc: self.arc }))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
@@ -77,20 +89,23 @@ impl Regularizer for TotalVariation {
     }
 
     fn describe(&self) -> String {
-        let axes = said(self.weights);
+        let axes = said(self.weights, self.arc);
         format!("total-variation: weight {}{axes}, {} dual steps per update", self.weight, self.inner)
     }
 }
 
-/// The factors of the axes for `explain`, if they are not 1.
-pub(super) fn said(weights: [f64; 3]) -> String {
-    if are_equal(&weights) { String::new() } else { format!(" times {weights:?} along x, y, z") }
+/// The factors for `explain`, if they are not 1.
+pub(super) fn said(weights: [f64; 3], arc: f64) -> String {
+    let axes = if are_equal(&weights) { String::new() } else { format!(" times {weights:?} along x, y, z") };
+    if is_one(&arc) { axes } else { format!("{axes} times {arc} along the middle of a limited arc") }
 }
 
 /// Total variation on one grid.
 pub(super) struct On {
     pub(super) prox: TvProx,
     pub(super) inner: usize,
+    /// Factor along the middle of a limited arc.
+    pub(super) arc: f64,
 }
 
 impl Penalty for On {
@@ -113,6 +128,10 @@ impl Penalty for On {
     fn confine(&mut self, bounds: Bounds) -> Result<()> {
         self.prox.confine(bounds);
         Ok(())
+    }
+
+    fn limited(&mut self, middle: Vec3) {
+        self.prox.weigh(middle.map(|d| (1.0 - (1.0 - self.arc) * d * d) as f32));
     }
 
     fn update(&mut self, update: Update<'_>, tau: f32) {
