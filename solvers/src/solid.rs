@@ -32,9 +32,12 @@ const STARTS: [[f64; 2]; 6] = [[1.0, 0.0], [1.0, 0.15], [1.0, 0.3], [1.2, 0.0], 
 const CONFIRMED: f64 = 0.08;
 /// Least chord, relative to the diameter, that some of them have: what has only a thin wall is no solid.
 const LONG: f64 = 0.5;
+/// Least share of the rays through the rim that confirm a solid, and their chords relative to the diameter.
+const RIM: f64 = 0.5;
+const RIM_CHORDS: std::ops::Range<f64> = 0.1..0.4;
 /// Largest share of the object's rays that contradict a solid.
 const CONTRADICTED: f64 = 0.02;
-/// Largest mean deviation of edges from the first circle, relative to its radius.
+/// Nine in ten edges deviate less from the first circle, relative to its radius.
 const ROUND: f64 = 0.02;
 /// Fewest views.
 const VIEWS: usize = 3;
@@ -193,15 +196,15 @@ pub fn fit(scan: &Scan) -> Result<Solid, String> {
         (solid, Verdict::of(&solid, &measured, high))
     });
     let best = judged.into_iter().max_by(|a, b| a.1.score().total_cmp(&b.1.score()));
-    let (solid, Verdict { close, long, denser }) = best.unwrap_or_else(|| unreachable!("there are starts"));
+    let (solid, Verdict { close, rim, long, denser }) = best.unwrap_or_else(|| unreachable!("there are starts"));
     let same = (solid.cylinder.radius / circle.radius - 1.0).abs() < 0.1;
-    if same && close >= CONFIRMED && long >= LONG && denser <= CONTRADICTED {
+    if same && close >= CONFIRMED && rim >= RIM && long >= LONG && denser <= CONTRADICTED {
         return Ok(solid);
     }
-    let [close, long, denser] = [close, long, denser].map(|share| 100.0 * share);
+    let [close, rim, long, denser] = [close, rim, long, denser].map(|share| 100.0 * share);
     Err(format!(
-        "{close:.0}% of the object's rays fit a cylinder of one material, on chords up to {long:.0}% of its diameter, \
-         and {denser:.1}% are denser"
+        "{close:.0}% of the object's rays, and {rim:.0}% of those through its rim, fit a cylinder of one material, on \
+         chords up to {long:.0}% of its diameter, and {denser:.1}% are denser"
     ))
 }
 
@@ -209,6 +212,8 @@ pub fn fit(scan: &Scan) -> Result<Solid, String> {
 struct Verdict {
     /// Share of the rays that confirm it.
     close: f64,
+    /// The same share of the rays through its rim. A model that is too dense for the rim takes a dense core for it.
+    rim: f64,
     /// The chord that one in twenty of these exceeds, relative to the diameter.
     long: f64,
     /// Share of the rays that contradict it.
@@ -222,20 +227,27 @@ impl Verdict {
     }
 
     fn of(solid: &Solid, measured: &[Measured], high: f64) -> Self {
-        let (mut all, mut denser, mut chords) = (0, 0, vec![]);
-        for m in measured.iter().filter(|m| m.p > EDGE * high) {
-            let e = m.p - solid.model(&m.ray);
-            all += 1;
-            denser += usize::from(e > DENSER * high);
-            if e.abs() < CLOSE * high {
-                let chord = solid.cylinder.clip(&m.ray).map_or(0.0, |[a, b]| b - a) * m.line.flat;
-                chords.push(chord / (2.0 * solid.cylinder.radius));
+        let (mut all, mut denser, mut chords, mut rim) = (0, 0, vec![], [0, 0]);
+        for m in measured {
+            let model = solid.model(&m.ray);
+            let (e, is_close) = (m.p - model, (m.p - model).abs() < CLOSE * high);
+            let chord = solid.cylinder.clip(&m.ray).map_or(0.0, |[a, b]| b - a) * m.line.flat;
+            let chord = chord / (2.0 * solid.cylinder.radius);
+            // Rays above or below the object meet the cylinder too.
+            if RIM_CHORDS.contains(&chord) && m.p > 0.5 * model {
+                rim = [rim[0] + 1, rim[1] + usize::from(is_close)];
+            }
+            if m.p > EDGE * high {
+                all += 1;
+                denser += usize::from(e > DENSER * high);
+                chords.extend(is_close.then_some(chord));
             }
         }
+        let rim = rim[1] as f64 / rim[0].max(1) as f64;
         let share = |n: usize| n as f64 / all.max(1) as f64;
         let (close, k) = (share(chords.len()), chords.len() * 19 / 20);
         let long = if chords.is_empty() { 0.0 } else { *chords.select_nth_unstable_by(k, f64::total_cmp).1 };
-        Self { close, long, denser: share(denser) }
+        Self { close, rim, long, denser: share(denser) }
     }
 }
 
@@ -253,7 +265,7 @@ fn circle(edges: &[[Ray; 2]]) -> Result<Cylinder, String> {
         .collect();
     let mut weights = vec![1.0; tangents.len()];
     let mut found = [0.0; 3];
-    let mut mean = f64::INFINITY;
+    let mut close = 0;
     for _ in 0..20 {
         let mut normal = [[0.0; 3]; 3];
         let mut right = [0.0; 3];
@@ -268,12 +280,12 @@ fn circle(edges: &[[Ray; 2]]) -> Result<Cylinder, String> {
         let [x, y, radius] = found;
         let deviations: Vec<f64> =
             tangents.iter().map(|(n, side, offset)| (n[0] * x + n[1] * y + side * radius - offset).abs()).collect();
-        mean = deviations.iter().zip(&weights).map(|(d, w)| d * w).sum::<f64>() / weights.iter().sum::<f64>();
+        close = deviations.iter().filter(|d| **d < ROUND * radius).count();
         let scale = 1e-3 * radius.abs();
         weights.iter_mut().zip(&deviations).for_each(|(w, d)| *w = 1.0 / (1.0 + (d / scale).powi(2)).sqrt());
     }
     let [x, y, radius] = found;
-    let round = radius.is_finite() && radius > 0.0 && mean < ROUND * radius;
+    let round = radius.is_finite() && radius > 0.0 && 10 * close >= 9 * tangents.len();
     if round { Ok(Cylinder { center: [x, y], radius }) } else { Err(unclear()) }
 }
 

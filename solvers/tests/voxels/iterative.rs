@@ -341,7 +341,7 @@ fn differences_along_the_middle_of_an_arc_cost_less() {
         scan_ellipsoids(&bodies(), Geometry { views, ..geometry(1) })
     };
     let solved = |degrees: f64, prior: &str| {
-        let text = spec("fista-tv", &format!("prior = {{ {prior} }}\nstop = {{ passes = 4 }}"));
+        let text = spec("fista", &format!("prior = {{ {prior} }}\nstop = {{ passes = 4 }}"));
         Case::of(&scan(degrees)).volume(&text).0.data
     };
     for kind in ["total-variation", "directional-total-variation"] {
