@@ -10,6 +10,7 @@
 //! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them; [`finite`]: the
 //!   search for values that are not allowed.
 //! - [`settings`], [`spec`], [`registry`]: what a user writes, and the available types.
+//! - [`matrix`]: small matrices, for fits.
 //! - [`host`]: stages on the host, to inspect a model beside training.
 //! - [`voxel`]: line integrals of voxel volumes.
 //! - [`basis`], [`data_term`], [`regularizer`]: parts of an iterative method; [`place`], [`space`]: its arrays, and
@@ -33,6 +34,7 @@ pub mod geometry;
 pub mod host;
 pub mod input_file;
 pub mod loss;
+pub mod matrix;
 pub mod method;
 pub mod opened;
 pub mod orbit;

@@ -9,6 +9,7 @@
 
 use crate::support::Blocks;
 use conefield_core::geometry::{Ray, norm};
+use conefield_core::matrix::{inner, inverse};
 use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::scene::SupportRule;
 use conefield_core::support::Cylinder;
@@ -83,10 +84,14 @@ impl Solid {
         )
     }
 
-    /// The line integral of the solid without lighter parts.
-    fn model(&self, ray: &Ray) -> f64 {
-        let chord = self.cylinder.clip(ray).map_or(0.0, |[a, b]| b - a);
+    /// The line integral of a chord through the solid without lighter parts.
+    fn model(&self, chord: f64) -> f64 {
         self.attenuation * chord - self.hardening * chord * chord
+    }
+
+    /// How far the line integral of a ray is above that of the solid without lighter parts.
+    fn above(&self, m: &Measured) -> f64 {
+        m.p - self.model(m.line.chord(&self.cylinder))
     }
 }
 
@@ -97,12 +102,12 @@ pub fn bytes(rule: SupportRule, header: &ScanHeader) -> u64 {
 
 /// A ray with its line integral.
 struct Measured {
-    ray: Ray,
     line: Line,
     p: f64,
 }
 
 /// A ray seen along z: the line `normal·(x, y) = offset`.
+#[derive(Clone, Copy)]
 struct Line {
     /// Unit vector.
     normal: [f64; 2],
@@ -117,6 +122,16 @@ impl Line {
         let flat = dx.hypot(dy);
         let normal = [-dy / flat, dx / flat];
         Self { normal, offset: normal[0] * ray.origin[0] + normal[1] * ray.origin[1], flat }
+    }
+
+    /// Its signed distance from the axis of a cylinder.
+    fn distance(&self, Cylinder { center, .. }: &Cylinder) -> f64 {
+        self.offset - self.normal[0] * center[0] - self.normal[1] * center[1]
+    }
+
+    /// Length of the ray inside a cylinder.
+    fn chord(&self, cylinder: &Cylinder) -> f64 {
+        2.0 * (cylinder.radius.powi(2) - self.distance(cylinder).powi(2)).max(0.0).sqrt() / self.flat
     }
 }
 
@@ -149,7 +164,7 @@ impl<'a> Rows<'a> {
     }
 
     /// The rays at the first and the last pixel of the object in each row that shows both sides of it.
-    fn edges(&self) -> Result<Vec<[Ray; 2]>, String> {
+    fn edges(&self) -> Result<Vec<[Line; 2]>, String> {
         let (g, columns) = (&self.scan.geometry, self.scan.geometry.detector[1]);
         let mut shown = 0;
         let mut edges = vec![];
@@ -159,7 +174,7 @@ impl<'a> Rows<'a> {
             let Some((first, last)) = (0..columns).find(on).zip((0..columns).rev().find(on)) else { continue };
             shown += 1;
             if first > 0 && last + 1 < columns {
-                edges.push([g.ray(view, row, first), g.ray(view, row, last)]);
+                edges.push([first, last].map(|c| Line::of(&g.ray(view, row, c))));
             }
         }
         let enough = g.views.len() >= VIEWS && edges.len() >= VIEWS && 10 * edges.len() >= 9 * shown;
@@ -170,7 +185,7 @@ impl<'a> Rows<'a> {
         let (scan, columns) = (self.scan, self.scan.geometry.detector[1]);
         let of = |view: usize, row: usize, c: usize| {
             let ray = scan.geometry.ray(view, row, c);
-            Measured { line: Line::of(&ray), ray, p: f64::from(scan.view(view)[[row, c]]) }
+            Measured { line: Line::of(&ray), p: f64::from(scan.view(view)[[row, c]]) }
         };
         self.rows.iter().flat_map(|&(view, row)| (0..columns).map(move |c| of(view, row, c))).collect()
     }
@@ -212,9 +227,9 @@ pub fn fit(scan: &Scan) -> Result<Solid, String> {
 struct Verdict {
     /// Share of the rays that confirm it.
     close: f64,
-    /// The same share of the rays through its rim. A model that is too dense for the rim takes a dense core for it.
+    /// The same share of the rays through its rim. It is small where a dense core passes for the whole.
     rim: f64,
-    /// The chord that one in twenty of these exceeds, relative to the diameter.
+    /// The chord that one in twenty of the confirming rays exceeds, relative to the diameter.
     long: f64,
     /// Share of the rays that contradict it.
     denser: f64,
@@ -229,12 +244,12 @@ impl Verdict {
     fn of(solid: &Solid, measured: &[Measured], high: f64) -> Self {
         let (mut all, mut denser, mut chords, mut rim) = (0, 0, vec![], [0, 0]);
         for m in measured {
-            let model = solid.model(&m.ray);
-            let (e, is_close) = (m.p - model, (m.p - model).abs() < CLOSE * high);
-            let chord = solid.cylinder.clip(&m.ray).map_or(0.0, |[a, b]| b - a) * m.line.flat;
-            let chord = chord / (2.0 * solid.cylinder.radius);
+            let e = solid.above(m);
+            let is_close = e.abs() < CLOSE * high;
+            // Seen along z, relative to the diameter.
+            let chord = m.line.chord(&solid.cylinder) * m.line.flat / (2.0 * solid.cylinder.radius);
             // Rays above or below the object meet the cylinder too.
-            if RIM_CHORDS.contains(&chord) && m.p > 0.5 * model {
+            if RIM_CHORDS.contains(&chord) && m.p > 0.5 * (m.p - e) {
                 rim = [rim[0] + 1, rim[1] + usize::from(is_close)];
             }
             if m.p > EDGE * high {
@@ -252,13 +267,12 @@ impl Verdict {
 }
 
 /// The circle whose tangents the edges are, by least squares with less weight on stray edges.
-fn circle(edges: &[[Ray; 2]]) -> Result<Cylinder, String> {
+fn circle(edges: &[[Line; 2]]) -> Result<Cylinder, String> {
     let unclear = || "the edges in the views are not those of a cylinder along z".to_string();
     // Each edge: normal·center + side·radius = offset.
     let tangents: Vec<([f64; 2], f64, f64)> = edges
         .iter()
-        .flat_map(|pair| {
-            let [a, b] = [Line::of(&pair[0]), Line::of(&pair[1])];
+        .flat_map(|[a, b]| {
             let side = if a.offset > b.offset { 1.0 } else { -1.0 };
             [(a.normal, side, a.offset), (b.normal, -side, b.offset)]
         })
@@ -306,15 +320,15 @@ fn refine(start: Solid, measured: &[Measured], high: f64, pixel: f64) -> Solid {
     let mut damping = 1e-3;
     for _ in 0..60 {
         // Weights are those of the iteration's start, as in iteratively reweighted least squares.
-        let weights: Vec<f64> = measured.par_iter().map(|m| weight(m.p - solid.model(&m.ray))).collect();
+        let weights: Vec<f64> = measured.par_iter().map(|m| weight(solid.above(m))).collect();
         let cost = |solid: &Solid| {
-            let one = |(m, w): (&Measured, &f64)| [w * (m.p - solid.model(&m.ray)).powi(2)];
+            let one = |(m, w): (&Measured, &f64)| [w * solid.above(m).powi(2)];
             sums(measured, &weights, one)[0]
         };
         // The upper triangle of the normal equations, and their right side.
         let found: [f64; 20] = sums(measured, &weights, |(m, w)| {
             let row = slope(&solid, m, pixel);
-            let e = m.p - solid.model(&m.ray);
+            let e = solid.above(m);
             let entry = |(i, j): (usize, usize)| w * row[i] * if j < 5 { row[j] } else { e };
             std::array::from_fn(|k| entry(ENTRIES[k]))
         });
@@ -384,43 +398,28 @@ fn sums<const N: usize>(
 /// Derivatives of the model with respect to axis, radius, μ and κ. At the edge, where the chord's derivative has no
 /// bound, it is that a quarter of a pixel inside.
 fn slope(solid: &Solid, at: &Measured, pixel: f64) -> [f64; 5] {
-    let Solid { cylinder: Cylinder { center, radius }, attenuation, hardening } = *solid;
-    let Line { normal: n, offset, flat } = at.line;
-    let r = offset - n[0] * center[0] - n[1] * center[1];
+    let Solid { cylinder, attenuation, hardening } = *solid;
+    let (radius, Line { normal: n, flat, .. }) = (cylinder.radius, at.line);
+    let (r, chord) = (at.line.distance(&cylinder), at.line.chord(&cylinder));
     let square = radius * radius - r * r;
     if square <= 0.0 {
         return [0.0; 5];
     }
-    let chord = 2.0 * square.sqrt() / flat;
     let half = square.max(0.5 * radius * pixel).sqrt();
     let by_chord = attenuation - 2.0 * hardening * chord;
     let by_r = by_chord * 2.0 / (flat * half);
     [by_r * r * n[0], by_r * r * n[1], by_r * radius, chord, -chord * chord]
 }
 
-/// Solves a small symmetric positive definite system (Cholesky); `None` if it is singular.
-fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
+/// Solves normal equations; `None` if they are singular.
+fn solve<const N: usize>(normal: [[f64; N]; N], right: [f64; N]) -> Option<[f64; N]> {
     // Unknowns of different units: scaled to a diagonal of 1.
-    let scale: [f64; N] = std::array::from_fn(|k| a[k][k].sqrt());
+    let scale: [f64; N] = std::array::from_fn(|k| normal[k][k].sqrt());
     if scale.iter().any(|s| !(s.is_finite() && *s > 0.0)) {
         return None;
     }
-    for i in 0..N {
-        (0..N).for_each(|j| a[i][j] /= scale[i] * scale[j]);
-        b[i] /= scale[i];
-    }
-    for i in 0..N {
-        for j in 0..=i {
-            let sum = a[i][j] - (0..j).map(|k| a[i][k] * a[j][k]).sum::<f64>();
-            a[i][j] = if i == j { (sum > 1e-14).then(|| sum.sqrt())? } else { sum / a[j][j] };
-        }
-    }
-    for i in 0..N {
-        b[i] = (b[i] - (0..i).map(|k| a[i][k] * b[k]).sum::<f64>()) / a[i][i];
-    }
-    for i in (0..N).rev() {
-        b[i] = (b[i] - (i + 1..N).map(|k| a[k][i] * b[k]).sum::<f64>()) / a[i][i];
-    }
-    (0..N).for_each(|k| b[k] /= scale[k]);
-    Some(b)
+    let scaled = (0..N).map(|i| (0..N).map(|j| normal[i][j] / (scale[i] * scale[j])).collect()).collect();
+    let inverse = inverse(scaled)?;
+    let right: [f64; N] = std::array::from_fn(|k| right[k] / scale[k]);
+    Some(std::array::from_fn(|k| inner(&inverse[k], &right) / scale[k]))
 }

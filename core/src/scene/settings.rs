@@ -39,9 +39,8 @@ impl SceneSettings {
         if let AttenuationScale::Fixed(x) | AttenuationScale::Relative(x) = self.attenuation {
             ensure(x.is_finite() && x > 0.0, "spec", "scene.attenuation", x, "a positive finite number")?;
         }
-        self.support.validate()?;
         self.surround.validate()?;
-        self.support.allows(&self.surround)
+        self.support.validate(&self.surround)
     }
 }
 
@@ -145,10 +144,15 @@ pub struct CuboidSettings {
 }
 
 impl SupportRule {
-    /// Refuses invalid settings.
-    pub fn validate(&self) -> Result<()> {
+    /// Refuses invalid settings, and a solid beside a surround.
+    pub fn validate(&self, surround: &SurroundRule) -> Result<()> {
         match *self {
-            Self::Box | Self::Carve | Self::Solid | Self::SolidOrCarve => Ok(()),
+            Self::Box | Self::Carve => Ok(()),
+            Self::Solid | Self::SolidOrCarve => {
+                let found = if surround.is_none() { "none" } else { "coarse" };
+                let expected = "\"none\", because scene.support looks for a solid whose whole width is visible";
+                ensure(surround.is_none(), "spec", "scene.surround", found, expected)
+            }
             Self::Cylinder(CylinderSettings { center, radius }) => {
                 let [center_key, radius_key] = ["center", "radius"].map(|k| format!("scene.support.cylinder.{k}"));
                 let finite = center.iter().all(|x| x.is_finite());
@@ -166,13 +170,6 @@ impl SupportRule {
     /// Whether the scan decides on the attenuation and hardening of a solid.
     pub fn is_solid(&self) -> bool {
         matches!(self, Self::Solid | Self::SolidOrCarve)
-    }
-
-    /// Refuses a solid whose views lose attenuation beyond the volume.
-    fn allows(&self, surround: &SurroundRule) -> Result<()> {
-        let found = if surround.is_none() { "none" } else { "coarse" };
-        let expected = "\"none\", because scene.support looks for a solid whose whole width is visible";
-        ensure(surround.is_none() || !self.is_solid(), "spec", "scene.surround", found, expected)
     }
 }
 
@@ -225,9 +222,8 @@ impl Default for VoxelScene {
 impl VoxelScene {
     /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
-        self.support.validate()?;
         self.surround.validate()?;
-        self.support.allows(&self.surround)?;
+        self.support.validate(&self.surround)?;
         let BoundsSettings { low, high } = self.bounds;
         ensure(low.is_finite(), "spec", "scene.bounds.low", low, "a finite number")?;
         if let Some(high) = high {

@@ -10,11 +10,12 @@
 //! object stays in place.
 
 use crate::calibration::criterion::Level;
-use crate::calibration::search::{LONGEST, Meter, SMALL, inverse};
+use crate::calibration::search::{LONGEST, Meter, SMALL};
 use crate::calibration::{FEWEST, Verdict, Watch, widths};
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Vec3, View, dot, norm, sub};
+use conefield_core::matrix::inverse;
 use conefield_core::scan::Scan;
 use ndarray::{ArrayView2, Zip};
 use serde::Serialize;

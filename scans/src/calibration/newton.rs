@@ -11,8 +11,9 @@
 use crate::calibration::CLEAR;
 use crate::calibration::consistency::Consistency;
 use crate::calibration::parameters::{Correction, Parameter};
-use crate::calibration::search::{Evidence, LONGEST, Meter, REACH, SMALL, damped, inner, inverse};
+use crate::calibration::search::{Evidence, LONGEST, Meter, REACH, SMALL, damped};
 use conefield_core::Result;
+use conefield_core::matrix::{inner, inverse};
 use rayon::prelude::*;
 
 /// How often a step that does not reduce the criterion is cut to a third.
