@@ -57,6 +57,20 @@ impl View {
         }
     }
 
+    /// The same detector in a parallel beam with rays along the unit vector `direction`. Its source is [`FAR`] diagonals of
+    /// the volume away; pixels have the same size where the rays pass the middle of the volume.
+    pub fn parallel(&self, direction: Vec3, volume: &VoxelGrid) -> Self {
+        let behind = dot(sub(self.detector, volume.center), direction);
+        let away = FAR * (norm(volume.size()) + behind.abs());
+        let wide = (away + behind) / away;
+        Self {
+            source: std::array::from_fn(|k| self.detector[k] - (away + behind) * direction[k]),
+            u: self.u.map(|x| x * wide),
+            v: self.v.map(|x| x * wide),
+            ..*self
+        }
+    }
+
     /// The same view with its detector rotated about its centre: right-handed about `u`, `v` and `u × v` (pointing away
     /// from the source). The rotation about `u × v` comes first; each uses the axis before any rotation.
     pub fn tilted(&self, [about_u, about_v, about_normal]: [Radians; 3]) -> Self {
@@ -105,6 +119,11 @@ impl VoxelGrid {
     /// Side lengths in mm.
     pub fn size(&self) -> Vec3 {
         std::array::from_fn(|k| self.shape[k] as f64 * self.spacing[k])
+    }
+
+    /// Whether a source is so far away that its beam counts as parallel.
+    pub fn is_far(&self, source: Vec3) -> bool {
+        norm(sub(source, self.center)) > 0.5 * FAR * norm(self.size())
     }
 
     /// A grid of the same box with `n` voxels along its longest side and nearly cubic voxels.
@@ -185,10 +204,14 @@ pub struct Geometry {
     pub volume: VoxelGrid,
 }
 
+/// Diagonals of a volume between it and the source of a parallel beam ([`crate::orbit::CircularOrbit::parallel`]): across
+/// the volume, rays come together by 1/100 000.
+pub const FAR: f64 = 1e5;
+
 /// A straight line from the source: `origin + t·direction`, `t` in mm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ray {
-    /// The source.
+    /// The source; for a parallel beam, a point of the ray before the volume.
     pub origin: Vec3,
     /// Unit vector towards the pixel.
     pub direction: Vec3,
@@ -225,7 +248,19 @@ impl Geometry {
         let v = &self.views[view];
         let d = sub(v.pixel(self.detector, row as f64, column as f64), v.source);
         let len = norm(d);
-        Ray { origin: v.source, direction: d.map(|x| x / len) }
+        let direction = d.map(|x| x / len);
+        if !self.volume.is_far(v.source) {
+            return Ray { origin: v.source, direction };
+        }
+        // Positions along the ray count from a near point: from the source they would round to the size of a voxel.
+        let pixel = v.pixel(self.detector, row as f64, column as f64);
+        let back = dot(sub(pixel, self.volume.center), direction) + 2.0 * norm(self.volume.size());
+        Ray { origin: std::array::from_fn(|k| pixel[k] - back * direction[k]), direction }
+    }
+
+    /// Whether the beam of `view` is parallel.
+    pub fn is_parallel(&self, view: usize) -> bool {
+        self.volume.is_far(self.views[view].source)
     }
 
     /// Number of measured values, or `None` if it overflows `usize`.
@@ -338,6 +373,7 @@ pub fn norm(a: Vec3) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::orbit::{Beam, CircularOrbit};
 
     fn mm(x: f64) -> Millimetres {
         Millimetres(x)
@@ -388,6 +424,35 @@ mod tests {
         assert_eq!(r.clip(g.volume.bounds()), Some([96.0, 104.0]));
         let miss = Ray { origin: [100.0, 10.0, 0.0], direction: [-1.0, 0.0, 0.0] };
         assert_eq!(miss.clip(g.volume.bounds()), None);
+    }
+
+    /// The rays of a parallel beam, against lines of one direction through the pixels.
+    #[test]
+    fn a_parallel_beam_has_parallel_rays_of_its_pixels_pitch() {
+        let volume = VoxelGrid { shape: [40, 30, 20], spacing: [1.0; 3], center: [3.0, -2.0, 1.0] };
+        let orbit = CircularOrbit::parallel(&volume, [0.7, 1.3], [2.0, -4.0], vec![0.3, 2.0]);
+        let g = Geometry { detector: [16, 24], views: orbit.views(), volume };
+        g.validate("test").unwrap();
+        for (view, a) in [0.3f64, 2.0].into_iter().enumerate() {
+            assert!(g.is_parallel(view));
+            let (s, c) = a.sin_cos();
+            for (row, column) in [(0, 0), (15, 23), (3, 11)] {
+                let ray = g.ray(view, row, column);
+                let off = (ray.direction[0] + c).hypot(ray.direction[1] + s).hypot(ray.direction[2]);
+                assert!(off < 1e-5 && norm(ray.origin) < 200.0, "{off} {ray:?}");
+                // At the axis.
+                let t = -(ray.origin[0] * c + ray.origin[1] * s) / (ray.direction[0] * c + ray.direction[1] * s);
+                let p = ray.at(t);
+                let want = [1.3 * (column as f64 - 11.5) - 4.0, -0.7 * (row as f64 - 7.5) - 2.0];
+                let found = [c * p[1] - s * p[0], p[2]];
+                assert!(norm([found[0] - want[0], found[1] - want[1], 0.0]) < 1e-6, "{found:?} {want:?}");
+            }
+        }
+        let fitted = CircularOrbit::fit(&g.views).unwrap();
+        assert_eq!(fitted.beam(&volume), Beam::Parallel);
+        let at_axis = fitted.at_axis();
+        let apart = (0..2).map(|k| (at_axis.0[k] - [0.7, 1.3][k]).abs() + (at_axis.1[k] - [2.0, -4.0][k]).abs());
+        assert!(apart.fold(0.0, f64::max) < 1e-6, "{at_axis:?}");
     }
 
     #[test]

@@ -1,7 +1,26 @@
 //! Circular orbits of source and detector, described by a few numbers, and the arcs that views cover.
 
-use crate::geometry::{Millimetres, Radians, View, dot, norm, sub};
+use crate::geometry::{FAR, Millimetres, Radians, View, VoxelGrid, dot, norm, sub};
+use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
+
+/// How the rays of a view run.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Beam {
+    /// From one source.
+    #[default]
+    Cone,
+    /// In one direction; see [`CircularOrbit::parallel`].
+    Parallel,
+}
+
+impl Beam {
+    /// Whether it is a cone.
+    pub fn is_cone(&self) -> bool {
+        *self == Self::Cone
+    }
+}
 
 /// Views on one circle about z, all with the same distances and detector.
 #[derive(Debug, Clone, PartialEq)]
@@ -22,6 +41,26 @@ pub struct CircularOrbit {
 const TOLERANCE: f64 = 1e-9;
 
 impl CircularOrbit {
+    /// A parallel beam of rays from the directions `angles` (radians) through a volume: pixels of `pixel` mm, shifted by
+    /// `offset`, both at the axis. Its source is [`FAR`] diagonals of the volume away.
+    pub fn parallel(volume: &VoxelGrid, pixel: [f64; 2], offset: [f64; 2], angles: Vec<f64>) -> Self {
+        let diagonal = norm(volume.size()) + norm(volume.center);
+        let (dso, dsd) = (FAR * diagonal, (FAR + 1.0) * diagonal);
+        let [pixel, offset] = [pixel, offset].map(|x| x.map(|x| x * dsd / dso));
+        Self { dso, dsd, pixel, offset, angles }
+    }
+
+    /// How its rays run across `volume`.
+    pub fn beam(&self, volume: &VoxelGrid) -> Beam {
+        if volume.is_far([self.dso, 0.0, 0.0]) { Beam::Parallel } else { Beam::Cone }
+    }
+
+    /// Pixel size and shift of the detector along v and u, projected to the axis, mm.
+    pub fn at_axis(&self) -> ([f64; 2], [f64; 2]) {
+        let scaled = |x: [f64; 2]| x.map(|x| x * self.dso / self.dsd);
+        (scaled(self.pixel), scaled(self.offset))
+    }
+
     /// The view at `angle` (radians).
     pub fn view(&self, angle: f64) -> View {
         let mm = |x: [f64; 2]| x.map(Millimetres);

@@ -6,7 +6,7 @@
 //! the unit of `image`: see [`read_naf`].
 
 use crate::input::read_bytes;
-use crate::orbit::common_orbit;
+use crate::orbit::{common_orbit, written};
 use crate::pickle::{self, Item, Out, Pickle};
 use crate::scan::DataSet;
 use crate::unit::{self, Reading, Units};
@@ -14,7 +14,7 @@ use crate::{rays, text, write_atomic};
 use conefield_core::error::ensure;
 use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
-use conefield_core::orbit::CircularOrbit;
+use conefield_core::orbit::{Beam, CircularOrbit};
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array3, Ix3};
@@ -146,6 +146,7 @@ pub(crate) fn read(path: &Path, with_test: bool) -> Result<DataSet> {
 /// The entries shared by all views, in mm.
 #[derive(Clone)]
 struct Description {
+    beam: Beam,
     dso: f64,
     dsd: f64,
     detector: [usize; 2],
@@ -159,10 +160,11 @@ impl Description {
     fn read(top: &Item) -> Result<Self> {
         check_keys(top)?;
         let mode = required(top, "mode")?;
-        if mode.text()? != "cone" {
-            let expected = "\"cone\": rays must meet in one source";
-            return Err(mode.invalid(format!("\"{}\"", mode.text()?), expected));
-        }
+        let beam = match mode.text()? {
+            "cone" => Beam::Cone,
+            "parallel" => Beam::Parallel,
+            other => return Err(mode.invalid(format!("\"{other}\""), "\"cone\" or \"parallel\"")),
+        };
         let distance = |key: &str| -> Result<f64> {
             let item = required(top, key)?;
             positive(&item, [item.number()?], "a positive finite distance in mm").map(|[x]| x)
@@ -170,6 +172,7 @@ impl Description {
         let (detector, voxels) = (required(top, "nDetector")?, required(top, "nVoxel")?);
         let (pixel, spacing) = (required(top, "dDetector")?, required(top, "dVoxel")?);
         Ok(Self {
+            beam,
             dso: distance("DSO")?,
             dsd: distance("DSD")?,
             detector: counts(&detector, "pixels along [v, u]")?,
@@ -188,8 +191,11 @@ impl Description {
     }
 
     fn orbit(&self, angles: Vec<f64>) -> CircularOrbit {
-        let offset = [-self.offset[0], self.offset[1]];
-        CircularOrbit { dso: self.dso, dsd: self.dsd, pixel: self.pixel, offset, angles }
+        let (pixel, offset) = (self.pixel, [-self.offset[0], self.offset[1]]);
+        match self.beam {
+            Beam::Cone => CircularOrbit { dso: self.dso, dsd: self.dsd, pixel, offset, angles },
+            Beam::Parallel => CircularOrbit::parallel(&self.grid, pixel, offset, angles),
+        }
     }
 
     /// Geometry and projections of `train` or `val`. Checks shapes before it decodes a number.
@@ -346,18 +352,19 @@ pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volu
     }
     let ints = |xs: &[usize]| Out::List(xs.iter().map(|x| Out::Int(*x)).collect());
     let floats = |xs: &[f64]| Out::List(xs.iter().map(|x| Out::Float(*x)).collect());
+    let (mode, [dso, dsd], [pixel, offset]) = written(&orbit, grid);
     let mut entries = vec![
-        ("mode", Out::Text("cone")),
+        ("mode", Out::Text(mode)),
         ("filter", Out::None),
         ("accuracy", Out::Float(0.5)),
-        ("DSO", Out::Float(orbit.dso)),
-        ("DSD", Out::Float(orbit.dsd)),
+        ("DSO", Out::Float(dso)),
+        ("DSD", Out::Float(dsd)),
         ("nDetector", ints(&g.detector)),
-        ("dDetector", floats(&orbit.pixel)),
+        ("dDetector", floats(&pixel)),
         ("nVoxel", ints(&grid.shape)),
         ("dVoxel", floats(&grid.spacing)),
         ("offOrigin", floats(&grid.center)),
-        ("offDetector", floats(&[0.0 - orbit.offset[0], orbit.offset[1]])),
+        ("offDetector", floats(&[0.0 - offset[0], offset[1]])),
         ("totalAngle", Out::Float(total(&orbit.angles).to_degrees())),
         ("startAngle", Out::Float(orbit.angles.first().copied().unwrap_or(0.0).to_degrees())),
         ("randomAngle", Out::Bool(false)),

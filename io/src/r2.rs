@@ -6,7 +6,7 @@
 //! lengths, whatever their unit.
 
 use crate::input::LONGEST_TEXT;
-use crate::orbit::common_orbit;
+use crate::orbit::{common_orbit, written};
 use crate::scan::DataSet;
 use crate::text::{self, Notation, parse, shortened, unread};
 use crate::unit::{self, Reading, Units};
@@ -14,7 +14,7 @@ use crate::{ScanSize, folder, memory, npy, rays, write_atomic, write_folder_atom
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::geometry::{Geometry, VoxelGrid};
-use conefield_core::orbit::CircularOrbit;
+use conefield_core::orbit::{Beam, CircularOrbit};
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
@@ -45,7 +45,7 @@ struct Frame {
 #[derive(Deserialize)]
 #[allow(non_snake_case)]
 struct Scanner {
-    mode: String,
+    mode: Beam,
     DSD: f64,
     DSO: f64,
     nDetector: [usize; 2],
@@ -129,22 +129,19 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let place = file.display().to_string();
     let meta: Meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
     let s = &meta.scanner;
-    if s.mode != "cone" {
-        let what = format!("{place}: scanner.mode: \"{}\"", s.mode);
-        return Err(Error::unsupported(what, "only \"cone\" is understood: rays must meet in one source"));
-    }
     for (field, x) in [("scanner.DSO", s.DSO), ("scanner.DSD", s.DSD)] {
         ensure(x.is_finite() && x > 0.0, &place, field, x, "a positive finite distance")?;
     }
     let pixel = each(&place, ["Detector", "[v, u]"], s.nDetector, s.sDetector, s.dDetector)?;
     let spacing = each(&place, ["Voxel", "[x, y, z]"], s.nVoxel, s.sVoxel, s.dVoxel)?;
     let grid = VoxelGrid { shape: s.nVoxel, spacing, center: s.offOrigin };
-    let orbit = |frames: &[Frame]| CircularOrbit {
-        dso: s.DSO,
-        dsd: s.DSD,
-        pixel,
-        offset: [-s.offDetector[1], s.offDetector[0]],
-        angles: frames.iter().map(|f| f.angle).collect(),
+    let orbit = |frames: &[Frame]| {
+        let offset = [-s.offDetector[1], s.offDetector[0]];
+        let angles = frames.iter().map(|f| f.angle).collect();
+        match s.mode {
+            Beam::Cone => CircularOrbit { dso: s.DSO, dsd: s.DSD, pixel, offset, angles },
+            Beam::Parallel => CircularOrbit::parallel(&grid, pixel, offset, angles),
+        }
     };
     let scan = |field: &str, frames: &[Frame]| -> Result<Scan> {
         let geometry = Geometry { detector: s.nDetector, views: orbit(frames).views(), volume: grid };
@@ -295,18 +292,19 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
         let frame = |(i, a): (usize, &f64)| json!({ "file_path": format!("{split}/{split}_{i:04}.npy"), "angle": a });
         angles.iter().enumerate().map(frame).collect()
     };
+    let (mode, [dso, dsd], [pixel, offset]) = written(&orbit, grid);
     let mut meta = json!({
         "scanner": {
-            "mode": "cone",
+            "mode": mode,
             "filter": null,
-            "DSD": orbit.dsd / mm,
-            "DSO": orbit.dso / mm,
+            "DSD": dsd / mm,
+            "DSO": dso / mm,
             "nDetector": g.detector,
-            "sDetector": [orbit.pixel[0] * g.detector[0] as f64 / mm, orbit.pixel[1] * g.detector[1] as f64 / mm],
+            "sDetector": [pixel[0] * g.detector[0] as f64 / mm, pixel[1] * g.detector[1] as f64 / mm],
             "nVoxel": grid.shape,
             "sVoxel": size.map(|s| s / mm),
             "offOrigin": grid.center.map(|c| c / mm),
-            "offDetector": [orbit.offset[1] / mm, -orbit.offset[0] / mm],
+            "offDetector": [offset[1] / mm, -offset[0] / mm],
             "accuracy": 0.5,
             "totalAngle": 360.0,
             "startAngle": orbit.angles.first().copied().unwrap_or(0.0).to_degrees(),

@@ -12,7 +12,7 @@
 //!
 //! [circle]                           # or [vectors] or [rtk]
 //! dso = 500.0                        # source to rotation axis
-//! dsd = 800.0                        # source to detector plane
+//! dsd = 800.0                        # source to detector plane; or, in place of both: beam = "parallel"
 //! pixel = { u = 2.0, v = 2.0 }
 //! offset = { u = 0.0, v = 0.0 }      # shift of the detector along its columns' and its rows' direction
 //! tilt_deg = { u = 0.0, v = 0.0, normal = 0.0 }   # turns of the detector about its own axes; see View::tilted
@@ -38,7 +38,8 @@
 //! ```
 //!
 //! `[vectors]` has `cone_vec = [[...], ...]`, ASTRA's twelve numbers per view: source, detector centre, the step to the
-//! next column (u) and to the next row (v), all in mm here, or the name of a file with them. `[rtk]` has `file`,
+//! next column (u) and to the next row (v), all in mm here, or the name of a file with them. `parallel_vec` has the
+//! direction of the rays in place of the source. `[rtk]` has `file`,
 //! `pixel` and `offset`; see [`read_rtk_geometry`]. `[cil]` has the `file` that CIL wrote. All lengths are mm; angles
 //! are degrees, as their keys say.
 //!
@@ -58,8 +59,8 @@ use crate::table::{self, Numbers};
 use crate::text::{self, described};
 use crate::{ScanSize, folder, foreign, memory, scan_folder};
 use conefield_core::error::ensure;
-use conefield_core::geometry::{Geometry, Radians, View, VoxelGrid};
-use conefield_core::orbit::CircularOrbit;
+use conefield_core::geometry::{Geometry, Radians, View, VoxelGrid, norm};
+use conefield_core::orbit::{Beam, CircularOrbit};
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis};
@@ -228,8 +229,10 @@ struct TiltTable {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Circle {
-    dso: f64,
-    dsd: f64,
+    #[serde(default)]
+    beam: Beam,
+    dso: Option<f64>,
+    dsd: Option<f64>,
     pixel: Uv,
     #[serde(default)]
     offset: Uv,
@@ -246,7 +249,8 @@ struct Circle {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Vectors {
-    cone_vec: Numbers<Vec<f64>>,
+    cone_vec: Option<Numbers<Vec<f64>>>,
+    parallel_vec: Option<Numbers<Vec<f64>>>,
 }
 
 #[derive(Deserialize)]
@@ -447,6 +451,7 @@ fn open_beam(place: &str, d: &Description, i0: Option<I0>, floor: Option<f64>) -
 }
 
 fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Vec<View>> {
+    let volume = &d.volume;
     let fits = |field: &str, n: usize| {
         let expected = format!("{count}, one for each view in the projections");
         ensure(n == count, place, field, format!("{n} of them"), expected)
@@ -455,12 +460,7 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
         (Some(c), None, None, None) => {
             let angles = angles(folder, place, c, count)?;
             fits("circle.angles_deg", angles.len())?;
-            for (field, x) in [("circle.dso", c.dso), ("circle.dsd", c.dsd)] {
-                ensure(x.is_finite() && x > 0.0, place, field, x, "a positive finite length in mm")?;
-            }
-            let expected =
-                format!("more than the {} of dso: the detector lies behind the axis (are they swapped?)", c.dso);
-            ensure(c.dsd > c.dso, place, "circle.dsd", c.dsd, expected)?;
+            let distances = distances(place, c)?;
             lengths(place, "circle", c.pixel, c.offset)?;
             let (pixel, offset) = ([c.pixel.v, c.pixel.u], [c.offset.v, c.offset.u]);
             let tilt = [("u", c.tilt_deg.u), ("v", c.tilt_deg.v), ("normal", c.tilt_deg.normal)];
@@ -469,13 +469,23 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
                 ensure(fits, place, &format!("circle.tilt_deg.{axis}"), x, "degrees between -90 and 90")?;
             }
             let tilt = tilt.map(|(_, x)| Radians(x.to_radians()));
-            let orbit = CircularOrbit { dso: c.dso, dsd: c.dsd, pixel, offset, angles };
+            let orbit = match distances {
+                Some([dso, dsd]) => CircularOrbit { dso, dsd, pixel, offset, angles },
+                None => CircularOrbit::parallel(volume, pixel, offset, angles),
+            };
             Ok(orbit.views().into_iter().map(|v| v.tilted(tilt)).collect())
         }
         (None, Some(v), None, None) => {
-            let field = "vectors.cone_vec";
+            let (field, rows) = match (&v.cone_vec, &v.parallel_vec) {
+                (Some(rows), None) => ("vectors.cone_vec", rows),
+                (None, Some(rows)) => ("vectors.parallel_vec", rows),
+                (found, _) => {
+                    let found = if found.is_some() { "both" } else { "nothing" };
+                    return Err(Error::invalid(place, "vectors", found, "one of cone_vec and parallel_vec"));
+                }
+            };
             let read;
-            let rows = match &v.cone_vec {
+            let rows = match rows {
                 Numbers::List(rows) => rows,
                 Numbers::File(name) => {
                     read = table::read(folder, place, field, name, VECTOR)?;
@@ -486,7 +496,14 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
                 let field = format!("{field}[{i}]");
                 ensure(n.len() == VECTOR, place, &field, format!("{} numbers", n.len()), format!("{VECTOR}"))?;
                 let part = |k: usize| [n[k], n[k + 1], n[k + 2]];
-                Ok(View { source: part(0), detector: part(3), u: part(6), v: part(9) })
+                let view = View { source: part(0), detector: part(3), u: part(6), v: part(9) };
+                if v.cone_vec.is_some() {
+                    return Ok(view);
+                }
+                let long = norm(view.source);
+                let expected = "a direction: three finite numbers, not all 0";
+                ensure(long.is_finite() && long > 0.0, place, &field, format!("{:?}", view.source), expected)?;
+                Ok(view.parallel(view.source.map(|x| x / long), volume))
             };
             let views = rows.iter().enumerate().map(view).collect::<Result<Vec<_>>>()?;
             fits(field, views.len())?;
@@ -507,6 +524,25 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
         (None, None, None, None) => Err(Error::invalid(place, "circle", "nothing", GEOMETRIES)),
         _ => Err(Error::invalid(place, "circle", "several geometries", GEOMETRIES)),
     }
+}
+
+/// DSO and DSD of a cone beam; `None` for a parallel one.
+fn distances(place: &str, c: &Circle) -> Result<Option<[f64; 2]>> {
+    let all = [("circle.dso", c.dso), ("circle.dsd", c.dsd)];
+    if c.beam == Beam::Parallel {
+        let said = all.iter().find_map(|(field, x)| x.map(|x| (field, x)));
+        let expected = "no distance: a parallel beam has no source";
+        return said.map_or(Ok(None), |(field, x)| Err(Error::invalid(place, *field, x, expected)));
+    }
+    let expected = "a positive finite length in mm, or beam = \"parallel\"";
+    for (field, x) in all {
+        let found = x.map_or("nothing".into(), |x| x.to_string());
+        ensure(x.is_some_and(|x| x.is_finite() && x > 0.0), place, field, found, expected)?;
+    }
+    let distances @ [dso, dsd] = all.map(|(_, x)| x.unwrap_or_default());
+    let expected = format!("more than the {dso} of dso: the detector lies behind the axis (are they swapped?)");
+    ensure(dsd > dso, place, "circle.dsd", dsd, expected)?;
+    Ok(Some(distances))
 }
 
 fn lengths(place: &str, table: &str, pixel: Uv, offset: Uv) -> Result<()> {

@@ -18,8 +18,8 @@ def _voxels(volume: Any, spacing: Any, center: Any) -> tuple[list[int], tuple, t
 
 def circular(
     *,
-    dso: float,
-    dsd: float,
+    dso: float | None = None,
+    dsd: float | None = None,
     angles: Any,
     detector: Any,
     pixel: Any,
@@ -37,7 +37,8 @@ def circular(
     Parameters
     ----------
     dso, dsd
-        Source to rotation axis, and source to detector plane, mm.
+        Source to rotation axis, and source to detector plane, mm. Without both the beam is parallel: all rays of a view run
+        along ``(-cos a, -sin a, 0)``.
     angles
         One per view, radians; an integer means this many even steps over the circle from 0.
     detector
@@ -55,8 +56,8 @@ def circular(
     if isinstance(angles, (int, np.integer)):
         angles = np.arange(int(angles)) * (2 * np.pi / max(int(angles), 1))
     return Geometry.circular(
-        float(dso),
-        float(dsd),
+        None if dso is None else float(dso),
+        None if dsd is None else float(dsd),
         as_floats(angles, "angles", 1, np.float64),
         counts(detector, "detector", 2),
         pair(pixel, "pixel"),

@@ -21,8 +21,8 @@ class Geometry:
 
     @staticmethod
     def circular(
-        dso: float,
-        dsd: float,
+        dso: float | None,
+        dsd: float | None,
         angles: NDArray[np.float64],
         detector: list[int],
         pixel: tuple[float, float],

@@ -37,8 +37,8 @@ impl Geometry {
     #[staticmethod]
     fn circular(
         py: Python<'_>,
-        dso: f64,
-        dsd: f64,
+        dso: Option<f64>,
+        dsd: Option<f64>,
         angles: PyReadonlyArray1<'_, f64>,
         detector: [usize; 2],
         pixel: [f64; 2],
@@ -47,17 +47,26 @@ impl Geometry {
         volume: ([usize; 3], Vec3, Vec3),
     ) -> PyResult<Self> {
         let angles = owned(&angles).to_vec();
-        let all = [&[dso, dsd][..], &pixel, &offset, &tilt, &angles].concat();
+        let distances: Vec<f64> = [dso, dsd].into_iter().flatten().collect();
+        let all = [&distances[..], &pixel, &offset, &tilt, &angles].concat();
         let field = "a length or an angle";
         ensure(all.iter().all(|x| x.is_finite()), "geometry", field, "a number that is not finite", "finite numbers")
             .or_raise(py)?;
-        ensure(dso > 0.0, "geometry", "dso", dso, "a distance above 0").or_raise(py)?;
-        ensure(dsd > 0.0, "geometry", "dsd", dsd, "a distance above 0").or_raise(py)?;
-        let orbit = CircularOrbit { dso, dsd, pixel, offset, angles };
+        for (name, x) in [("dso", dso), ("dsd", dsd)] {
+            let found = x.map_or("None".into(), |x| x.to_string());
+            let expected = "a distance above 0, or None for both: a parallel beam";
+            let one = dso.is_some() != dsd.is_some() && x.is_none();
+            ensure(!one && x.is_none_or(|x| x > 0.0), "geometry", name, found, expected).or_raise(py)?;
+        }
+        let (shape, spacing, center) = volume;
+        let volume = VoxelGrid { shape, spacing, center };
+        let orbit = match (dso, dsd) {
+            (Some(dso), Some(dsd)) => CircularOrbit { dso, dsd, pixel, offset, angles },
+            _ => CircularOrbit::parallel(&volume, pixel, offset, angles),
+        };
         let tilt = tilt.map(Radians);
         let views = orbit.views().into_iter().map(|v| v.tilted(tilt)).collect();
-        let (shape, spacing, center) = volume;
-        Self::checked(py, geometry::Geometry { detector, views, volume: VoxelGrid { shape, spacing, center } })
+        Self::checked(py, geometry::Geometry { detector, views, volume })
     }
 
     /// Views given by their vectors, `[view, 12]`.

@@ -150,3 +150,18 @@ def test_torch_trains_an_unrolled_network_through_it():
     assert all(p.grad.abs().max() > 0 for p in network.parameters())
     # Better than an empty volume.
     assert losses[-1] < 0.5 * losses[0] and losses[-1] < 0.5 * truth.square().mean().item(), losses
+
+
+def test_a_parallel_beam_sums_along_its_direction():
+    volume = np.zeros((8, 6, 4), np.float32)
+    volume[3, 2, 1] = 2.0
+    common = dict(angles=[0.0, np.pi / 2], detector=(4, 8), pixel=1, volume=(8, 6, 4))
+    geometry = conefield.circular(**common)
+    images = conefield.project(volume, geometry)
+    # Along x: columns are y, from -3.5 on; along y: columns are -x. Rows run towards -z.
+    assert images[0].argmax() == np.ravel_multi_index((2, 3), (4, 8))
+    assert images[1].argmax() == np.ravel_multi_index((2, 4), (4, 8))
+    assert np.allclose([images[0].max(), images[1].max()], 2.0, atol=1e-3)
+    assert np.allclose(images.sum(axis=(1, 2)), 2.0, atol=1e-3)
+    with pytest.raises(conefield.InvalidError, match="dsd"):
+        conefield.circular(dso=9, **common)

@@ -185,6 +185,8 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     scan.validate("scan")?;
     let n = scan.geometry.views.len();
     ensure(n >= FEWEST, "scan", "views", n, format!("at least {FEWEST}, some of which are held out"))?;
+    let cone = (0..n).all(|view| !scan.geometry.is_parallel(view));
+    ensure(cone, "scan", "views", "a parallel beam", "a cone beam: calibration moves its source and detector")?;
     let mut asked = settings.parameters.clone();
     asked.sort_unstable();
     asked.dedup();

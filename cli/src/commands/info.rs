@@ -210,12 +210,16 @@ pub fn in_short(scan: &Scan, survey: &Survey, counts: Option<&CountsReport>) -> 
         ),
         (
             "source",
-            format!(
-                "{} mm to the axis, {} mm to the detector, magnification {}{orbit}",
-                short(setup.source_to_axis_mm),
-                short(setup.source_to_detector_mm),
-                short(setup.magnification),
-            ),
+            if g.is_parallel(0) {
+                format!("none: a parallel beam{orbit}")
+            } else {
+                format!(
+                    "{} mm to the axis, {} mm to the detector, magnification {}{orbit}",
+                    short(setup.source_to_axis_mm),
+                    short(setup.source_to_detector_mm),
+                    short(setup.magnification),
+                )
+            },
         ),
         (
             "arc",
@@ -273,13 +277,19 @@ fn title(path: &Path, s: &Scan, survey: &Survey) -> String {
     let setup = &survey.setup;
     let g = &s.geometry;
     format!(
-        "{}: {} views, detector {} x {}, source to axis {:.1} mm, to detector {:.1} mm; {:.1} % of the volume covered",
+        "{}: {} views, detector {} x {}, {}; {:.1} % of the volume covered",
         name.unwrap_or_default(),
         g.views.len(),
         g.detector[0],
         g.detector[1],
-        setup.source_to_axis_mm,
-        setup.source_to_detector_mm,
+        if g.is_parallel(0) {
+            "a parallel beam".into()
+        } else {
+            format!(
+                "source to axis {:.1} mm, to detector {:.1} mm",
+                setup.source_to_axis_mm, setup.source_to_detector_mm
+            )
+        },
         100.0 * survey.coverage.complete,
     )
 }

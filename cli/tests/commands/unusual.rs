@@ -211,3 +211,43 @@ fn views_that_are_no_circle_are_read_drawn_and_reconstructed() {
     args.extend(SMALL);
     conefield(&args).assert().success();
 }
+
+/// A parallel beam over half a turn, through simulation, scan folder, R2-Gaussian's format and back, and every kind of
+/// method.
+#[test]
+fn a_parallel_beam_goes_through_every_command() {
+    let bench = Bench::new();
+    let protocol = "beam = 'parallel'\ndetector = [16, 24]\nextent = { pixel = [4.0, 4.0] }\n\
+                    angles = { even = { views = 30, arc_deg = 180.0 } }\n";
+    fs::write(bench.at("beam.toml"), protocol).unwrap();
+    let (truth, scan, other) = (bench.at("truth.mha"), bench.at("beam"), bench.at("r2"));
+    done(&["simulate", &truth, "-o", &scan, "--protocol", &bench.at("beam.toml")]);
+    let said = done(&["info", &scan]);
+    assert!(said.contains("none: a parallel beam"), "{said}");
+    done(&["convert", &scan, "-o", &other, "--format", "r2"]);
+    let score = |scan: &str, spec: &[&str]| {
+        let run = bench.at("run");
+        done(&[&["reconstruct", scan, "-o", &run, "--force", "--spec"], spec].concat());
+        let found = json(&["evaluate", &format!("{run}/volume.nii.gz"), &truth, "--json"]);
+        found["psnr"].as_f64().unwrap()
+    };
+    let [own, back] = [&scan, &other].map(|scan| score(scan, &["fdk"]));
+    assert!((own - back).abs() < 0.01, "{own} and {back} dB");
+    let empty =
+        20.0 * (volume().data.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / 756.0).sqrt().recip().log10() - 4.4;
+    for spec in
+        [&["fdk"][..], &["os-sart", "--steps", "5"], &["fista-tv", "--steps", "5"], &["gaussians", "--steps", "60"]]
+    {
+        let found = score(&scan, spec);
+        println!("{spec:?}: {found:.2} dB, an empty volume {empty:.2} dB");
+        assert!(found > empty + 6.0, "{spec:?}: {found}");
+    }
+    let field = score(&scan, &[&["fast"][..], &SMALL[..6], &["--steps", "150"]].concat());
+    println!("a field: {field:.2} dB");
+    assert!(field > empty + 4.0, "{field}");
+    let e = refused(1, &["calibrate", &scan, "-o", &bench.at("calibrated")]);
+    assert!(e.contains("a parallel beam"), "{e}");
+    fs::write(bench.at("both.toml"), format!("dso = 500.0\n{protocol}")).unwrap();
+    let e = refused(1, &["simulate", &truth, "-o", &bench.at("x"), "--protocol", &bench.at("both.toml")]);
+    assert!(e.contains("dso: found 500") && e.contains("no source"), "{e}");
+}

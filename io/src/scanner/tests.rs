@@ -230,3 +230,43 @@ fn hostile_descriptions_and_files_are_refused_in_words() {
     with("views/v1.tif", npy_bytes("<f4", false, "(4, 6)", &[255; 96]), &["v1.tif", "data[0, 0]", "NaN"]);
     with("views/v1.tif", npy_bytes("<u2", false, "(48,)", &[1; 96]), &["v1.tif", "3 axes", "2 axes"]);
 }
+
+/// A circle and vectors of a parallel beam describe the same rays; what a cone needs is refused, and the reverse.
+#[test]
+fn parallel_beams_have_no_distances() {
+    let dir = tempfile::tempdir().unwrap();
+    let values: Vec<u8> = (0..2 * 3 * 4).flat_map(|i| (i as f32).to_le_bytes()).collect();
+    fs::write(dir.path().join("p.npy"), npy_bytes("<f4", false, "(2, 3, 4)", &values)).unwrap();
+    let read = |geometry: &str| {
+        let text = format!(
+            "format = \"conefield-scanner\"\nversion = 1\n[files]\nprojections = \"p.npy\"\n{geometry}\n\
+             [values]\nkind = \"line-integrals\"\n[volume]\nshape = [6, 5, 4]\nspacing = [1.0, 1.0, 1.0]\n"
+        );
+        let path = dir.path().join("scanner.toml");
+        fs::write(&path, text).unwrap();
+        read_scanner(path, None)
+    };
+    let circle = "[circle]\nbeam = \"parallel\"\npixel = { u = 2.0, v = 0.5 }\noffset = { u = 0.25, v = 0.0 }\n\
+                  step_deg = 90.0\ndirection = \"counterclockwise\"\n";
+    let scan = read(circle).unwrap();
+    // Directions of the rays, detector centres, u and v, as ASTRA has them.
+    let vectors = "[vectors]\nparallel_vec = [[-3, 0, 0, 0, 0.25, 0, 0, 2, 0, 0, 0, -0.5],\n\
+                   [0, -1, 0, -0.25, 0, 0, -2, 0, 0, 0, 0, -0.5]]\n";
+    let same = read(vectors).unwrap();
+    for (view, row, column) in [(0, 0, 0), (0, 2, 3), (1, 1, 2)] {
+        let [a, b] = [&scan, &same].map(|s| s.geometry.ray(view, row, column));
+        let off = norm([0, 1, 2].map(|k| a.direction[k] - b.direction[k]));
+        // Both through the same point before the volume, on lines of the same direction.
+        let along = (0..3).map(|k| (b.origin[k] - a.origin[k]) * a.direction[k]).sum::<f64>();
+        let apart = norm([0, 1, 2].map(|k| b.origin[k] - a.origin[k] - along * a.direction[k]));
+        assert!(off < 2e-5 && apart < 1e-3, "{view} {row} {column}: {off} {apart}");
+        assert!(scan.geometry.is_parallel(view) && same.geometry.is_parallel(view));
+    }
+    let refused = |geometry: String, all: &[&str]| says(read(&geometry), all);
+    refused(circle.replace("step_deg", "dso = 100.0\nstep_deg"), &["circle.dso", "found 100", "no source"]);
+    refused(circle.replace("beam = \"parallel\"\n", ""), &["circle.dso", "found nothing", "beam = \"parallel\""]);
+    refused(circle.replace("\"parallel\"", "\"fan\""), &["scanner.toml", "fan", "parallel"]);
+    refused(vectors.replace("[-3, 0, 0,", "[0, 0, 0,"), &["parallel_vec[0]", "a direction"]);
+    refused(vectors.replace("parallel_vec", "cone_vec"), &["views[0]"]);
+    refused("[vectors]\n".into(), &["vectors", "found nothing", "one of cone_vec and parallel_vec"]);
+}

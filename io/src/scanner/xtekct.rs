@@ -81,7 +81,7 @@ pub(super) fn description(path: &Path) -> Result<Description> {
         _version: 0,
         files: Files { projections: projections(&keys, path, count, &mut remarks), flat: None, dark: None },
         circle: None,
-        vectors: Some(Vectors { cone_vec: Numbers::List(cone_vec) }),
+        vectors: Some(Vectors { cone_vec: Some(Numbers::List(cone_vec)), parallel_vec: None }),
         rtk: None,
         cil: None,
         layout: LayoutTable::default(),

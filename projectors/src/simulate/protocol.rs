@@ -1,8 +1,9 @@
 //! Settings of a simulated scan.
 
 use super::noise::DetectorNoise;
-use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::geometry::{Geometry, Radians, VoxelGrid};
+use conefield_core::orbit::{Beam, CircularOrbit};
 use conefield_core::scan::Unit;
 use serde::{Deserialize, Serialize};
 
@@ -16,9 +17,14 @@ pub struct Protocol {
     /// Unit of all lengths below, and of the volume's values (per unit).
     #[serde(default)]
     pub unit: Unit,
+    /// How the rays run. A parallel beam has neither `dso` nor `dsd`.
+    #[serde(default, skip_serializing_if = "Beam::is_cone")]
+    pub beam: Beam,
     /// Distance from the source to the rotation axis.
+    #[serde(default)]
     pub dso: f64,
     /// Distance from the source to the detector plane.
+    #[serde(default)]
     pub dsd: f64,
     /// Detector rows and columns.
     pub detector: [usize; 2],
@@ -97,6 +103,7 @@ impl Protocol {
         let side = grid.size().into_iter().fold(0.0, f64::max);
         Self {
             unit: Unit { name: "cube half side".into(), mm: side / 2.0 },
+            beam: Beam::Cone,
             dso: 5.0,
             dsd: 7.0,
             detector: [512, 512],
@@ -139,16 +146,15 @@ impl Protocol {
     /// Source, detector and `grid` in mm. Refuses an impossible geometry.
     pub fn geometry(&self, grid: &VoxelGrid) -> Result<Geometry> {
         self.validate()?;
-        let mm = |x: f64| Millimetres(x * self.unit.mm);
+        let mm = |x: f64| x * self.unit.mm;
         let side = self.side();
         let pixel = std::array::from_fn(|k| mm(side[k] / self.detector[k] as f64));
-        let views = self
-            .angles
-            .radians()
-            .into_iter()
-            .map(|a| View::circular(a, mm(self.dso), mm(self.dsd), pixel, self.offset.map(mm)))
-            .collect();
-        let geometry = Geometry { detector: self.detector, views, volume: *grid };
+        let (offset, angles) = (self.offset.map(mm), self.angles.radians().into_iter().map(|a| a.0).collect());
+        let orbit = match self.beam {
+            Beam::Cone => CircularOrbit { dso: mm(self.dso), dsd: mm(self.dsd), pixel, offset, angles },
+            Beam::Parallel => CircularOrbit::parallel(grid, pixel, offset, angles),
+        };
+        let geometry = Geometry { detector: self.detector, views: orbit.views(), volume: *grid };
         geometry.validate("protocol")?;
         Ok(geometry)
     }
@@ -157,14 +163,15 @@ impl Protocol {
         let positive =
             |field: &str, x: f64| ensure(x.is_finite() && x > 0.0, "protocol", field, x, "a positive finite number");
         positive("unit.mm", self.unit.mm)?;
-        positive("dso", self.dso)?;
-        ensure(
-            self.dsd.is_finite() && self.dsd > self.dso,
-            "protocol",
-            "dsd",
-            self.dsd,
-            format!("a detector beyond the axis (more than dso = {})", self.dso),
-        )?;
+        if self.beam.is_cone() {
+            positive("dso", self.dso)?;
+            let expected = format!("a detector beyond the axis (more than dso = {})", self.dso);
+            ensure(self.dsd.is_finite() && self.dsd > self.dso, "protocol", "dsd", self.dsd, expected)?;
+        }
+        let said = [("dso", self.dso), ("dsd", self.dsd)].into_iter().find(|(_, x)| *x != 0.0);
+        if let (Beam::Parallel, Some((field, x))) = (self.beam, said) {
+            return Err(Error::invalid("protocol", field, x, "no distance: a parallel beam has no source"));
+        }
         ensure(
             self.detector.iter().all(|&n| n > 0),
             "protocol",

@@ -355,6 +355,7 @@ fn an_exact_scan_is_reproduced_and_its_mirror_is_not() {
     let volume = Volume::centered(data, [0, 1, 2].map(|k| metres(&scanner["sVoxel"][k]) / 64.0));
     let views = meta["proj_train"].as_array().unwrap();
     let protocol = |sign: f64| Protocol {
+        beam: conefield_core::orbit::Beam::Cone,
         unit: Default::default(),
         dso: metres(&scanner["DSO"]),
         dsd: metres(&scanner["DSD"]),

@@ -269,7 +269,7 @@ fn scale(scan: &Scan, s: &Survey, warn: Warn) {
         return;
     }
     let dso = s.setup.source_to_axis_mm;
-    if !(DISTANCES[0]..=DISTANCES[1]).contains(&dso) {
+    if !scan.geometry.is_parallel(0) && !(DISTANCES[0]..=DISTANCES[1]).contains(&dso) {
         let advice = if dso < DISTANCES[0] {
             "unless this is a micro-CT, check that the lengths are mm and not metres"
         } else {

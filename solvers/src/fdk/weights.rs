@@ -282,7 +282,7 @@ impl FdkOrbit {
         }
         if !first.whole() {
             return match first.arcs.len() {
-                1 if first.covered() < PI => format!("limited arc: {share} ({arc})"),
+                1 if first.covered() < PI - 1e-9 => format!("limited arc: {share} ({arc})"),
                 1 => format!("short scan: {share} ({arc})"),
                 n => format!("{n} arcs: {share} ({arc})"),
             };

@@ -123,6 +123,29 @@ fn means_are_right_for_every_orbit_magnification_and_detector() {
     println!("the worst mean is off by {:.3} %", 100.0 * worst);
 }
 
+/// In a parallel beam, half a turn measures every line once. A detector that is offset by half sees each in one of two
+/// views.
+#[test]
+fn a_parallel_beam_is_backprojected_with_its_scale() {
+    let full = Orbiting { radius: 1e7, magnification: 1.00001, ..CENTRED };
+    for (orbit, kind) in [
+        (full, "full turn"),
+        (full.backwards(), "full turn"),
+        (full.aside(5.2, true), "offset detector"),
+        (full.aside(5.2, false).backwards(), "offset detector"),
+        (Orbiting { arc: PI, views: 360, ..full }, "short scan"),
+        (Orbiting { arc: -PI, views: 360, ..full }, "short scan"),
+        (Orbiting { arc: 1.2 * PI, ..full }, "short scan"),
+    ] {
+        let scan = scan(orbit);
+        assert!(scan.geometry.is_parallel(0));
+        let (volume, heard) = fdk(&scan, "");
+        println!("{orbit:?}: {:?}", means(&volume));
+        assert!(heard.said(kind), "{orbit:?}: {:?}", heard.notes);
+        assert!(off(&volume) < EXACT, "{orbit:?}: {:?}", means(&volume));
+    }
+}
+
 /// A detector from the axis outwards measures every line once: half weights would give half the density.
 #[test]
 fn a_detector_on_one_side_of_the_axis_counts_whole() {

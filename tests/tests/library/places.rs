@@ -34,6 +34,15 @@ fn geometry() -> Geometry {
     g
 }
 
+/// The same detectors in a parallel beam.
+fn parallel() -> Geometry {
+    let mut g = geometry();
+    let volume = g.volume;
+    g.views.iter_mut().for_each(|view| *view = view.parallel(view.normal().0, &volume));
+    assert!((0..g.views.len()).all(|view| g.is_parallel(view)));
+    g
+}
+
 fn numbers(shape: impl Into<[usize; 3]>, seed: u64) -> Array3<f64> {
     let shape = shape.into();
     let mut i = 0;
@@ -62,20 +71,19 @@ fn all() -> Vec<Value> {
 }
 
 /// Both directions against double precision; how far off they are, and the mismatch of `<Ax, y>` and `<x, Aᵀy>`.
-fn errors(place: &dyn Place, p: &dyn VoxelProjector) -> conefield_core::Result<[f64; 3]> {
-    let g = geometry();
+fn errors(place: &dyn Place, p: &dyn VoxelProjector, g: &Geometry) -> conefield_core::Result<[f64; 3]> {
     let views: Vec<usize> = (0..g.views.len()).rev().collect();
     let [rows, columns] = g.detector;
     let (x, y) = (numbers(g.volume.shape, 1), numbers([views.len(), rows, columns], 2));
     let (mut ax, mut aty) = (Array3::zeros(y.dim()), Array3::ones(x.dim()));
-    p.reference().forward(&g, &views, x.view(), ax.view_mut());
-    p.reference().adjoint(&g, &views, y.view(), aty.view_mut());
+    p.reference().forward(g, &views, x.view(), ax.view_mut());
+    p.reference().adjoint(g, &views, y.view(), aty.view_mut());
     let (x32, y32) = (x.mapv(|v| v as f32), y.mapv(|v| v as f32));
     // Room for more views than are asked for.
     let mut found = place.adopt(Array3::from_elem((views.len() + 3, rows, columns), 7.0))?;
-    place.forward(p, &g, &views, &place.adopt(x32.clone())?, &mut found)?;
+    place.forward(p, g, &views, &place.adopt(x32.clone())?, &mut found)?;
     let mut back = place.adopt(Array3::ones(x.dim()))?;
-    place.adjoint(p, &g, &views, &place.adopt(y32.clone())?, &mut back)?;
+    place.adjoint(p, g, &views, &place.adopt(y32.clone())?, &mut back)?;
     let found = place.take(found)?.slice_move(s![..views.len(), .., ..]);
     let back = place.take(back)?;
     let dot =
@@ -94,10 +102,14 @@ fn places(what: &str) -> Vec<(&'static str, Arc<dyn Place>)> {
 #[test]
 fn projectors_agree_with_double_precision_and_are_adjoint() {
     for (name, place) in places("projectors of voxels") {
-        for settings in all() {
-            let [forward, adjoint, mismatch] = errors(place.as_ref(), projector(settings.clone()).as_ref()).unwrap();
-            println!("{settings}, {name}: forward {forward:.1e}, adjoint {adjoint:.1e}, mismatch {mismatch:.1e}");
-            assert!(forward < LIMIT && adjoint < LIMIT && mismatch < 1e-5, "{settings}, {name}");
+        for (beam, g) in [("cone", geometry()), ("parallel", parallel())] {
+            for settings in all() {
+                let p = projector(settings.clone());
+                let [forward, adjoint, mismatch] = errors(place.as_ref(), p.as_ref(), &g).unwrap();
+                let what = format!("{settings}, {beam}, {name}");
+                println!("{what}: forward {forward:.1e}, adjoint {adjoint:.1e}, mismatch {mismatch:.1e}");
+                assert!(forward < LIMIT && adjoint < LIMIT && mismatch < 1e-5, "{what}");
+            }
         }
     }
 }
@@ -125,7 +137,7 @@ fn a_perturbed_walk_is_found_and_what_cannot_run_is_refused() {
     let place = backend.place();
     let changed = |change| Changed(projector(json!({"type": "joseph"})), change);
     let wrong = changed(|s| Some(s.replace("fa * fb * step", "fa * fb * 1.01 * step")));
-    let [forward, adjoint, mismatch] = errors(place.as_ref(), &wrong).unwrap();
+    let [forward, adjoint, mismatch] = errors(place.as_ref(), &wrong, &geometry()).unwrap();
     assert!(forward > LIMIT && adjoint > LIMIT && mismatch < 1e-5, "{forward} {adjoint} {mismatch}");
     let e = place.admits(&changed(|_| None)).unwrap_err().to_string();
     assert!(e.contains("changed") && e.contains("no WGSL") && e.contains("--backend cpu"), "{e}");
@@ -488,9 +500,13 @@ fn classical_methods_end_where_the_cpu_does() {
         json!({"type": "fdk", "window": "hann", "cutoff": 0.8, "nonnegative": true}),
         json!({"type": "sart", "stop": {"passes": 3}}),
         json!({"type": "sart", "subsets": 3, "stop": {"passes": 3}, "scene": {"support": "carve"}}),
+        json!({"type": "mlem", "stop": {"passes": 3}}),
         json!({"type": "cgls", "stop": {"passes": 5}}),
+        json!({"type": "lsqr", "pull": 0.01, "stop": {"passes": 5}}),
         json!({"type": "asd-pocs", "stop": {"passes": 5}}),
         json!({"type": "fista", "prior": {"type": "total-variation"}, "stop": {"passes": 5}}),
+        json!({"type": "fista", "stop": {"passes": 5},
+            "prior": {"type": "sum", "priors": ["total-variation", "directional-total-variation"]}}),
         json!({"type": "fista", "prior": {"type": "directional-total-variation"}, "stop": {"passes": 5},
             "basis": {"type": "cubic", "spacing": 1.5}, "scene": {"support": "carve"}}),
     ];
@@ -541,7 +557,9 @@ fn a_pass_moves_scalars_and_a_run_its_views_and_its_volume() {
     let methods = [
         json!({"type": "sart", "subsets": 4}),
         json!({"type": "sart", "subsets": 1}),
+        json!({"type": "mlem", "subsets": 4}),
         json!({"type": "cgls"}),
+        json!({"type": "lsqr", "pull": 0.01}),
         json!({"type": "asd-pocs", "subsets": 4, "descents": 5}),
         json!({"type": "fista", "subsets": 4, "prior": tv, "scene": {"support": "carve"}}),
         json!({"type": "fista", "subsets": 4, "prior": {"type": "directional-total-variation"},

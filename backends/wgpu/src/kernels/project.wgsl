@@ -7,7 +7,10 @@ struct VoxelRay {
 }
 
 struct ProjectedView {
-    source: vec3<f32>,
+    // The source; of a parallel beam, pixel (0, 0): positions far away would round.
+    start: vec3<f32>,
+    // Share of the way from the pixel to the source at which a ray begins; 1 is the source.
+    near: f32,
     // From the source to pixel (0, 0), and from pixel to pixel, in voxels.
     corner: vec3<f32>,
     column: vec3<f32>,
@@ -42,8 +45,10 @@ fn projected(i: u32) -> VoxelRay {
     let pixel = i % projection.pixels;
     let row = f32(pixel / projection.columns);
     let column = f32(pixel % projection.columns);
-    let ahead = view.corner + column * view.column + row * view.row;
-    return VoxelRay(view.source, ahead, length(ahead * projection.spacing));
+    let place = column * view.column + row * view.row;
+    let ahead = view.near * (view.corner + place);
+    let start = view.start + select(vec3<f32>(0.0), place - ahead, view.near < 1.0);
+    return VoxelRay(start, ahead, length(ahead * projection.spacing));
 }
 
 fn walk_shape() -> vec3<u32> {

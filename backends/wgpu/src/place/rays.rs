@@ -7,7 +7,7 @@ use crate::compose::fragment_of;
 use crate::device::Atomics;
 use crate::source::{Access, Source};
 use conefield_core::error::Result;
-use conefield_core::geometry::{Geometry, sub};
+use conefield_core::geometry::{Geometry, norm, sub};
 use conefield_core::voxel::VoxelProjector;
 use conefield_core::wgsl::Fragment;
 
@@ -35,8 +35,14 @@ fn projected(geometry: &Geometry, view: usize) -> [[f32; 4]; 4] {
         let v: [f32; 3] = std::array::from_fn(|k| (d[k] / grid.spacing[k]) as f32);
         [v[0], v[1], v[2], 0.0]
     };
-    let corner = sub(w.pixel(geometry.detector, 0.0, 0.0), w.source);
-    [voxels(sub(w.source, lower)), voxels(corner), voxels(w.u), voxels(w.v)]
+    let first = w.pixel(geometry.detector, 0.0, 0.0);
+    let corner = sub(first, w.source);
+    let (mut start, mut near) = (w.source, 1.0);
+    if geometry.is_parallel(view) {
+        (start, near) = (first, (norm(sub(first, grid.center)) + 2.0 * norm(grid.size())) / norm(corner));
+    }
+    let [x, y, z, _] = voxels(sub(start, lower));
+    [[x, y, z, near as f32], voxels(corner), voxels(w.u), voxels(w.v)]
 }
 
 fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> Source {
