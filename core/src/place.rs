@@ -11,7 +11,7 @@ mod map;
 mod penalty;
 mod views;
 
-pub use map::{ADD, CLIP, DIVIDE, INVERT, Map, RELAX, Reduction, squares};
+pub use map::{ADD, CLIP, DIVIDE, INVERT, MULTIPLY, Map, RELAX, Reduction, squares};
 pub use penalty::{Bounds, Dual, Guide, Kernels, Penalty, Update};
 pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 

@@ -63,6 +63,11 @@ pub trait Regularizer: Send + Sync {
     /// coefficients of the scan's noise in the gradient of the data term. It takes a back-projection.
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64>;
 
+    /// The weights of the priors that it is a sum of; that of [`Regularizer::weight`] if it is none.
+    fn weights(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<Vec<f64>> {
+        Ok(vec![self.weight(grid, noise)?])
+    }
+
     /// A line for `explain`.
     fn describe(&self) -> String;
 }

@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result, ensure};
 use crate::geometry::{Ray, Vec3, VoxelGrid};
+use ndarray::{Array3, ArrayView3};
 use serde::{Deserialize, Serialize};
 
 /// A region that may contain the object; all else is air.
@@ -140,6 +141,24 @@ impl Support {
         let lower = grid.bounds()[0];
         let corner = |n: [usize; 3]| std::array::from_fn(|k| lower[k] + n[k] as f64 * grid.spacing[k]);
         Some(Self { bounds: [corner(low), corner(high)], shape: Shape::Cells(Cells { grid, occupied }) })
+    }
+
+    /// The marked voxels of `volume`, rounded out to blocks of voxels if there are more than 2²⁴; `None` if none is marked.
+    pub fn voxels(volume: &VoxelGrid, marked: ArrayView3<'_, bool>) -> Option<Self> {
+        let blocks = |side: usize| volume.shape.map(|n| n.div_ceil(side));
+        let side = (1..).find(|side| blocks(*side).iter().product::<usize>() <= MOST)?;
+        let shape = blocks(side);
+        let mut occupied = Array3::from_elem(shape, false);
+        for ((x, y, z), _) in marked.indexed_iter().filter(|(_, marked)| **marked) {
+            occupied[[x / side, y / side, z / side]] = true;
+        }
+        let [low, high] = volume.bounds();
+        let spacing = volume.spacing.map(|s| s * side as f64);
+        let center = std::array::from_fn(|k| low[k] + 0.5 * shape[k] as f64 * spacing[k]);
+        let mut support = Self::new(VoxelGrid { shape, spacing, center }, occupied.into_raw_vec_and_offset().0)?;
+        // The last blocks can extend beyond the volume.
+        support.bounds[1] = std::array::from_fn(|k| support.bounds[1][k].min(high[k]));
+        Some(support)
     }
 
     /// The part of a box (mm) in `volume`; `None` if there is none.
@@ -316,6 +335,25 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn marked_voxels_are_held_and_blocks_of_them_stay_in_the_volume() {
+        let marked = |at: [usize; 3]| at == [1, 2, 3] || at == [5, 4, 0];
+        let flags = Array3::from_shape_fn(grid().shape, |(x, y, z)| marked([x, y, z]));
+        let support = Support::voxels(&grid(), flags.view()).unwrap();
+        for (x, y, z) in ndarray::indices(grid().shape) {
+            assert_eq!(support.holds(grid().voxel([x, y, z])), marked([x, y, z]), "{x} {y} {z}");
+        }
+        assert!(Support::voxels(&grid(), Array3::from_elem(grid().shape, false).view()).is_none());
+        // 2²⁴ cells and more: blocks of two voxels along each axis.
+        let large = VoxelGrid { shape: [4097, 4097, 1], spacing: [1.0; 3], center: [0.0; 3] };
+        let mut flags = Array3::from_elem(large.shape, false);
+        flags[[4096, 10, 0]] = true;
+        let support = Support::voxels(&large, flags.view()).unwrap();
+        assert!(support.holds(large.voxel([4096, 10, 0])) && support.holds(large.voxel([4096, 11, 0])));
+        assert!(!support.holds(large.voxel([4096, 12, 0])) && !support.holds(large.voxel([4095, 10, 0])));
+        assert_eq!(support.bounds()[1], [large.bounds()[1][0], large.voxel([0, 11, 0])[1] + 0.5, 0.5]);
     }
 
     /// Against small steps: a cylinder and a box, cut by the volume.

@@ -242,7 +242,7 @@ impl Plan for FieldPlan {
         let [surround, corrected] = surround::bytes(self.scene.surround, scan);
         Needs {
             surround,
-            corrected: corrected + solid::bytes(self.scene.support, scan),
+            corrected: corrected + solid::bytes(&self.scene.support, scan),
             model: 8 * n,
             optimizer: 8 * n + kept,
             backend,
@@ -257,7 +257,7 @@ impl Plan for FieldPlan {
 
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
         let mut pipeline = self.pipeline.clone();
-        let fitted = fit(scan, &self.scene, &mut pipeline)?;
+        let fitted = fit(scan, &self.scene, None, &mut pipeline)?;
         let (scene, g) = (fitted.scene, &scan.geometry);
         let mut lines = surround::found(scan, self.scene.surround)?;
         lines.extend(fitted.found);
@@ -272,7 +272,8 @@ impl Plan for FieldPlan {
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         job.scan.validate("scan")?;
         let mut pipeline = self.pipeline.clone();
-        let Fitted { scene, solid, needed, found, changed } = fit(job.scan, &self.scene, &mut pipeline)?;
+        let Fitted { scene, solid, needed, found, changed } =
+            fit(job.scan, &self.scene, Some(job.volumes), &mut pipeline)?;
         found.iter().for_each(|line| observer.note(line));
         let corrected = Corrected::of(job, self.scene.surround, solid.as_ref(), observer)?;
         let job = &Corrected::job(corrected.as_ref(), job);

@@ -2,9 +2,10 @@
 
 use crate::solid::{self, Solid};
 use crate::support::carve;
-use conefield_core::error::{Error, Result};
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::geometry::VoxelGrid;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::scan::Scan;
+use conefield_core::scan::{Scan, Volume};
 use conefield_core::scene::{CuboidSettings, CylinderSettings, LevelRule, Scene, SceneSettings, SupportRule};
 use conefield_core::support::{Cylinder, Support};
 
@@ -33,18 +34,21 @@ pub struct Object {
     pub found: Vec<String>,
 }
 
-/// The object of a scan.
+/// Reads a volume by the name of its file.
+pub type ReadVolume<'a> = &'a dyn Fn(&str) -> Result<Volume>;
+
+/// The object of a scan. Without `read`, a support in a file is only named.
 ///
 /// # Errors
-/// The views show no solid, or the given region lies outside the volume.
-pub fn object(scan: &Scan, rule: SupportRule) -> Result<Object> {
+/// The views show no solid, the given region lies outside the volume, or its file does not suit the scan.
+pub fn object(scan: &Scan, rule: &SupportRule, read: Option<ReadVolume<'_>>) -> Result<Object> {
     let (volume, mm) = (&scan.geometry.volume, scan.unit.mm);
     let given = |key: &str, found: String, support: Option<Support>| {
         let outside =
             || Error::invalid("spec", format!("scene.support.{key}"), found, "a region that meets the volume");
         Ok(Object { support: Some(support.ok_or_else(outside)?), ..Object::default() })
     };
-    match rule {
+    match *rule {
         SupportRule::Box => Ok(Object::default()),
         SupportRule::Carve => Ok(carved(scan, vec![])),
         SupportRule::Cylinder(CylinderSettings { center, radius }) => {
@@ -54,6 +58,11 @@ pub fn object(scan: &Scan, rule: SupportRule) -> Result<Object> {
         SupportRule::Cuboid(CuboidSettings { low, high }) => {
             let corners = [low, high].map(|p| p.map(|x| x * mm));
             given("cuboid", format!("{low:?} to {high:?}"), Support::cuboid(corners, volume))
+        }
+        SupportRule::File(ref file) => {
+            let found = vec![format!("support: the voxels above 0 in {file}")];
+            let support = read.map(|read| in_file(file, read, volume)).transpose()?;
+            Ok(Object { support, solid: None, found })
         }
         SupportRule::Solid | SupportRule::SolidOrCarve => {
             let fitted = solid::fit(scan).and_then(|solid| {
@@ -65,7 +74,7 @@ pub fn object(scan: &Scan, rule: SupportRule) -> Result<Object> {
                     let found = vec![solid.describe(&scan.unit)];
                     Ok(Object { support: Some(support), solid: Some(solid), found })
                 }
-                Err(why) if rule == SupportRule::Solid => {
+                Err(why) if *rule == SupportRule::Solid => {
                     let expected = "\"solid-or-carve\", \"carve\" or \"box\" for these views";
                     Err(Error::invalid("spec", "scene.support", format!("\"solid\", but {why}"), expected))
                 }
@@ -73,6 +82,15 @@ pub fn object(scan: &Scan, rule: SupportRule) -> Result<Object> {
             }
         }
     }
+}
+
+/// The voxels above 0 of the volume in a file.
+fn in_file(file: &str, read: ReadVolume<'_>, grid: &VoxelGrid) -> Result<Support> {
+    let marks = read(file)?.data;
+    let expected = format!("{:?}, the voxels of the scan", grid.shape);
+    ensure(marks.shape() == grid.shape, file, "shape", format!("{:?}", marks.shape()), expected)?;
+    let occupied = marks.mapv(|x| x > 0.0);
+    Support::voxels(grid, occupied.view()).ok_or_else(|| Error::invalid(file, "voxels", "none above 0", "at least one"))
 }
 
 /// The object as it is carved.
@@ -83,9 +101,14 @@ fn carved(scan: &Scan, mut found: Vec<String>) -> Object {
 }
 
 /// The scene of a scan under a spec's settings. Converts the lengths of `pipeline` to that scene.
-pub fn fit(scan: &Scan, settings: &SceneSettings, pipeline: &mut Pipeline) -> Result<Fitted> {
+pub fn fit(
+    scan: &Scan,
+    settings: &SceneSettings,
+    read: Option<ReadVolume<'_>>,
+    pipeline: &mut Pipeline,
+) -> Result<Fitted> {
     let mut scene = Scene::new(scan, settings)?;
-    let Object { support, solid, mut found } = object(scan, settings.support)?;
+    let Object { support, solid, mut found } = object(scan, &settings.support, read)?;
     if let Some(support) = support {
         scene = scene.within(support, settings);
     }

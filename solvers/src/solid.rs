@@ -96,7 +96,7 @@ impl Solid {
 }
 
 /// Bytes of the corrected views; 0 if the rule does not look for a solid.
-pub fn bytes(rule: SupportRule, header: &ScanHeader) -> u64 {
+pub fn bytes(rule: &SupportRule, header: &ScanHeader) -> u64 {
     if rule.is_solid() { 4 * header.pixels() } else { 0 }
 }
 

@@ -44,6 +44,9 @@ fn the_tally_is_what_a_run_takes() {
     for text in [
         "type = \"fdk\"\n".to_owned(),
         with("type = \"cgls\"\n"),
+        with("type = \"lsqr\"\n"),
+        with("type = \"lsqr\"\npull = 0.01\n"),
+        with("type = \"mlem\"\n"),
         with("type = \"sart\"\n"),
         with("type = \"sart\"\nsubsets = 10\n"),
         with("type = \"sart\"\nsubsets = 1\n"),
@@ -51,6 +54,9 @@ fn the_tally_is_what_a_run_takes() {
         with("type = \"asd-pocs\"\n"),
         with("type = \"fista\"\n"),
         with(tv),
+        with(
+            "type = \"fista\"\nprior = { type = \"sum\", priors = [\"total-variation\", \"directional-total-variation\"] }\n",
+        ),
         with(&format!("{tv}subsets = 1\nair = false\ndata.type = \"least-squares\"\n")),
     ] {
         let spec = parse(&text, "test.toml", &[], &[]).unwrap().spec;

@@ -44,6 +44,17 @@ pub const DIVIDE: Map = Map {
     host: |[a, _], out, [x, _]| out.iter_mut().zip(x).for_each(|(o, x)| *o = (f64::from(*x) / a) as f32),
 };
 
+/// `a·x·o`.
+pub const MULTIPLY: Map = Map {
+    name: "product",
+    inputs: 1,
+    wgsl: "o * (a * x)",
+    host: |[a, _], out, [x, _]| {
+        let a = a as f32;
+        out.iter_mut().zip(x).for_each(|(o, x)| *o *= a * x);
+    },
+};
+
 /// `max(b, o + a·x·y)`.
 pub const RELAX: Map = Map {
     name: "relaxed step",
@@ -80,7 +91,7 @@ pub const CLIP: Map = Map {
 
 impl Map {
     /// All maps.
-    pub const ALL: [&'static Map; 5] = [&ADD, &DIVIDE, &RELAX, &INVERT, &CLIP];
+    pub const ALL: [&'static Map; 6] = [&ADD, &DIVIDE, &MULTIPLY, &RELAX, &INVERT, &CLIP];
 
     /// Overwrites `out` on the host; all arrays have the same shape and are in standard order.
     pub fn run(&self, factors: [f64; 2], out: &mut Array3<f32>, inputs: &[CowArray<'_, f32, Ix3>]) {

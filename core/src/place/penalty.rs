@@ -55,7 +55,8 @@ pub trait Penalty: Send {
     }
 
     /// Overwrites `u` with `argmin_{u ≥ 0} ½‖u − v‖² + tau·R(u)`, or approaches it with each call for the same `v`.
-    /// Both are in the grid's standard order. The result does not depend on the number of threads.
+    /// Both are in the grid's standard order. `v` is `f32::MIN` outside the object's support. The result does not depend
+    /// on the number of threads.
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]);
 
     /// Makes `bounds` those of `u` in [`Penalty::prox`], in place of `u ≥ 0`. Called before the first update, unless
@@ -73,6 +74,11 @@ pub trait Penalty: Send {
     /// across it are the ones that no ray is tangent to. Called before the first update.
     fn limited(&mut self, middle: Vec3) {
         let _ = middle;
+    }
+
+    /// Gives the priors of a sum their shares of its weight, which add up to 1. Called before the first update.
+    fn share(&mut self, shares: &[f64]) {
+        let _ = shares;
     }
 
     /// The whole update, with [`Penalty::prox`] for `tau`. A penalty whose proximal map is a single pass over the

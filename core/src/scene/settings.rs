@@ -2,6 +2,7 @@
 
 use crate::error::{Result, ensure};
 use crate::geometry::Vec3;
+use crate::input_file::InputFile;
 use crate::place::Bounds;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -103,7 +104,7 @@ pub enum LevelRule {
 
 /// Where the object can be inside the volume. Iterative methods keep other voxels at 0; for fields, the unit cube is
 /// fitted to the region, and rays are sampled inside it.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum SupportRule {
     /// Anywhere.
@@ -120,6 +121,8 @@ pub enum SupportRule {
     Cylinder(CylinderSettings),
     /// In a box.
     Cuboid(CuboidSettings),
+    /// In the voxels above 0 of a volume with the voxels of the scan.
+    File(InputFile),
 }
 
 /// A cylinder along z, in the unit of the scan.
@@ -146,8 +149,8 @@ pub struct CuboidSettings {
 impl SupportRule {
     /// Refuses invalid settings, and a solid beside a surround.
     pub fn validate(&self, surround: &SurroundRule) -> Result<()> {
-        match *self {
-            Self::Box | Self::Carve => Ok(()),
+        match self {
+            Self::Box | Self::Carve | Self::File(_) => Ok(()),
             Self::Solid | Self::SolidOrCarve => {
                 let found = if surround.is_none() { "none" } else { "coarse" };
                 let expected = "\"none\", because scene.support looks for a solid whose whole width is visible";
@@ -157,7 +160,7 @@ impl SupportRule {
                 let [center_key, radius_key] = ["center", "radius"].map(|k| format!("scene.support.cylinder.{k}"));
                 let finite = center.iter().all(|x| x.is_finite());
                 ensure(finite, "spec", &center_key, format!("{center:?}"), "finite numbers")?;
-                ensure(radius.is_finite() && radius > 0.0, "spec", &radius_key, radius, "a positive finite number")
+                ensure(radius.is_finite() && *radius > 0.0, "spec", &radius_key, radius, "a positive finite number")
             }
             Self::Cuboid(CuboidSettings { low, high }) => {
                 let right = (0..3).all(|k| low[k].is_finite() && high[k].is_finite() && low[k] < high[k]);
@@ -199,7 +202,7 @@ impl AttenuationScale {
 }
 
 /// How an iterative method treats the scan.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct VoxelScene {
     /// Where the object can be inside the volume.

@@ -270,7 +270,7 @@ impl Plan for GaussianPlan {
         let backend = self.outline.backend().scratch_bytes as u64;
         Needs {
             surround,
-            corrected: corrected + solid::bytes(self.scene.support, scan),
+            corrected: corrected + solid::bytes(&self.scene.support, scan),
             model: 8 * n,
             optimizer: 8 * n + self.kept,
             backend,
@@ -287,7 +287,7 @@ impl Plan for GaussianPlan {
     }
 
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
-        let fitted = fit(scan, &self.scene, &mut self.pipeline.clone())?;
+        let fitted = fit(scan, &self.scene, None, &mut self.pipeline.clone())?;
         let mut lines = surround::found(scan, self.scene.surround)?;
         lines.extend(fitted.found);
         Ok(Findings { lines, attenuation: Some(fitted.scene.attenuation * scan.unit.mm), samples: None })
@@ -296,7 +296,7 @@ impl Plan for GaussianPlan {
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         job.scan.validate("scan")?;
         let mut pipeline = self.pipeline.clone();
-        let Fitted { scene, solid, found, .. } = fit(job.scan, &self.scene, &mut pipeline)?;
+        let Fitted { scene, solid, found, .. } = fit(job.scan, &self.scene, Some(job.volumes), &mut pipeline)?;
         found.iter().for_each(|line| observer.note(line));
         let [rows, columns] = job.scan.geometry.detector;
         let room = format!("1 to {}, the detector's longer side", rows.max(columns));

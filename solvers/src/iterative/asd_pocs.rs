@@ -87,7 +87,7 @@ impl AsdPocs {
         let (subsets, order) = (self.subsets, Order::Golden);
         let updates = Updates { subsets, relaxation: RELAXATION, decay: DECAY, order, nonnegative: true };
         updates.validate()?;
-        let shared = Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?;
+        let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;
         Ok(Built { shared, updates, descents: self.descents })
     }
 }

@@ -53,7 +53,7 @@ conefield_core::stage_type!(Method, "cgls", Cgls, "conjugate gradients for least
 #[typetag::serde(name = "cgls")]
 impl Method for Cgls {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
-        let shared = Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?;
+        let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;
         Ok(Box::new(IterativePlan(Built { shared, nonnegative: self.nonnegative })))
     }
 
@@ -86,14 +86,8 @@ impl Iterative for Built {
         let mut iterate = Iterate::new(&space, self.shared.start(job, &problem, &space)?)?;
         problem.settle()?;
         iterate.prepare(&problem)?;
-        let mut solution = drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)?;
-        if let Reconstruction::Volume(volume) = &mut solution.result {
-            // The volume is in the scan's unit.
-            let [low, high] = [problem.bounds.low, problem.bounds.high].map(|x| x * job.scan.unit.mm as f32);
-            let bounds = Bounds { low: if self.nonnegative { low } else { f32::NEG_INFINITY }, high };
-            volume.data.par_mapv_inplace(|x| bounds.clip(x));
-        }
-        Ok(solution)
+        let solution = drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)?;
+        Ok(clipped(solution, &problem, self.nonnegative))
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
@@ -105,6 +99,17 @@ impl Iterative for Built {
     fn describe(&self) -> String {
         "cgls: conjugate gradients on the normal equations".into()
     }
+}
+
+/// The solution with its volume clipped to the bounds; without `nonnegative` to the upper one.
+pub(super) fn clipped(mut solution: Solution, problem: &Problem<'_>, nonnegative: bool) -> Solution {
+    if let Reconstruction::Volume(volume) = &mut solution.result {
+        // The volume is in the scan's unit.
+        let [low, high] = [problem.bounds.low, problem.bounds.high].map(|x| x * problem.scan.unit.mm as f32);
+        let bounds = Bounds { low: if nonnegative { low } else { f32::NEG_INFINITY }, high };
+        volume.data.par_mapv_inplace(|x| bounds.clip(x));
+    }
+    solution
 }
 
 struct Iterate {

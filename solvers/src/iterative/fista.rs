@@ -139,7 +139,7 @@ impl Fista {
         ensure(pull.is_finite() && pull >= 0.0, "spec", "pull", pull, "a finite number, 0 or more")?;
         ensure((1..=64).contains(&self.bin), "spec", "bin", self.bin, "1 to 64")?;
         Ok(Built {
-            shared: Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?,
+            shared: Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?,
             basis: self.basis.build().map_err(|e| e.within("basis"))?,
             data: self.data.build().map_err(|e| e.within("data"))?,
             prior: self.prior.build().map_err(|e| e.within("prior"))?,
@@ -279,7 +279,7 @@ fn limited(geometry: &Geometry) -> Option<Vec3> {
     let arcs = Arcs::of(&angles).arcs;
     let &[[start, length]] = arcs.as_slice() else { return None };
     let (sin, cos) = (start + length / 2.0).sin_cos();
-    (length < PI).then_some([cos, sin, 0.0])
+    (length < PI - 1e-9).then_some([cos, sin, 0.0])
 }
 
 /// FISTA's working memory.
@@ -463,13 +463,18 @@ impl Iterate {
         let views = problem.scan.geometry.views.len();
         let subsets = settings.subsets.of(views);
         let grid = arrays.model.grid();
-        let mut gain = Ok(0.0);
+        // One back-projection, however many priors ask.
+        let mut gain = None;
         let noise = &mut |k: f64| {
-            gain = arrays.noise_gain(problem, data.as_ref(), &subsets[0]);
+            let gain = gain.get_or_insert_with(|| arrays.noise_gain(problem, data.as_ref(), &subsets[0]));
             k * data.noise() * gain.as_ref().map_or(0.0, |gain| *gain)
         };
-        let lambda = settings.prior.weight(&grid, noise).map_err(|e| e.within("prior"))?;
-        gain?;
+        let weights = settings.prior.weights(&grid, noise).map_err(|e| e.within("prior"))?;
+        gain.transpose()?;
+        let lambda: f64 = weights.iter().sum();
+        if lambda > 0.0 {
+            arrays.penalty.share(&weights.iter().map(|weight| weight / lambda).collect::<Vec<_>>());
+        }
         let lipschitz = arrays.largest_eigenvalue(problem, data.as_ref(), &subsets)?;
         arrays.model.fault()?;
         data.fault()?;

@@ -2,7 +2,7 @@
 //!
 //! A step is one pass over all views. After each, the driver records, checkpoints and checks the stopping criteria.
 //!
-//! - [`sart`], [`cgls`], [`asd_pocs`], [`fista`]: the methods. [`shared`]: their common settings.
+//! - [`sart`], [`mlem`], [`cgls`], [`lsqr`], [`asd_pocs`], [`fista`]: the methods. [`shared`]: their common settings.
 //! - [`data`], [`regularizers`], [`bases`]: the parts of FISTA. [`noise`]: estimation of a scan's noise.
 //! - [`tv`], [`edges`]: total variation, and the edges that it may follow.
 //! - [`problem`]: a scan with its system matrix, in a place. [`drive`]: the passes of a run. [`monitor`]: metrics during a run.
@@ -14,6 +14,8 @@ pub mod data;
 pub mod drive;
 pub mod edges;
 pub mod fista;
+pub mod lsqr;
+pub mod mlem;
 mod model;
 pub mod monitor;
 pub mod noise;
@@ -36,6 +38,6 @@ pub use shared::known_volume;
 pub use stop::Stop;
 
 /// Bytes of the object's support mask.
-pub fn mask_bytes(rule: SupportRule, header: &ScanHeader) -> u64 {
-    if rule == SupportRule::Box { 0 } else { header.voxels() }
+pub fn mask_bytes(rule: &SupportRule, header: &ScanHeader) -> u64 {
+    if *rule == SupportRule::Box { 0 } else { header.voxels() }
 }

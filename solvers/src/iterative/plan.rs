@@ -59,16 +59,16 @@ impl<T: Iterative> Plan for IterativePlan<T> {
 
     fn needs(&self, scan: &ScanHeader) -> Needs {
         let shared = self.0.shared();
-        let working = self.0.bytes(scan) + mask_bytes(shared.scene.support, scan);
+        let working = self.0.bytes(scan) + mask_bytes(&shared.scene.support, scan);
         let [surround, corrected] = surround::bytes(shared.scene.surround, scan);
-        let corrected = corrected + solid::bytes(shared.scene.support, scan);
+        let corrected = corrected + solid::bytes(&shared.scene.support, scan);
         Needs { surround, corrected, working, resume: working + 4 * scan.voxels(), volume: true, ..Needs::default() }
     }
 
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
-        let scene = self.0.shared().scene;
+        let scene = &self.0.shared().scene;
         let mut lines = surround::found(scan, scene.surround)?;
-        lines.extend(object(scan, scene.support)?.found);
+        lines.extend(object(scan, &scene.support, None)?.found);
         lines.extend(self.0.found(scan));
         Ok(Findings { lines, ..Findings::default() })
     }

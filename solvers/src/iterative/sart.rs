@@ -89,7 +89,7 @@ impl Sart {
             nonnegative: self.nonnegative,
         };
         updates.validate()?;
-        Ok(Built { shared: Shared::of(self.projector.as_ref(), self.scene, &self.start, &self.stop)?, updates })
+        Ok(Built { shared: Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?, updates })
     }
 }
 
@@ -232,7 +232,7 @@ impl Sweep {
 }
 
 /// Overwrites `sums` with the inverse column sums of some views; `pixels` is a buffer for their images.
-fn column_sums(problem: &Problem<'_>, views: &[usize], pixels: &mut Array, sums: &mut Array) -> Result<()> {
+pub(super) fn column_sums(problem: &Problem<'_>, views: &[usize], pixels: &mut Array, sums: &mut Array) -> Result<()> {
     problem.place.fill(pixels, 1.0)?;
     problem.back(views, pixels, sums)?;
     invert(problem.place, sums)

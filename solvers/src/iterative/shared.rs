@@ -35,7 +35,7 @@ impl Shared {
     /// Builds the settings at the keys `projector`, `scene`, `start` and `stop` of a method.
     pub(super) fn of(
         projector: &dyn VoxelProjectorSpec,
-        scene: VoxelScene,
+        scene: &VoxelScene,
         start: &Option<InputFile>,
         stop: &Stop,
     ) -> Result<Self> {
@@ -43,7 +43,13 @@ impl Shared {
         scene.validate()?;
         let projector_kind = projector.typetag_name();
         let projector = projector.build().map_err(|e| e.within("projector"))?;
-        Ok(Self { projector: projector.into(), projector_kind, scene, start: start.clone(), stop: stop.clone() })
+        Ok(Self {
+            projector: projector.into(),
+            projector_kind,
+            scene: scene.clone(),
+            start: start.clone(),
+            stop: stop.clone(),
+        })
     }
 
     /// Whether there is a start volume.
@@ -94,7 +100,7 @@ impl Shared {
         let on = place.device().map(|device| format!(", on {device}")).unwrap_or_default();
         observer.note(&format!("{method}; {}{on}", self.projector.describe()));
         // Uses the views as measured: the attenuation subtracted later is too coarse for carving.
-        let Object { support, solid, found } = object(job.scan, self.scene.support)?;
+        let Object { support, solid, found } = object(job.scan, &self.scene.support, Some(job.volumes))?;
         found.iter().for_each(|line| observer.note(line));
         let inside = support.map(|support| {
             let mut inside = Array3::from_elem(grid.shape, false);

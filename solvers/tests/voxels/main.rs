@@ -6,6 +6,7 @@ mod chain;
 mod fdk;
 mod iterative;
 mod kit;
+mod references;
 mod refusals;
 mod solid;
 mod surround;

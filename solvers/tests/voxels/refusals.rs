@@ -4,7 +4,7 @@ use crate::kit::{Case, Heard, bodies, geometry, method, spec};
 use conefield_core::geometry::View;
 use conefield_projectors::simulate::scan_ellipsoids;
 
-const ALL: [&str; 7] = ["fdk", "sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"];
+const ALL: [&str; 9] = ["fdk", "sart", "os-sart", "sirt", "mlem", "cgls", "lsqr", "asd-pocs", "fista-tv"];
 
 /// The error for a spec that is refused when it is read, built or run.
 fn said(text: &str) -> String {
@@ -139,6 +139,9 @@ fn settings_out_of_range_are_named() {
         ("sart", "subsets = \"view\"", "subsets"),
         ("sirt", "relaxation = -1.0", "relaxation"),
         ("cgls", "relaxation = 1.0", "relaxation"),
+        ("mlem", "relaxation = 1.0", "relaxation"),
+        ("mlem", "subsets = 0", "subsets"),
+        ("lsqr", "pull = -1.0", "pull"),
         ("asd-pocs", "subsets = 0", "subsets"),
         ("asd-pocs", "alpha = 0.0", "alpha"),
         ("asd-pocs", "tolerance = -1.0", "tolerance"),
@@ -148,6 +151,14 @@ fn settings_out_of_range_are_named() {
         ("fista-tv", "prior.weight = 3.0", "prior.weight"),
         ("fista", "prior = { type = \"directional-total-variation\", strength = 1.0 }", "prior.strength"),
         ("fista", "prior = { type = \"directional-total-variation\", edge = 0.0 }", "prior.edge"),
+        ("fista", "prior = { type = \"sum\", priors = [] }", "prior.priors"),
+        ("fista", "prior = { type = \"sum\", turns = 0 }", "prior.turns"),
+        ("fista", "prior = { type = \"sum\", priors = [\"none\", \"sum\"] }", "prior.priors.1"),
+        (
+            "fista",
+            "prior = { type = \"sum\", priors = [\"none\", { type = \"total-variation\", inner = 0 }] }",
+            "prior.priors.1.inner",
+        ),
     ] {
         let e = said(&method(kind, setting));
         assert!(e.contains(&format!(": {field}: found")), "{kind}, {setting}: {e}");

@@ -116,7 +116,7 @@ fn other_objects_are_no_solid() {
 fn a_limited_arc_gains_by_the_solid() {
     let scan = noisy(scan(&[DISC], &holes(), 0.1, geometry(64, 40.0, 1)), 1);
     let truth = truth(scan.geometry.volume);
-    for kind in ["sart", "cgls", "asd-pocs", "fista-tv"] {
+    for kind in ["sart", "mlem", "cgls", "lsqr", "asd-pocs", "fista-tv"] {
         let of = |support: &str| {
             let text = method(kind, &format!("scene.support = {support}\nstop = {{ passes = 40 }}"));
             Case::of(&scan).volume(&text)

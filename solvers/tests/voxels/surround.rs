@@ -51,7 +51,7 @@ fn method(kind: &str, surround: &str) -> String {
 fn every_method_loses_the_rim_that_the_outside_leaves() {
     let (scan, truth) = (scan(), ellipsoids(&bodies(), &geometry(false).volume));
     let rim = |p: [f64; 3]| (17.0..19.0).contains(&p[0].hypot(p[1])) && p[2].abs() < 15.0;
-    for kind in ["fdk", "os-sart", "cgls", "asd-pocs", "fista-tv"] {
+    for kind in ["fdk", "os-sart", "mlem", "cgls", "lsqr", "asd-pocs", "fista-tv"] {
         let (without, _) = Case::of(&scan).volume(&method(kind, ""));
         let (with, heard) = Case::of(&scan).volume(&method(kind, SURROUND));
         assert!(heard.said("beyond the volume"), "{:?}", heard.notes);

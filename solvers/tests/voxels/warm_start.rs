@@ -9,7 +9,7 @@ use conefield_projectors::voxel::Joseph;
 /// The start of a field.
 const START: &str = "[initializer]\ntype = \"volume\"\npath = \"earlier.nii\"\n";
 
-const ALL: [&str; 6] = ["sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"];
+const ALL: [&str; 7] = ["sart", "os-sart", "sirt", "cgls", "lsqr", "asd-pocs", "fista-tv"];
 
 fn truth() -> Volume {
     ellipsoids(&bodies(), &geometry(1).volume)

@@ -2,8 +2,10 @@
 
 pub mod directional_total_variation;
 pub mod none;
+pub mod sum;
 pub mod total_variation;
 
 pub use directional_total_variation::DirectionalTotalVariation;
 pub use none::Nonnegative;
+pub use sum::Sum;
 pub use total_variation::TotalVariation;
