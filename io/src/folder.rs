@@ -1,7 +1,7 @@
 //! Names of files in a folder: those in a scan's description stay inside it, those of a series come in order.
 
 use conefield_core::{Error, Result};
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::path::{Component, Path, PathBuf};
 
 /// The file `name` in `folder`; refuses anything but a plain file name.
@@ -98,6 +98,17 @@ pub(crate) fn names(folder: &Path, ends: &[&str]) -> Result<Vec<String>> {
     });
     found.sort_by_cached_key(|n| natural(n));
     Ok(found)
+}
+
+/// Those of `names` that are `start`, in small or capital letters, a number and an extension, by their numbers.
+pub(crate) fn numbered(names: &[String], start: &str) -> BTreeMap<usize, String> {
+    let number = |name: &str| -> Option<usize> {
+        let (name, _) = name.rsplit_once('.')?;
+        name.get(..start.len()).filter(|s| s.eq_ignore_ascii_case(start))?;
+        let number = &name[start.len()..];
+        number.bytes().all(|b| b.is_ascii_digit()).then(|| number.parse().ok())?
+    };
+    names.iter().filter_map(|n| Some((number(n)?, n.clone()))).collect()
 }
 
 /// A sort key that puts `view2` before `view10`: runs of digits count as numbers.
