@@ -46,12 +46,18 @@
 //! angles that DXchange, NXtomo or CIL keep there. A vendor's description may replace this file; see [`Vendor`].
 
 mod cil;
+mod differences;
+mod his;
 mod keys;
+mod obi;
+mod pixels;
 mod skyscan;
 mod turning;
 mod vendor;
+mod xim;
 mod xtekct;
 
+pub(crate) use pixels::Pixels;
 pub(crate) use vendor::Vendor;
 
 use crate::hdf5::ScanPart;

@@ -1,7 +1,8 @@
-//! Keys and values of vendors' INI files.
+//! Keys and values of vendors' texts: INI files and the leaves of XML elements.
 
 use crate::text::shortened;
 use conefield_core::{Error, Result};
+use roxmltree::Node;
 use std::collections::HashMap;
 
 /// The keys of all sections or elements of a text, in small and capital letters alike, with the file's name.
@@ -26,6 +27,15 @@ impl Keys {
             }
         }
         Ok(keys)
+    }
+
+    /// The elements below `node` that hold text only; of elements with one name the first counts.
+    pub fn xml(place: String, node: Node) -> Self {
+        let mut keys = Self { place, all: HashMap::new() };
+        for leaf in node.descendants().filter(|n| n.is_element() && !n.children().any(|c| c.is_element())) {
+            keys.add(leaf.tag_name().name(), leaf.text().unwrap_or_default().trim());
+        }
+        keys
     }
 
     /// Adds a value unless the key has one, and returns the one that it has.

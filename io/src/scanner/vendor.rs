@@ -1,13 +1,13 @@
 //! The files with which vendors describe a scan, and what they give in common: views, the names of the images, the open
 //! beam and a volume.
 
-use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, skyscan, xtekct};
+use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, his, obi, skyscan, xim, xtekct};
 use crate::input::LONGEST_TEXT;
 use crate::stack::Names;
 use crate::text::read_foreign;
 use conefield_core::Result;
 use conefield_core::geometry::{View, VoxelGrid};
-use ndarray::Array3;
+use ndarray::{Array3, Axis};
 use std::path::Path;
 
 /// Most views of a description: a circle in steps of about one second of arc.
@@ -25,6 +25,11 @@ const MOST_VOXELS: f64 = 512.0;
 pub(crate) enum Vendor {
     Nikon,
     SkyScan,
+    /// Varian's XIM.
+    TrueBeam,
+    /// Varian's HND and HNC.
+    Obi,
+    Elekta,
 }
 
 impl Vendor {
@@ -35,6 +40,7 @@ impl Vendor {
         let marks: &[(&str, Self)] = match &extension[..] {
             "xtekct" => return Some(Self::Nikon),
             "log" => &[(skyscan::MARK, Self::SkyScan)],
+            "xml" => &[(xim::MARK, Self::TrueBeam), (obi::MARK, Self::Obi), (his::MARK, Self::Elekta)],
             _ => return None,
         };
         let text = read_foreign(path, LONGEST_TEXT).ok()?;
@@ -46,6 +52,9 @@ impl Vendor {
         match self {
             Self::Nikon => xtekct::scan(path),
             Self::SkyScan => skyscan::scan(path),
+            Self::TrueBeam => xim::scan(path),
+            Self::Obi => obi::scan(path),
+            Self::Elekta => his::scan(path),
         }
         .map(Description::from)
     }
@@ -67,6 +76,7 @@ pub(super) struct VendorScan {
 
 /// The open beam.
 pub(super) enum Open {
+    Flat(Names),
     Number(f64),
     /// Estimated from the border of each view.
     Air,
@@ -78,12 +88,20 @@ pub(super) enum Response {
     /// Nothing: they are counts.
     #[default]
     Counts,
+    /// A factor for each view.
+    Factors(Vec<f32>),
+    /// They are the open beam of Elekta's detector less the counts.
+    Inverted,
 }
 
 impl Response {
-    pub fn apply(&self, _values: &mut Array3<f32>) {
+    pub fn apply(&self, values: &mut Array3<f32>) {
         match self {
             Self::Counts => {}
+            Self::Factors(all) => {
+                values.axis_iter_mut(Axis(0)).zip(all).for_each(|(mut view, factor)| view *= *factor);
+            }
+            Self::Inverted => values.mapv_inplace(|x| his::I0 - if (1.0..=65534.0).contains(&x) { x } else { 1.0 }),
         }
     }
 }
@@ -91,6 +109,7 @@ impl Response {
 impl From<VendorScan> for Description {
     fn from(scan: VendorScan) -> Self {
         let (flat, i0) = match scan.open {
+            Open::Flat(names) => (Some(names), None),
             Open::Number(n) => (None, Some(I0Text::Number(n))),
             Open::Air => (None, Some(I0Text::Word("air".into()))),
         };
