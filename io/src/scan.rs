@@ -87,7 +87,7 @@ pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
 pub(crate) fn find(path: &Path) -> Result<ScanFile> {
     let place = path.display().to_string();
     let understood = "a folder with scan.toml or scan.json (conefield), scanner.toml (a scanner's images) or \
-                      meta_data.json (R2-Gaussian), a pickle (NAF) or a vendor's file (.xtekct, .log, .xml)";
+                      meta_data.json (R2-Gaussian), a pickle (NAF) or a vendor's file (.xtekct, .log, .xml, .txrm)";
     let info = path.metadata().map_err(|e| Error::io(path, e))?;
     if !info.is_dir() {
         if pickle::is_pickle(path)? {

@@ -53,6 +53,7 @@ mod obi;
 mod pixels;
 mod skyscan;
 mod turning;
+mod txrm;
 mod vendor;
 mod xim;
 mod xtekct;

@@ -215,7 +215,7 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
         return Ok((pages(stack.values)?, Some(stack.numbers)));
     }
     if let Some(format) = Pixels::of(&head) {
-        return Ok((pages(format.read(path)?)?, Some(format!("{format:?}"))));
+        return Ok((pages(format.read(path, part)?)?, Some(format!("{format:?}"))));
     }
     if is_metaimage(&mut input, &head)? {
         // Columns are its x, rows its y.
@@ -223,7 +223,7 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
     }
     foreign::refuse(path, &head)?;
     let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), \
-                    MATLAB's .mat (4d 41 54 4c), HDF5 (89 48 44 46), MetaImage (NDims = 3), HIS, HND, HNC or XIM";
+                    MATLAB's .mat (4d 41 54 4c), HDF5 (89 48 44 46), MetaImage (NDims = 3), HIS, HND, HNC, XIM or TXRM";
     Err(Error::invalid(place, "format", format!("{head:02x?} at the start"), expected))
 }
 

@@ -1,6 +1,7 @@
 //! The images of vendors' detectors, recognized by their first bytes. `scanner.toml` can name them too.
 
-use super::{his, obi, xim};
+use super::{his, obi, txrm, xim};
+use crate::hdf5::ScanPart;
 use conefield_core::Result;
 use ndarray::Array3;
 use std::path::Path;
@@ -14,12 +15,14 @@ pub(crate) enum Pixels {
     Obi,
     /// Elekta's and PerkinElmer's HIS.
     His,
+    /// Zeiss' TXRM.
+    Txrm,
 }
 
 impl Pixels {
     /// The format of a file that starts with `head`.
     pub fn of(head: &[u8]) -> Option<Self> {
-        [(xim::MAGIC, Self::Xim), (obi::MAGIC, Self::Obi), (his::MAGIC, Self::His)]
+        [(xim::MAGIC, Self::Xim), (obi::MAGIC, Self::Obi), (his::MAGIC, Self::His), (txrm::MAGIC, Self::Txrm)]
             .into_iter()
             .find_map(|(magic, format)| head.starts_with(magic).then_some(format))
     }
@@ -31,15 +34,17 @@ impl Pixels {
             Self::Xim => xim::head(path).map(|h| one(h.size)),
             Self::Obi => obi::head(path).map(|h| one(h.size)),
             Self::His => his::shape(path),
+            Self::Txrm => txrm::shape(path),
         }
     }
 
-    /// The numbers, `[view, row, column]`.
-    pub fn read(self, path: &Path) -> Result<Array3<f32>> {
+    /// The numbers of `part`, `[view, row, column]`; a file without parts holds projections or a field of its own.
+    pub fn read(self, path: &Path, part: ScanPart) -> Result<Array3<f32>> {
         match self {
             Self::Xim => xim::read(path),
             Self::Obi => obi::read(path),
             Self::His => his::read(path),
+            Self::Txrm => txrm::read(path, part),
         }
     }
 }

@@ -246,7 +246,7 @@ mod tests {
             dir.path(),
             "bone_~00.log: scan: found a file of another kind, expected a folder with scan.toml or scan.json (conefield), \
              scanner.toml (a scanner's images) or meta_data.json (R2-Gaussian), a pickle (NAF) or a vendor's file \
-             (.xtekct, .log, .xml)",
+             (.xtekct, .log, .xml, .txrm)",
         );
     }
 }

@@ -1,7 +1,7 @@
 //! The files with which vendors describe a scan, and what they give in common: views, the names of the images, the open
 //! beam and a volume.
 
-use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, his, obi, skyscan, xim, xtekct};
+use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, his, obi, skyscan, txrm, xim, xtekct};
 use crate::input::LONGEST_TEXT;
 use crate::stack::Names;
 use crate::text::read_foreign;
@@ -30,6 +30,7 @@ pub(crate) enum Vendor {
     /// Varian's HND and HNC.
     Obi,
     Elekta,
+    Zeiss,
 }
 
 impl Vendor {
@@ -39,6 +40,7 @@ impl Vendor {
         let extension = path.extension()?.to_string_lossy().to_lowercase();
         let marks: &[(&str, Self)] = match &extension[..] {
             "xtekct" => return Some(Self::Nikon),
+            "txrm" => return Some(Self::Zeiss),
             "log" => &[(skyscan::MARK, Self::SkyScan)],
             "xml" => &[(xim::MARK, Self::TrueBeam), (obi::MARK, Self::Obi), (his::MARK, Self::Elekta)],
             _ => return None,
@@ -55,6 +57,7 @@ impl Vendor {
             Self::TrueBeam => xim::scan(path),
             Self::Obi => obi::scan(path),
             Self::Elekta => his::scan(path),
+            Self::Zeiss => txrm::scan(path),
         }
         .map(Description::from)
     }
