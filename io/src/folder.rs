@@ -1,7 +1,7 @@
 //! Names of files in a folder: those in a scan's description stay inside it, those of a series come in order.
 
 use conefield_core::{Error, Result};
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::path::{Component, Path, PathBuf};
 
 /// The file `name` in `folder`; refuses anything but a plain file name.
@@ -98,6 +98,39 @@ pub(crate) fn names(folder: &Path, ends: &[&str]) -> Result<Vec<String>> {
     });
     found.sort_by_cached_key(|n| natural(n));
     Ok(found)
+}
+
+/// The files in `folder` and in folders at most `depth` below it whose names end in one of `ends`, as relative paths with
+/// slashes, in the order of [`names`]. Links to folders are not followed.
+pub(crate) fn below(folder: &Path, depth: usize, ends: &[&str]) -> Result<Vec<String>> {
+    let mut found = names(folder, ends)?;
+    if depth == 0 {
+        return Ok(found);
+    }
+    let io = |e| Error::io(folder, e);
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        let entry = entry.map_err(io)?;
+        let (is_folder, Ok(name)) = (entry.file_type().is_ok_and(|t| t.is_dir()), entry.file_name().into_string())
+        else {
+            continue;
+        };
+        if is_folder {
+            found.extend(below(&entry.path(), depth - 1, ends)?.into_iter().map(|n| format!("{name}/{n}")));
+        }
+    }
+    found.sort_by_cached_key(|n| natural(n));
+    Ok(found)
+}
+
+/// Those of `names` that are `start`, in small or capital letters, a number and an extension, by their numbers.
+pub(crate) fn numbered(names: &[String], start: &str) -> BTreeMap<usize, String> {
+    let number = |name: &str| -> Option<usize> {
+        let (name, _) = name.rsplit_once('.')?;
+        name.get(..start.len()).filter(|s| s.eq_ignore_ascii_case(start))?;
+        let number = &name[start.len()..];
+        number.bytes().all(|b| b.is_ascii_digit()).then(|| number.parse().ok())?
+    };
+    names.iter().filter_map(|n| Some((number(n)?, n.clone()))).collect()
 }
 
 /// A sort key that puts `view2` before `view10`: runs of digits count as numbers.

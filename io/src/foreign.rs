@@ -1,5 +1,5 @@
-//! Files of scanners and programs that conefield does not read: one message for each, which names the format and the way
-//! to a format that is read, whatever command meets the file.
+//! Files of scanners and programs that conefield does not read, or not alone: one message for each, which names the format
+//! and what to name or convert instead, whatever command meets the file.
 
 use conefield_core::{Error, Result, files};
 use std::io::Read;
@@ -11,39 +11,38 @@ const HEAD: u64 = 64;
 /// Most files of a folder that are looked at.
 const MOST_FILES: usize = 64;
 
-const RTK: &str = "convert the projections with rtkprojections and the geometry with RTK's program for this machine \
-                   (rtkvarianobigeometry, rtkvarianprobeamgeometry, rtkelektasynergygeometry), and describe both in a \
-                   scanner.toml with [rtk] and kind = \"line-integrals\" (docs/guide/formats.md)";
-const ZEISS: &str = "export the projections as TIFF and describe them in a scanner.toml (docs/guide/formats.md), or \
-                     convert the file to Data Exchange (HDF5)";
 const EXPORT: &str = "export TIFF, NumPy, MetaImage or NIfTI files, and describe projections in a scanner.toml \
                       (docs/guide/formats.md)";
-
 const MAT: &str = "save a volume as .npy, and describe projections in a scanner.toml (docs/guide/formats.md)";
+const OBI: &str = "name the ProjectionInfo.xml of its scan, or describe the images in a scanner.toml \
+                   (docs/guide/formats.md)";
+const XIM: &str = "name the Scan.xml of its scan, or describe the images in a scanner.toml (docs/guide/formats.md)";
+const HIS: &str = "name the _Frames.xml of its scan, or describe the images in a scanner.toml (docs/guide/formats.md)";
+const ZEISS: &str = "a scan of Zeiss is read from its .txrm, and a volume from TIFF files; describe other projections in \
+                     a scanner.toml (docs/guide/formats.md)";
 
 /// First bytes of a file, the format's name and what to do.
 const FORMATS: &[(&[u8], &str, &str)] = &[
-    (b"VARIAN_VA_INTERNAL_HND", "Varian's HND, projections of an On-Board Imager", RTK),
-    (b"VARIAN_VA_INTERNAL", "Varian's HNC or HNA, projections of an On-Board Imager", RTK),
-    (b"VMS.XI", "Varian's XIM, projections of a TrueBeam or ProBeam", RTK),
+    (b"VARIAN_VA_INTERNAL_HND", "Varian's HND, an image of a scan: not read alone", OBI),
+    (b"VARIAN_VA_INTERNAL_HNC", "Varian's HNC, an image of a scan: not read alone", OBI),
+    (b"VMS.XI", "Varian's XIM, an image of a scan: not read alone", XIM),
     // Type 0x7000, a header of 68 bytes, whose image part has another 32.
-    (b"\x00\x70\x44\x00", "HIS, projections of an Elekta or PerkinElmer detector", RTK),
-    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "an OLE file such as Zeiss' TXRM and TXM", ZEISS),
-    (b"MATLAB ", "MATLAB's MAT file", MAT),
-    (b"SIMPLE  =", "FITS", EXPORT),
-    (b"\x89PNG\r\n", "PNG", EXPORT),
-    (b"\xff\xd8\xff", "JPEG", EXPORT),
-    (b"ncaa", "VFF", EXPORT),
+    (b"\x00\x70\x44\x00", "HIS, an image of a scan: not read alone", HIS),
+    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "an OLE file such as Zeiss' TXM: not read here", ZEISS),
+    (b"MATLAB ", "MATLAB's MAT file: not read", MAT),
+    (b"SIMPLE  =", "FITS: not read", EXPORT),
+    (b"\x89PNG\r\n", "PNG: not read", EXPORT),
+    (b"\xff\xd8\xff", "JPEG: not read", EXPORT),
+    (b"ncaa", "VFF: not read", EXPORT),
 ];
 
 /// Extensions of these formats, for files that no mark identifies.
 const EXTENSIONS: &[(&str, &str, &str)] = &[
-    ("hnd", "Varian's HND, projections of an On-Board Imager", RTK),
-    ("hnc", "Varian's HNC, projections of an On-Board Imager", RTK),
-    ("xim", "Varian's XIM, projections of a TrueBeam or ProBeam", RTK),
-    ("his", "HIS, projections of an Elekta or PerkinElmer detector", RTK),
-    ("txrm", "Zeiss' TXRM", ZEISS),
-    ("txm", "Zeiss' TXM", ZEISS),
+    ("hnd", "Varian's HND, an image of a scan: not read alone", OBI),
+    ("hnc", "Varian's HNC, an image of a scan: not read alone", OBI),
+    ("xim", "Varian's XIM, an image of a scan: not read alone", XIM),
+    ("his", "HIS, an image of a scan: not read alone", HIS),
+    ("txm", "Zeiss' TXM, a volume: not read", ZEISS),
 ];
 
 /// The name of the format of `path`, which starts with `head`, and what to do.
@@ -58,7 +57,7 @@ fn format(path: &Path, head: &[u8]) -> Option<(&'static str, &'static str)> {
 /// recognized it.
 pub(crate) fn refuse(path: &Path, head: &[u8]) -> Result<()> {
     match format(path, head) {
-        Some((name, way)) => Err(Error::unsupported(format!("{}: {name}: not read", path.display()), way)),
+        Some((name, way)) => Err(Error::unsupported(format!("{}: {name}", path.display()), way)),
         None => Ok(()),
     }
 }
@@ -95,7 +94,7 @@ mod tests {
             ("c.hnc", b"VARIAN_VA_INTERNAL_HNCU_1.0", "HNC"),
             ("d.xim", b"VMS.XI\0\0", "XIM"),
             ("e.HIS", b"", "HIS"),
-            ("f.txrm", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "TXRM"),
+            ("f.txm", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "TXM"),
         ] {
             std::fs::write(at(name), bytes).unwrap();
             for said in [

@@ -5,8 +5,8 @@
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.
-//! - Projections from scanners: [`read_scanner`] (a description in TOML; TIFF, NumPy, HDF5, RTK's XML geometry; Nikon's
-//!   description), as [`Stored`]: line integrals or counts.
+//! - Projections from scanners: [`read_scanner`] (a description in TOML; TIFF, NumPy, HDF5, RTK's XML geometry; the
+//!   files of vendors), as [`Stored`]: line integrals or counts.
 //! - Sizes, before memory is allocated: [`scan_size`], [`scanner_size`], [`volume_voxels`].
 //! - Weights: [`read_weights`], [`write_weights`]; checkpoints: [`read_checkpoint`], [`write_checkpoint`]
 //!   (safetensors).

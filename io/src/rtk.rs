@@ -10,31 +10,28 @@
 //!
 //! RTK names no unit of length; conefield uses mm. Angles are degrees.
 
-use crate::text::read_foreign;
+use crate::text::{self, read_foreign};
 use crate::write_text_atomic;
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Vec3, View, cross, dot, norm, sub};
-use conefield_core::{Error, Result, allowance};
-use roxmltree::{Document, Node, ParsingOptions};
+use conefield_core::{Error, Result};
+use roxmltree::Node;
 use std::path::Path;
 
 const ROOT: &str = "RTKThreeDCircularGeometry";
-/// Longest file, in bytes, and most nodes of the parser: fifty thousand views.
+/// Longest file, in bytes: fifty thousand views.
 const LONGEST: u64 = 64 << 20;
-const MOST_NODES: u32 = 4_000_000;
-/// Most bytes that a byte of the text expands to: a node takes about a hundred, and four bytes of text can make one.
-const NODE_BYTES: u64 = 24;
 
 /// RTK's nine numbers of one projection, lengths in mm, angles in degrees.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Projection {
-    sid: f64,
-    sdd: f64,
-    gantry: f64,
-    out_of_plane: f64,
-    in_plane: f64,
-    source: [f64; 2],
-    detector: [f64; 2],
+pub(crate) struct Projection {
+    pub sid: f64,
+    pub sdd: f64,
+    pub gantry: f64,
+    pub out_of_plane: f64,
+    pub in_plane: f64,
+    pub source: [f64; 2],
+    pub detector: [f64; 2],
 }
 
 /// Converts RTK's axes to conefield's.
@@ -75,7 +72,7 @@ impl Projection {
     }
 
     /// The view, for a pixel size and a shift of the image's centre along v and u, in mm.
-    fn view(&self, pixel: [f64; 2], offset: [f64; 2]) -> View {
+    pub fn view(&self, pixel: [f64; 2], offset: [f64; 2]) -> View {
         let [x, y, z] = self.axes();
         let at = |p: f64, q: f64, r: f64| ours(std::array::from_fn(|k| p * x[k] + q * y[k] + r * z[k]));
         View {
@@ -147,11 +144,7 @@ pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 
     let path = path.as_ref();
     let place = path.display().to_string();
     let text = read_foreign(path, LONGEST)?;
-    allowance::memory(&place, "XML", (text.len() as u64).saturating_mul(NODE_BYTES))?;
-    // RTK writes a document type without content; the parser limits entities.
-    let options = ParsingOptions { allow_dtd: true, nodes_limit: MOST_NODES, ..ParsingOptions::default() };
-    let document =
-        Document::parse_with_options(&text, options).map_err(|e| Error::invalid(&place, "XML", e, "RTK's geometry"))?;
+    let document = text::xml(&place, &text, "RTK's geometry")?;
     let root = document.root_element();
     let name = root.tag_name().name();
     ensure(name == ROOT, &place, "root element", format!("<{name}>"), format!("<{ROOT}>"))?;

@@ -34,7 +34,7 @@ pub(crate) enum ScanFile {
 
 /// Reads a scan from conefield's own folder (`scan.toml` or `scan.json`), R2-Gaussian's folder (`meta_data.json`, the
 /// training views), NAF's pickle of any name (the training views), or a scanner's files through their description
-/// (`scanner.toml` or Nikon's `.xtekct`, see [`read_scanner`](crate::read_scanner)). For folders, the path may also
+/// (`scanner.toml` or a vendor's file, see [`read_scanner`](crate::read_scanner)). For folders, the path may also
 /// name the description file.
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Stored> {
     let scan = match find(path.as_ref())? {
@@ -87,13 +87,13 @@ pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
 pub(crate) fn find(path: &Path) -> Result<ScanFile> {
     let place = path.display().to_string();
     let understood = "a folder with scan.toml or scan.json (conefield), scanner.toml (a scanner's images) or \
-                      meta_data.json (R2-Gaussian), a pickle (NAF) or Nikon's .xtekct";
+                      meta_data.json (R2-Gaussian), a pickle (NAF) or a vendor's file (.xtekct, .log, .xml, .txrm)";
     let info = path.metadata().map_err(|e| Error::io(path, e))?;
     if !info.is_dir() {
         if pickle::is_pickle(path)? {
             return Ok(ScanFile::Naf(path.to_path_buf()));
         }
-        if scanner::is_xtekct(path) {
+        if scanner::Vendor::of(path).is_some() {
             return Ok(ScanFile::Scanner(path.to_path_buf()));
         }
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));

@@ -44,13 +44,23 @@
 //! are degrees, as their keys say.
 //!
 //! In an HDF5 file, `scan.h5:/PATH` names a data set; `scan.h5` alone means the projections, open beam, dark field or
-//! angles that DXchange, NXtomo or CIL keep there. Nikon's description, `.xtekct`, may replace this file.
+//! angles that DXchange, NXtomo or CIL keep there. A vendor's description may replace this file; see [`Vendor`].
 
 mod cil;
+mod differences;
+mod his;
+mod keys;
+mod obi;
+mod pixels;
+mod skyscan;
 mod turning;
+mod txrm;
+mod vendor;
+mod xim;
 mod xtekct;
 
-pub(crate) use xtekct::is_xtekct;
+pub(crate) use pixels::Pixels;
+pub(crate) use vendor::Vendor;
 
 use crate::hdf5::ScanPart;
 use crate::rtk::read_rtk_geometry;
@@ -67,6 +77,7 @@ use ndarray::{Array2, Array3, Axis};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::Path;
+use vendor::Response;
 
 pub(crate) const FORMAT: &str = "conefield-scanner";
 pub(crate) const VERSION: u32 = 1;
@@ -161,19 +172,28 @@ struct Description {
     #[serde(default)]
     values: ValuesTable,
     volume: VoxelGrid,
+    /// The views, if a vendor's files give them.
+    #[serde(skip)]
+    views: Option<Vec<View>>,
     /// Rows and columns of the detector, if the description states them.
     #[serde(skip)]
     detector: Option<[usize; 2]>,
+    /// What makes counts of the numbers in the images.
+    #[serde(skip)]
+    response: Response,
     /// Warnings for the user.
     #[serde(skip)]
     remarks: Vec<String>,
 }
 
 impl Description {
-    /// Reads the description `path`: Nikon's or conefield's own, according to its name.
+    /// Reads the description `path`, a vendor's or conefield's own.
     fn read(path: &Path) -> Result<Self> {
+        if let Some(vendor) = Vendor::of(path) {
+            return vendor.description(path);
+        }
         refuse_images(path)?;
-        if is_xtekct(path) { xtekct::description(path) } else { described(path, FORMAT, VERSION) }
+        described(path, FORMAT, VERSION)
     }
 }
 
@@ -307,7 +327,8 @@ struct ValuesTable {
     flat_includes_dark: Option<bool>,
 }
 
-/// Reads the scan described by `path`, a TOML (or JSON) file or Nikon's `.xtekct`; the module's source lists the keys.
+/// Reads the scan described by `path`, a TOML (or JSON) file, whose keys the module's source lists, or the file of a
+/// vendor, which takes its place.
 ///
 /// Files are relative to the description's folder and stay in it. Counts require a flat field, `i0` of the description or
 /// `i0`, which replaces both; `floor` replaces the description's. The geometry is checked against the shape of the
@@ -322,7 +343,9 @@ pub fn read_scanner(path: impl AsRef<Path>, i0: Option<I0>, floor: Option<f64>) 
     let layout = layout(&place, &d.layout)?;
     let i0 = open_beam(&place, &d, i0, floor)?;
     let read = |field: &str, part, names: &Names| stack::read_field(folder, &place, field, part, names, layout);
-    let values = stack::read(folder, &place, "files.projections", ScanPart::Projections, &d.files.projections, layout)?;
+    let field = "files.projections";
+    let mut values = stack::read(folder, &place, field, ScanPart::Projections, &d.files.projections, layout)?;
+    d.response.apply(&mut values);
     let (count, rows, columns) = values.dim();
     if let Some([r, c]) = d.detector.filter(|found| *found != [rows, columns]) {
         let expected = format!("{r} x {c} (rows x columns), as the detector has");
@@ -456,6 +479,10 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
         let expected = format!("{count}, one for each view in the projections");
         ensure(n == count, place, field, format!("{n} of them"), expected)
     };
+    if let Some(views) = &d.views {
+        fits("views", views.len())?;
+        return Ok(views.clone());
+    }
     match (&d.circle, &d.vectors, &d.rtk, &d.cil) {
         (Some(c), None, None, None) => {
             let angles = angles(folder, place, c, count)?;

@@ -1,8 +1,9 @@
-//! Stacks of projections and single fields from TIFF, `.npy`, `.npz`, `.mat`, MetaImage and HDF5, reordered to
-//! `[view, row, column]`.
+//! Stacks of projections and single fields from TIFF, `.npy`, `.npz`, `.mat`, MetaImage, HDF5 and the images of vendors'
+//! detectors, reordered to `[view, row, column]`.
 
 use crate::hdf5::{self, ScanPart};
 use crate::input::Input;
+use crate::scanner::Pixels;
 use crate::{folder, foreign, mat, memory, metaimage, npy, npz, text, tiff};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
@@ -69,8 +70,8 @@ struct StackFile {
 
 /// Reads a stack `[view, row, column]` from a sequence of files, each with one view (two axes) or several.
 ///
-/// Names are relative to `folder` and stay in it. A folder stands for its TIFF files, or its `.npy` files if it has
-/// none, in the order of the numbers in their names. From an HDF5 file that holds a whole scan, `part` is read.
+/// Names are relative to `folder` and stay in it. A folder stands for its TIFF files, if it has none for its `.npy` files,
+/// and then for the images of a vendor, in the order of the numbers in their names. From an HDF5 file that holds a whole scan, `part` is read.
 pub(crate) fn read(
     folder: &Path,
     place: &str,
@@ -131,6 +132,8 @@ pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> 
             product(&mat::shape(&path, array.as_deref())?)
         } else if head == hdf5::MAGIC {
             product(&hdf5::shape(&path, array.as_deref(), ScanPart::Projections)?)
+        } else if let Some(pixels) = Pixels::of(&head) {
+            product(&pixels.shape(&path)?)
         } else if is_metaimage(&mut input, &head)? {
             product(&metaimage::shape(&path)?)
         } else {
@@ -211,13 +214,16 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
         let stack = tiff::read(path)?;
         return Ok((pages(stack.values)?, Some(stack.numbers)));
     }
+    if let Some(format) = Pixels::of(&head) {
+        return Ok((pages(format.read(path, part)?)?, Some(format!("{format:?}"))));
+    }
     if is_metaimage(&mut input, &head)? {
         // Columns are its x, rows its y.
         return Ok((pages(metaimage::read(path)?.data.reversed_axes())?, None));
     }
     foreign::refuse(path, &head)?;
     let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), \
-                    MATLAB's .mat (4d 41 54 4c), HDF5 (89 48 44 46) or MetaImage (NDims = 3)";
+                    MATLAB's .mat (4d 41 54 4c), HDF5 (89 48 44 46), MetaImage (NDims = 3), HIS, HND, HNC, XIM or TXRM";
     Err(Error::invalid(place, "format", format!("{head:02x?} at the start"), expected))
 }
 
@@ -253,14 +259,21 @@ fn source(folder: &Path, place: &str, field: &str, name: &str, oddities: &mut Ve
     if path.is_file() {
         return Ok(vec![StackFile { path, array }]);
     }
-    let mut chosen = folder::names(&path, &["tif", "tiff"])?;
-    if chosen.is_empty() {
-        chosen = folder::names(&path, &["npy"])?;
+    let mut chosen = Vec::new();
+    for ends in [&["tif", "tiff"][..], &["npy"], &["his"], &["hnd", "hnc"], &["xim"]] {
+        if chosen.is_empty() {
+            chosen = folder::names(&path, ends)?;
+        }
     }
     if chosen.is_empty() {
         foreign::refuse_folder(&path)?;
         let what = format!("a folder \"{file}\" without them");
-        return Err(Error::invalid(place, field, what, "a folder with .tif, .tiff or .npy files"));
+        return Err(Error::invalid(
+            place,
+            field,
+            what,
+            "a folder with .tif, .tiff, .npy, .his, .hnd, .hnc or .xim files",
+        ));
     }
     oddities.extend(folder::oddity(&chosen));
     let inside = chosen.iter().map(|n| {

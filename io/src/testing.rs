@@ -16,6 +16,27 @@ pub(crate) fn says<T>(result: Result<T>, words: &[&str]) {
     assert!(words.iter().all(|w| e.contains(w)), "{words:?} are not all in: {e}");
 }
 
+/// Fails unless `result` is an error with just these words, in which names of files are relative to `dir`.
+pub(crate) fn says_just<T>(result: Result<T>, dir: &Path, words: &str) {
+    let Err(e) = result else { panic!("no error: {words}") };
+    assert_eq!(e.to_string().replace(&format!("{}/", dir.display()), ""), words);
+}
+
+/// Fails unless source, detector, u and v are `want`, to a billionth.
+pub(crate) fn is_view(found: &View, want: [[f64; 3]; 4]) {
+    for (found, want) in [found.source, found.detector, found.u, found.v].into_iter().zip(want) {
+        assert!((0..3).all(|k| (found[k] - want[k]).abs() < 1e-9), "{found:?} is not {want:?}");
+    }
+}
+
+/// Writes a 16-bit TIFF with the pixels that `f` gives for row and column.
+pub(crate) fn tiff16(path: &Path, [rows, columns]: [usize; 2], f: impl Fn(usize, usize) -> u16) {
+    use tiff::encoder::{TiffEncoder, colortype::Gray16};
+    let pixels: Vec<u16> = (0..rows * columns).map(|i| f(i / columns, i % columns)).collect();
+    let file = std::fs::File::create(path).unwrap();
+    TiffEncoder::new(file).unwrap().write_image::<Gray16>(columns as u32, rows as u32, &pixels).unwrap();
+}
+
 /// A file called `name` in a folder of its own.
 pub(crate) fn file(name: &str, parts: &[&[u8]]) -> (TempDir, PathBuf) {
     let dir = tempfile::tempdir().unwrap();

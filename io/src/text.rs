@@ -4,7 +4,8 @@
 use crate::input::LONGEST_TEXT;
 use conefield_core::error::ensure;
 use conefield_core::files::{BYTE_ORDER_MARK, read_text, read_text_bytes, toml_line};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, allowance};
+use roxmltree::{Document, ParsingOptions};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use std::path::Path;
@@ -73,6 +74,19 @@ fn windows_1252(bytes: &[u8]) -> String {
     ];
     let decoded = |b: &u8| HIGH.get(usize::from(b.wrapping_sub(0x80))).copied().unwrap_or(char::from(*b));
     bytes.iter().map(decoded).collect()
+}
+
+/// Most nodes of an XML text: fifty thousand views of RTK's.
+const MOST_NODES: u32 = 4_000_000;
+/// Most bytes that a byte of XML expands to: a node takes about a hundred, and four bytes of text can make one.
+const NODE_BYTES: u64 = 24;
+
+/// Parses the XML `text` of the file `place`, in which `expected` should be. The parser limits entities.
+pub(crate) fn xml<'t>(place: &str, text: &'t str, expected: &str) -> Result<Document<'t>> {
+    allowance::memory(place, "XML", (text.len() as u64).saturating_mul(NODE_BYTES))?;
+    // Document types may stand there, without content.
+    let options = ParsingOptions { allow_dtd: true, nodes_limit: MOST_NODES, ..ParsingOptions::default() };
+    Document::parse_with_options(text, options).map_err(|e| Error::invalid(place, "XML", e, expected))
 }
 
 /// Parses `text`, the content of `path`.

@@ -67,7 +67,7 @@ fn one_directory(counted: Option<usize>, stored: usize) -> impl Fn(&Path) + Sync
 /// A view of Varian's format, named in `args`.
 fn hnd(what: &'static str, args: &'static str) -> Case {
     let make = |d: &Path| put(d.join("a.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0");
-    refused(what, make, args, &["a.hnd", "Varian's HND", "rtkprojections"])
+    refused(what, make, args, &["a.hnd", "Varian's HND", "ProjectionInfo.xml"])
 }
 
 pub fn cases() -> Vec<Case> {
@@ -139,12 +139,12 @@ pub fn cases() -> Vec<Case> {
             }
             put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
         }, IMPORT, ["files.projections", "flat.tif and view_1.tif", "two series"].ends(End::Warned);
-        "HND of Varian in place of images", |d| {
+        "HND of Varian, cut off", |d| {
             scanner_tiff(d);
             std::fs::create_dir(d.join("views")).unwrap();
             put(d.join("views/Proj_00001.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0");
             put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
-        }, IMPORT, ["Proj_00001.hnd", "Varian's HND", "rtkprojections"];
+        }, IMPORT, ["Proj_00001.hnd", "header", "512 bytes"];
     };
     all.extend([
         hnd("HND of Varian, asked about", "info a.hnd"),

@@ -10,48 +10,29 @@
 //! The angles are those of the stage in `_ctdata.txt` or `Name.ang` (rows of a projection's number and its angle, as
 //! TIGRE reads them), unless `AngleFile_Use` is `False`; without such a file, even steps.
 
+use super::keys::Keys;
 use super::turning::TurningObject;
-use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, Vectors};
+use super::vendor::{MOST_PIXELS, MOST_VIEWS, Open, Response, VendorScan, field_of_view};
 use crate::folder;
 use crate::input::LONGEST_TEXT;
 use crate::scan_folder::folder_of;
 use crate::stack::Names;
-use crate::table::Numbers;
 use crate::text::{read_foreign, shortened, unread};
-use conefield_core::geometry::{View, VoxelGrid};
+use conefield_core::geometry::VoxelGrid;
 use conefield_core::{Error, Result};
-use std::collections::HashMap;
 use std::path::Path;
-
-/// Most views of a description: a circle in steps of about one second of arc.
-const MOST_VIEWS: f64 = 1e6;
 
 /// Share of a step by which measured angles may differ from even steps before a warning.
 const UNEVEN: f64 = 0.1;
 
-/// Whether `path` has the extension of such a file.
-pub(crate) fn is_xtekct(path: &Path) -> bool {
-    path.extension().is_some_and(|e| e.eq_ignore_ascii_case("xtekct"))
-}
-
-/// The scan as a description in the terms of `scanner.toml`.
-pub(super) fn description(path: &Path) -> Result<Description> {
+pub(super) fn scan(path: &Path) -> Result<VendorScan> {
     let text = read_foreign(path, LONGEST_TEXT)?;
-    let keys = Keys::of(path.display().to_string(), &text)?;
-    let whole = |key: &str, most: f64| -> Result<usize> {
-        let found = keys.number(key)?;
-        let fits = found.fract() == 0.0 && (1.0..=most).contains(&found);
-        if fits {
-            Ok(found as usize)
-        } else {
-            Err(keys.invalid(key, found, format!("a whole number from 1 to {most}")))
-        }
-    };
+    let keys = Keys::ini(path.display().to_string(), &text, KNOWN)?;
     if let Some(unit) = keys.text("Units").filter(|u| !u.eq_ignore_ascii_case("mm")) {
         return Err(keys.invalid("Units", shortened(unit), "mm"));
     }
-    let count = whole("Projections", MOST_VIEWS)?;
-    let [columns, rows] = [whole("DetectorPixelsX", 1e6)?, whole("DetectorPixelsY", 1e6)?];
+    let count = keys.whole("Projections", MOST_VIEWS)?;
+    let [columns, rows] = [keys.whole("DetectorPixelsX", MOST_PIXELS)?, keys.whole("DetectorPixelsY", MOST_PIXELS)?];
     let [column, row] = [keys.length("DetectorPixelSizeX")?, keys.length("DetectorPixelSizeY")?];
     let [object, detector] = [keys.length("SrcToObject")?, keys.length("SrcToDetector")?];
     let [aside_detector, above] = [keys.or("DetectorOffsetX", 0.0)?, keys.or("DetectorOffsetY", 0.0)?];
@@ -71,27 +52,19 @@ pub(super) fn description(path: &Path) -> Result<Description> {
         // Rx(tilt)·Ry(roll)·z.
         axis_direction: [roll.sin(), -tilt.sin() * roll.cos(), tilt.cos() * roll.cos()],
     };
-    let numbers = |v: View| [v.source, v.detector, v.u, v.v].concat();
     let mut remarks = Vec::new();
     let angles = angles(&keys, path, count, &mut remarks)?;
-    let cone_vec = rest.views(angles.into_iter().map(|a| a - 180.0)).into_iter().map(numbers).collect();
-    remarks.extend(unread(&keys.others()));
-    Ok(Description {
-        _format: String::new(),
-        _version: 0,
-        files: Files { projections: projections(&keys, path, count, &mut remarks), flat: None, dark: None },
-        circle: None,
-        vectors: Some(Vectors { cone_vec: Some(Numbers::List(cone_vec)), parallel_vec: None }),
-        rtk: None,
-        cil: None,
-        layout: LayoutTable::default(),
-        values: ValuesTable {
-            kind: ValueKind::Counts,
-            i0: Some(I0Text::Number(keys.length("WhiteLevel")?)),
-            ..ValuesTable::default()
-        },
-        volume: volume(&keys, [columns, rows], [column, row].map(|x| x * object / detector))?,
-        detector: Some([rows, columns]),
+    let white = keys.length("WhiteLevel")?;
+    let projections = projections(&keys, path, count, &mut remarks);
+    remarks.extend(unread(&keys.others(MOVING, KNOWN)));
+    let at_axis = [row, column].map(|x| x * object / detector);
+    Ok(VendorScan {
+        views: rest.views(angles.into_iter().map(|a| a - 180.0)),
+        detector: [rows, columns],
+        projections,
+        open: Open::Number(white),
+        response: Response::Counts,
+        volume: volume(&keys, [rows, columns], at_axis, &mut remarks)?,
         remarks,
     })
 }
@@ -132,7 +105,7 @@ fn measured_angles(
     let Some(file) = wanted.iter().find_map(|w| names.iter().find(|n| n.eq_ignore_ascii_case(w))) else {
         return Ok(None);
     };
-    let path = folder::inside(folder, &keys.1, "angles", file)?;
+    let path = folder::inside(folder, keys.place(), "angles", file)?;
     let place = path.display().to_string();
     let mut rows: Vec<(usize, f64)> = Vec::new();
     for line in read_foreign(&path, LONGEST_TEXT)?.lines().filter(|l| !l.trim().is_empty()) {
@@ -176,21 +149,16 @@ fn projections(keys: &Keys, path: &Path, count: usize, remarks: &mut Vec<String>
     };
     let start = format!("{}{}", text("Name"), text("InputSeparator"));
     let digits = text("InputDigits").parse().unwrap_or(4usize).min(9);
-    let within = folder::within(folder_of(path), &keys.1, "InputFolderName", folder);
+    let within = folder::within(folder_of(path), keys.place(), "InputFolderName", folder);
     // The reader of the images reports a folder that is not there.
     let all = within.and_then(|f| folder::names(&f, &["tif", "tiff"])).unwrap_or_default();
-    let number = |name: &str| -> Option<usize> {
-        let (name, _) = name.rsplit_once('.')?;
-        name.get(..start.len()).filter(|s| s.eq_ignore_ascii_case(&start))?;
-        name[start.len()..].bytes().all(|b| b.is_ascii_digit()).then(|| name[start.len()..].parse().ok())?
-    };
-    let mut numbered: HashMap<usize, &String> = all.iter().filter_map(|n| Some((number(n)?, n))).collect();
+    let mut numbered = folder::numbered(&all, &start);
     if !numbered.contains_key(&1) {
         return Names::One(folder.to_owned());
     }
     let name = |i: usize| {
         // A missing image is reported with the name that it should have.
-        let name = numbered.remove(&i).cloned().unwrap_or_else(|| format!("{start}{i:0digits$}.tif"));
+        let name = numbered.remove(&i).unwrap_or_else(|| format!("{start}{i:0digits$}.tif"));
         format!("{folder}/{name}")
     };
     let names = (1..=count).map(name).collect();
@@ -201,75 +169,19 @@ fn projections(keys: &Keys, path: &Path, count: usize, remarks: &mut Vec<String>
     Names::Many(names)
 }
 
-/// The volume in the file, else as many voxels as pixels, with the pixel size at the axis.
-fn volume(keys: &Keys, [columns, rows]: [usize; 2], [across, along]: [f64; 2]) -> Result<VoxelGrid> {
+/// The volume in the file, else one as wide as the detector's field of view.
+fn volume(keys: &Keys, detector: [usize; 2], at_axis: [f64; 2], remarks: &mut Vec<String>) -> Result<VoxelGrid> {
     let axes = ["X", "Y", "Z"];
-    let named = axes.iter().all(|a| keys.0.contains_key(&format!("Voxels{a}")));
-    let (shape, spacing) = if named {
-        let numbers =
-            |name: &str| -> Result<Vec<f64>> { axes.iter().map(|a| keys.length(&format!("{name}{a}"))).collect() };
-        let (n, size) = (numbers("Voxels")?, numbers("VoxelSize")?);
-        ([n[0], n[1], n[2]].map(|x| x as usize), [size[0], size[1], size[2]])
-    } else {
-        ([columns, columns, rows], [across, across, along])
-    };
-    let grid = VoxelGrid { shape, spacing, center: [0.0; 3] };
-    grid.validate(&keys.1)?;
+    if !axes.iter().all(|a| keys.has(&format!("Voxels{a}"))) {
+        return field_of_view(keys.place(), detector, at_axis, 0.0, remarks);
+    }
+    let numbers =
+        |name: &str| -> Result<Vec<f64>> { axes.iter().map(|a| keys.length(&format!("{name}{a}"))).collect() };
+    let (n, size) = (numbers("Voxels")?, numbers("VoxelSize")?);
+    let shape = [n[0], n[1], n[2]].map(|x| x as usize);
+    let grid = VoxelGrid { shape, spacing: [size[0], size[1], size[2]], center: [0.0; 3] };
+    grid.validate(keys.place())?;
     Ok(grid)
-}
-
-/// The keys of all sections, with the file's name.
-struct Keys(HashMap<String, String>, String);
-
-impl Keys {
-    fn of(place: String, text: &str) -> Result<Self> {
-        let mut all = HashMap::new();
-        for (i, line) in text.lines().enumerate() {
-            let Some((key, value)) = line.split_once('=') else { continue };
-            let (key, value) = (key.trim().to_owned(), value.trim().to_owned());
-            // Later sections may use the same names for other devices.
-            if all.get(&key).is_some_and(|v| *v != value) && KNOWN.contains(&key.as_str()) {
-                let at = format!("{place}: line {}", i + 1);
-                return Err(Error::invalid(at, key, format!("a second value, {value}"), "one value"));
-            }
-            all.entry(key).or_insert(value);
-        }
-        Ok(Self(all, place))
-    }
-
-    fn invalid(&self, key: &str, found: impl ToString, expected: impl Into<String>) -> Error {
-        Error::invalid(&self.1, key, found, expected)
-    }
-
-    /// The text of a key; an empty one counts as absent.
-    fn text(&self, key: &str) -> Option<&str> {
-        self.0.get(key).map(String::as_str).filter(|v| !v.is_empty())
-    }
-
-    fn number(&self, key: &str) -> Result<f64> {
-        let Some(text) = self.0.get(key) else { return Err(self.invalid(key, "nothing", "a number")) };
-        let found = text.parse::<f64>().ok().filter(|x| x.is_finite());
-        found.ok_or_else(|| self.invalid(key, shortened(text), "a number"))
-    }
-
-    fn length(&self, key: &str) -> Result<f64> {
-        let found = self.number(key)?;
-        if found > 0.0 { Ok(found) } else { Err(self.invalid(key, found, "a number above 0")) }
-    }
-
-    fn or(&self, key: &str, otherwise: f64) -> Result<f64> {
-        if self.text(key).is_some() { self.number(key) } else { Ok(otherwise) }
-    }
-
-    /// Keys that may move source, detector, object or volume and are not read, with their values.
-    fn others(&self) -> Vec<String> {
-        let moves = |key: &str| MOVING.iter().any(|m| key.contains(m)) && !KNOWN.contains(&key);
-        let set = |value: &str| value.parse::<f64>().is_ok_and(|x| x != 0.0);
-        let mut others: Vec<String> =
-            self.0.iter().filter(|(k, v)| moves(k) && set(v)).map(|(k, v)| format!("{k} = {v}")).collect();
-        others.sort();
-        others
-    }
 }
 
 /// Parts of the names of keys that move something.
@@ -289,7 +201,7 @@ const KNOWN: &[&str] = &[
 mod tests {
     use super::*;
     use crate::testing::{read_scan, read_scanner, says};
-    use conefield_core::geometry::{Millimetres, Radians};
+    use conefield_core::geometry::{Millimetres, Radians, View};
     use conefield_core::orbit::CircularOrbit;
     use std::fs;
     use tiff::encoder::{TiffEncoder, colortype::Gray16};
@@ -360,8 +272,8 @@ mod tests {
         assert_eq!((moved.offset[0], moved.angles), (-4.5, plain.angles));
         assert!((moved.offset[1] + 8.0).abs() < 1e-9, "{:?}", moved.offset);
         let path = "bone.xtekct".into();
-        let keys = Keys::of(path, "DetectorOffsetX=8\nOffsetX=-4\nShuttling=True\nObjectOffsetY=0\n").unwrap();
-        assert_eq!(keys.others(), ["OffsetX = -4"]);
+        let keys = Keys::ini(path, "DetectorOffsetX=8\nOffsetX=-4\nShuttling=True\nObjectOffsetY=0\n", KNOWN).unwrap();
+        assert_eq!(keys.others(MOVING, KNOWN), ["OffsetX = -4"]);
     }
 
     #[test]

@@ -285,6 +285,52 @@ pub fn xtekct(dir: &Path) {
     put(&dir.join("bone.xtekct"), text.as_bytes());
 }
 
+/// `bone.log` of SkyScan, with its images.
+pub fn skyscan(dir: &Path) {
+    for (i, view) in counts().chunks(SHAPE[1] * SHAPE[2]).enumerate() {
+        let file = File::create(dir.join(format!("bone{i:08}.tif"))).expect("a file of the test's own folder");
+        let mut w = TiffEncoder::new(file).expect("a file");
+        w.write_image::<Gray16>(SHAPE[2] as u32, SHAPE[1] as u32, view).expect("a file");
+    }
+    let text = "[System]\nScanner=SkyScan1172\n[Acquisition]\nFilename Prefix=bone\nNumber of Files= 3\nNumber of Rows= 4\n\
+                Number of Columns= 5\nImage Pixel Size (um)=   10.5\nObject to Source (mm)=50.5\n\
+                Camera to Source (mm)=200.25\nOptical Axis (line)= 1\nReference Intensity=60000\n\
+                Rotation Step (deg)=120.0\nRotation Direction=CW\n[Reconstruction]\nPostalignment=1.50\n";
+    put(&dir.join("bone.log"), text.as_bytes());
+}
+
+/// `Scan.xml` of Varian, with an image and an open beam.
+pub fn xim(dir: &Path) {
+    let air = dir.join("Calibrations/Air-1");
+    fs::create_dir_all(&air).expect("a folder of the test's own");
+    put(&dir.join("Proj_1.xim"), fixture!("a.xim"));
+    put(&air.join("Filter.xim"), fixture!("a.xim"));
+    let text = "<?xml version=\"1.0\"?>\n<Scan Version=\"2.7\"><Acquisitions><SAD>1000</SAD><SID>1500</SID></Acquisitions></Scan>";
+    put(&dir.join("Scan.xml"), text.as_bytes());
+}
+
+/// `ProjectionInfo.xml` of Varian, with an image.
+pub fn obi(dir: &Path) {
+    put(&dir.join("a.hnd"), fixture!("a.hnd"));
+    let text = "<?xml version=\"1.0\"?>\n<Info><CalibratedSAD>1000</CalibratedSAD><CalibratedSID>1500</CalibratedSID>\
+                <FanType>HalfFan</FanType><CalibratedDetectorOffsetX>1</CalibratedDetectorOffsetX>\
+                <CalibratedDetectorOffsetY>2</CalibratedDetectorOffsetY><DetectorPosLat>-148</DetectorPosLat></Info>";
+    put(&dir.join("ProjectionInfo.xml"), text.as_bytes());
+}
+
+/// `_Frames.xml` of Elekta, with an image.
+pub fn elekta(dir: &Path) {
+    put(&dir.join("00001.his"), fixture!("a.his"));
+    let text = "<?xml version=\"1.0\"?>\n<ProjectionSet><Frames><Frame><GantryAngle>-90.5</GantryAngle>\
+                <UCentre>115</UCentre><VCentre>-1.5</VCentre></Frame></Frames></ProjectionSet>";
+    put(&dir.join("_Frames.xml"), text.as_bytes());
+}
+
+/// `a.txrm` of Zeiss.
+pub fn txrm(dir: &Path) {
+    put(&dir.join("a.txrm"), fixture!("a.txrm"));
+}
+
 /// `scan.pickle`, with the volume.
 pub fn naf(dir: &Path) {
     written(conefield_io::write_naf(dir.join("scan.pickle"), &scan(), None, Some(&volume())));

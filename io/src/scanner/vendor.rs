@@ -1,0 +1,164 @@
+//! The files with which vendors describe a scan, and what they give in common: views, the names of the images, the open
+//! beam and a volume.
+
+use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, his, obi, skyscan, txrm, xim, xtekct};
+use crate::input::LONGEST_TEXT;
+use crate::stack::Names;
+use crate::text::read_foreign;
+use conefield_core::Result;
+use conefield_core::geometry::{View, VoxelGrid};
+use ndarray::{Array3, Axis};
+use std::path::Path;
+
+/// Most views of a description: a circle in steps of about one second of arc.
+pub(super) const MOST_VIEWS: usize = 1_000_000;
+
+/// Most rows or columns of a detector.
+pub(super) const MOST_PIXELS: usize = 1_000_000;
+
+/// Most voxels along x and y of a volume that no file states: clinical scanners reconstruct as many, and a finer grid
+/// may not fit in memory.
+const MOST_VOXELS: f64 = 512.0;
+
+/// A vendor's description of a scan.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Vendor {
+    Nikon,
+    SkyScan,
+    /// Varian's XIM.
+    TrueBeam,
+    /// Varian's HND and HNC.
+    Obi,
+    Elekta,
+    Zeiss,
+}
+
+impl Vendor {
+    /// The vendor that describes a scan in the file `path`, by its extension and, where others use that too, by words
+    /// in it.
+    pub fn of(path: &Path) -> Option<Self> {
+        let extension = path.extension()?.to_string_lossy().to_lowercase();
+        let marks: &[(&str, Self)] = match &extension[..] {
+            "xtekct" => return Some(Self::Nikon),
+            "txrm" => return Some(Self::Zeiss),
+            "log" => &[(skyscan::MARK, Self::SkyScan)],
+            "xml" => &[(xim::MARK, Self::TrueBeam), (obi::MARK, Self::Obi), (his::MARK, Self::Elekta)],
+            _ => return None,
+        };
+        let text = read_foreign(path, LONGEST_TEXT).ok()?;
+        marks.iter().find(|(words, _)| text.contains(words)).map(|(_, vendor)| *vendor)
+    }
+
+    /// The scan as a description in the terms of `scanner.toml`.
+    pub(super) fn description(self, path: &Path) -> Result<Description> {
+        match self {
+            Self::Nikon => xtekct::scan(path),
+            Self::SkyScan => skyscan::scan(path),
+            Self::TrueBeam => xim::scan(path),
+            Self::Obi => obi::scan(path),
+            Self::Elekta => his::scan(path),
+            Self::Zeiss => txrm::scan(path),
+        }
+        .map(Description::from)
+    }
+}
+
+/// What a vendor's files say of a scan.
+pub(super) struct VendorScan {
+    /// One for each image.
+    pub views: Vec<View>,
+    /// Rows and columns of the detector.
+    pub detector: [usize; 2],
+    pub projections: Names,
+    pub open: Open,
+    pub response: Response,
+    pub volume: VoxelGrid,
+    /// Warnings for the user.
+    pub remarks: Vec<String>,
+}
+
+/// The open beam.
+pub(super) enum Open {
+    Flat(Names),
+    Number(f64),
+    /// Estimated from the border of each view.
+    Air,
+}
+
+/// What makes counts of the numbers in the images.
+#[derive(Debug, Default, PartialEq)]
+pub(super) enum Response {
+    /// Nothing: they are counts.
+    #[default]
+    Counts,
+    /// A factor for each view.
+    Factors(Vec<f32>),
+    /// They are the open beam of Elekta's detector less the counts.
+    Inverted,
+}
+
+impl Response {
+    pub fn apply(&self, values: &mut Array3<f32>) {
+        match self {
+            Self::Counts => {}
+            Self::Factors(all) => {
+                values.axis_iter_mut(Axis(0)).zip(all).for_each(|(mut view, factor)| view *= *factor);
+            }
+            Self::Inverted => values.mapv_inplace(|x| his::I0 - if (1.0..=65534.0).contains(&x) { x } else { 1.0 }),
+        }
+    }
+}
+
+impl From<VendorScan> for Description {
+    fn from(scan: VendorScan) -> Self {
+        let (flat, i0) = match scan.open {
+            Open::Flat(names) => (Some(names), None),
+            Open::Number(n) => (None, Some(I0Text::Number(n))),
+            Open::Air => (None, Some(I0Text::Word("air".into()))),
+        };
+        Self {
+            _format: String::new(),
+            _version: 0,
+            files: Files { projections: scan.projections, flat, dark: None },
+            circle: None,
+            vectors: None,
+            rtk: None,
+            cil: None,
+            layout: LayoutTable::default(),
+            values: ValuesTable { kind: ValueKind::Counts, i0, ..ValuesTable::default() },
+            volume: scan.volume,
+            views: Some(scan.views),
+            detector: Some(scan.detector),
+            response: scan.response,
+            remarks: scan.remarks,
+        }
+    }
+}
+
+/// A volume for a scan that states none: as wide as the views see, with voxels of the pixel's size at the axis (`across`
+/// along u, `along` along v), or larger ones if there were more than [`MOST_VOXELS`]. `aside` is the distance, at the
+/// axis, by which the detector is shifted along u: over a full turn its views see a disc wider by twice that.
+pub(super) fn field_of_view(
+    place: &str,
+    [rows, columns]: [usize; 2],
+    [along, across]: [f64; 2],
+    aside: f64,
+    remarks: &mut Vec<String>,
+) -> Result<VoxelGrid> {
+    let width = columns as f64 + 2.0 * aside.abs() / across;
+    let coarser = (width / MOST_VOXELS).max(1.0);
+    // Rounding errors do not add a voxel.
+    let count = |pixels: f64| (pixels / coarser - 1e-6).ceil().max(1.0) as usize;
+    let [x, y, z] = [across, across, along].map(|x| x * coarser);
+    let grid =
+        VoxelGrid { shape: [count(width), count(width), count(rows as f64)], spacing: [x, y, z], center: [0.0; 3] };
+    grid.validate(place)?;
+    if coarser > 1.0 {
+        remarks.push(format!(
+            "the files state no volume: {} x {} x {} voxels of {x:.4} mm are taken, and the pixels are {across:.4} mm at \
+             the axis; volume in the imported scan.toml sets others",
+            grid.shape[0], grid.shape[1], grid.shape[2]
+        ));
+    }
+    Ok(grid)
+}
