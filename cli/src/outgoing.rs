@@ -3,6 +3,7 @@
 use crate::out::duration;
 use crate::progress::Progress;
 use crate::signals;
+use conefield::hounsfield::{Calibration, Levels};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Volume};
@@ -12,9 +13,23 @@ use ndarray::{Array3, ArrayViewMut3};
 use std::path::Path;
 use std::time::Instant;
 
-/// Writes `voxels` to `path` without keeping any.
-pub fn write_only(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
-    conefield_io::write_voxels(path, &mut Outgoing::new(path, voxels))
+/// Writes `voxels` to `path` without keeping any, with `affine` if they have none of their own; in Hounsfield units if
+/// there is a calibration, and then returns its water and air.
+pub fn write_only(
+    path: &Path,
+    voxels: &mut dyn Voxels,
+    affine: Option<Affine>,
+    hu: Option<&Calibration>,
+) -> Result<Option<Levels>> {
+    let mut outgoing = Outgoing::new(path, voxels);
+    outgoing.affine = outgoing.affine.or(affine);
+    let levels = hu.map(|hu| hu.measure(&mut outgoing)).transpose()?;
+    outgoing.done = 0;
+    match &levels {
+        Some(levels) => conefield_io::write_voxels(path, &mut levels.of(&mut outgoing))?,
+        None => conefield_io::write_voxels(path, &mut outgoing)?,
+    }
+    Ok(levels)
 }
 
 /// What is kept of written voxels.

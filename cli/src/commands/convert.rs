@@ -2,6 +2,7 @@
 
 use super::corrections::{CorrectionOptions, corrected_size, log_applied};
 use super::selection::SelectionOptions;
+use super::units::{HounsfieldOption, unit_of};
 use crate::boundary::{Inputs, refuse_existing};
 use crate::out;
 use clap::{Args, ValueEnum};
@@ -11,7 +12,7 @@ use conefield::parse::{self, Values};
 use conefield_core::{Error, Result};
 use conefield_io::{DataSet, Parts};
 use conefield_scans::diagnosis::survey;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Rewrite a volume or a scan in another format.
 ///
@@ -33,6 +34,8 @@ pub struct ConvertArgs {
     /// Meaning of the voxel values: as-is, hu:MU_WATER or clip:LO,HI.
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
+    #[command(flatten)]
+    units: HounsfieldOption,
     #[command(flatten)]
     corrections: CorrectionOptions,
     #[command(flatten)]
@@ -59,7 +62,7 @@ impl ConvertArgs {
     pub fn run(self) -> Result<()> {
         std::fs::metadata(&self.input).map_err(|e| Error::io(&self.input, e))?;
         refuse_existing(&self.output, self.force)?;
-        let inputs = Inputs::of([&self.input]);
+        let inputs = Inputs::of([&self.input]).and(self.units.path().map(Path::to_path_buf));
         inputs.spare_file(&self.output)?;
         inputs.spare_folder(&self.output)?;
         let (selection, corrections) = (self.selection.selection(), self.corrections.corrections()?);
@@ -74,9 +77,18 @@ impl ConvertArgs {
             Memory::of_volumes(&[voxels]).check(|_| vec![])?;
             let volume = conefield_io::read_volume(&self.input)?;
             conefield_io::check_shape(&self.output, volume.grid.shape)?;
-            let volume = self.values.apply(volume)?;
-            conefield_io::write_volume(&self.output, &volume)?;
+            let mut volume = &self.values.apply(volume)?;
+            let unit = if self.values == Values::AsIs { unit_of(&self.input)? } else { None };
+            let hu = self.units.open(&self.input, unit.as_ref(), &volume.grid, volume.affine.as_ref())?;
+            match hu.map(|hu| hu.measure(&mut volume)).transpose()? {
+                Some(levels) => conefield_io::write_voxels(&self.output, &mut levels.of(&mut volume))?,
+                None => conefield_io::write_volume(&self.output, volume)?,
+            }
         } else {
+            if self.units.hu.is_some() {
+                let expected = "a volume: a scan has line integrals";
+                return Err(Error::invalid(self.input.display().to_string(), "--hu", "a scan", expected));
+            }
             let size = corrected_size(conefield_io::scan_size(&self.input)?, &corrections);
             Memory::of_data_set(&size).check(|_| vec![])?;
             let DataSet { train, test, volume } = conefield_scans::read_data_set(&self.input, Parts::ALL)?;

@@ -1,11 +1,13 @@
 //! `conefield export`
 
 use super::trained::Trained;
+use super::units::{HounsfieldOption, unit_of};
 use crate::boundary::{Inputs, refuse_existing};
 use crate::{out, outgoing, signals};
 use clap::Args;
 use conefield::memory;
 use conefield_core::Result;
+use conefield_core::scan::Unit;
 use conefield_core::trained::FieldVoxels;
 use conefield_io::{PACKED_BYTES, SLAB_BYTES};
 use serde_json::json;
@@ -23,6 +25,8 @@ pub struct ExportArgs {
     /// The volume to write: .nii, .nii.gz, .mha, .mhd (with a .raw), .nrrd, .npy, .tif or .zarr (a folder, OME-Zarr).
     #[arg(short, long = "output", visible_alias = "out", value_name = "VOLUME")]
     output: PathBuf,
+    #[command(flatten)]
+    units: HounsfieldOption,
     /// Replace VOLUME.
     #[arg(long)]
     force: bool,
@@ -37,18 +41,21 @@ impl ExportArgs {
         let buffers = FieldVoxels::BYTES + SLAB_BYTES + PACKED_BYTES;
         let opened = self.trained.open(buffers)?;
         let (memory, grid) = (opened.memory(buffers)?, opened.grid);
-        Inputs::of([&opened.file]).spare_file(&self.output)?;
+        Inputs::of([&opened.file]).and(self.units.path()).spare_file(&self.output)?;
         conefield_io::check_shape(&self.output, grid.shape)?;
+        let unknown = || Unit { name: "unknown, no record.json names it".into(), mm: opened.field.unit_mm };
+        let unit = unit_of(&opened.file)?.unwrap_or_else(unknown);
+        let hu = self.units.open(&opened.file, Some(&unit), &grid, None)?;
         let backend = self.trained.backend.open()?;
         signals::listen()?;
         let start = Instant::now();
         let mut voxels = opened.field.voxels(backend.as_ref(), grid)?;
-        outgoing::write_only(&self.output, &mut voxels)?;
+        let hounsfield = outgoing::write_only(&self.output, &mut voxels, None, hu.as_ref())?;
         let export_s = start.elapsed().as_secs_f64();
         if self.json {
             return out::json(&json!({
                 "volume": self.output, "shape": grid.shape, "spacing_mm": grid.spacing, "export_s": export_s,
-                "memory": memory, "peak_bytes": memory::peak(),
+                "hounsfield": hounsfield, "memory": memory, "peak_bytes": memory::peak(),
             }));
         }
         let [x, y, z] = grid.shape;
