@@ -3,13 +3,19 @@
 //! `dicom-object` reads the elements. This crate adds the rest: [`lengths`] refuses files whose elements claim more
 //! than the file holds before they are read, [`slice`](mod@slice) extracts what a volume needs, [`pixels`] decodes the
 //! values (the decoders of `dicom-pixeldata` index past the end of damaged data and panic), and this module sorts the
-//! slices.
+//! slices. [`write`](mod@write) writes a series.
 
 mod lengths;
 mod pixels;
 mod slice;
 #[cfg(test)]
 mod tests;
+mod write;
+#[cfg(test)]
+mod written;
+
+pub use write::DicomTemplate;
+pub(crate) use write::{check_shape, write};
 
 use crate::{affine, foreign};
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm, sub};

@@ -10,16 +10,16 @@ use conefield::files;
 use conefield::memory::Memory;
 use conefield::parse::{self, Values};
 use conefield_core::{Error, Result};
-use conefield_io::{DataSet, Parts};
+use conefield_io::{DataSet, DicomTemplate, Parts, write_voxels_of};
 use conefield_scans::diagnosis::survey;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
 ///
 /// Volumes: the extension of OUT selects NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd with a .raw), NRRD, NumPy (.npy),
-/// a TIFF stack (.tif) or an OME-Zarr folder (.zarr). IN may also be a .nhdr file, or a folder with a DICOM series or
-/// TIFF slices. Scans: --to sets the format; r2 and naf keep test views. --correct corrects faults of a scan; other
-/// options select part of it; --bin averages line integrals.
+/// a TIFF stack (.tif), an OME-Zarr folder (.zarr) or a folder with a DICOM series (.dicom, 16 bits). IN may also be a
+/// .nhdr file, or a folder with a DICOM series or TIFF slices. Scans: --to sets the format; r2 and naf keep test views.
+/// --correct corrects faults of a scan; other options select part of it; --bin averages line integrals.
 #[derive(Args)]
 pub struct ConvertArgs {
     /// A volume or a scan.
@@ -36,6 +36,9 @@ pub struct ConvertArgs {
     values: Values,
     #[command(flatten)]
     units: HounsfieldOption,
+    /// A DICOM file whose patient and study OUT gets, if it is a .dicom folder.
+    #[arg(long, value_name = "FILE")]
+    dicom_template: Option<PathBuf>,
     #[command(flatten)]
     corrections: CorrectionOptions,
     #[command(flatten)]
@@ -62,7 +65,7 @@ impl ConvertArgs {
     pub fn run(self) -> Result<()> {
         std::fs::metadata(&self.input).map_err(|e| Error::io(&self.input, e))?;
         refuse_existing(&self.output, self.force)?;
-        let inputs = Inputs::of([&self.input]).and(self.units.path().map(Path::to_path_buf));
+        let inputs = Inputs::of([&self.input]).and(self.units.path()).and(&self.dicom_template);
         inputs.spare_file(&self.output)?;
         inputs.spare_folder(&self.output)?;
         let (selection, corrections) = (self.selection.selection(), self.corrections.corrections()?);
@@ -73,6 +76,7 @@ impl ConvertArgs {
                 let expected = "a scan: only scans have views and pixels";
                 return Err(Error::invalid(place, option, "a volume", expected));
             }
+            let template = self.dicom_template.as_ref().map(DicomTemplate::read).transpose()?;
             let voxels = conefield_io::volume_voxels(&self.input)?;
             Memory::of_volumes(&[voxels]).check(|_| vec![])?;
             let volume = conefield_io::read_volume(&self.input)?;
@@ -81,13 +85,14 @@ impl ConvertArgs {
             let unit = if self.values == Values::AsIs { unit_of(&self.input)? } else { None };
             let hu = self.units.open(&self.input, unit.as_ref(), &volume.grid, volume.affine.as_ref())?;
             match hu.map(|hu| hu.measure(&mut volume)).transpose()? {
-                Some(levels) => conefield_io::write_voxels(&self.output, &mut levels.of(&mut volume))?,
-                None => conefield_io::write_volume(&self.output, volume)?,
+                Some(levels) => write_voxels_of(&self.output, &mut levels.of(&mut volume), template.as_ref())?,
+                None => write_voxels_of(&self.output, &mut volume, template.as_ref())?,
             }
         } else {
-            if self.units.hu.is_some() {
+            let named = [("--hu", self.units.hu.is_some()), ("--dicom-template", self.dicom_template.is_some())];
+            if let Some((option, _)) = named.into_iter().find(|(_, given)| *given) {
                 let expected = "a volume: a scan has line integrals";
-                return Err(Error::invalid(self.input.display().to_string(), "--hu", "a scan", expected));
+                return Err(Error::invalid(self.input.display().to_string(), option, "a scan", expected));
             }
             let size = corrected_size(conefield_io::scan_size(&self.input)?, &corrections);
             Memory::of_data_set(&size).check(|_| vec![])?;

@@ -9,7 +9,7 @@ use conefield::memory;
 use conefield_core::Result;
 use conefield_core::scan::Unit;
 use conefield_core::trained::FieldVoxels;
-use conefield_io::{PACKED_BYTES, SLAB_BYTES};
+use conefield_io::{DicomTemplate, PACKED_BYTES, SLAB_BYTES};
 use serde_json::json;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -22,11 +22,15 @@ use std::time::Instant;
 pub struct ExportArgs {
     #[command(flatten)]
     trained: Trained,
-    /// The volume to write: .nii, .nii.gz, .mha, .mhd (with a .raw), .nrrd, .npy, .tif or .zarr (a folder, OME-Zarr).
+    /// The volume to write: .nii, .nii.gz, .mha, .mhd (with a .raw), .nrrd, .npy, .tif, .zarr (a folder, OME-Zarr)
+    /// or .dicom (a folder, a DICOM series in 16 bits).
     #[arg(short, long = "output", visible_alias = "out", value_name = "VOLUME")]
     output: PathBuf,
     #[command(flatten)]
     units: HounsfieldOption,
+    /// A DICOM file whose patient and study VOLUME gets, if it is a .dicom folder.
+    #[arg(long, value_name = "FILE")]
+    dicom_template: Option<PathBuf>,
     /// Replace VOLUME.
     #[arg(long)]
     force: bool,
@@ -41,7 +45,10 @@ impl ExportArgs {
         let buffers = FieldVoxels::BYTES + SLAB_BYTES + PACKED_BYTES;
         let opened = self.trained.open(buffers)?;
         let (memory, grid) = (opened.memory(buffers)?, opened.grid);
-        Inputs::of([&opened.file]).and(self.units.path()).spare_file(&self.output)?;
+        let inputs = Inputs::of([&opened.file]).and(self.units.path()).and(&self.dicom_template);
+        inputs.spare_file(&self.output)?;
+        inputs.spare_folder(&self.output)?;
+        let template = self.dicom_template.as_ref().map(DicomTemplate::read).transpose()?;
         conefield_io::check_shape(&self.output, grid.shape)?;
         let unknown = || Unit { name: "unknown, no record.json names it".into(), mm: opened.field.unit_mm };
         let unit = unit_of(&opened.file)?.unwrap_or_else(unknown);
@@ -50,7 +57,7 @@ impl ExportArgs {
         signals::listen()?;
         let start = Instant::now();
         let mut voxels = opened.field.voxels(backend.as_ref(), grid)?;
-        let hounsfield = outgoing::write_only(&self.output, &mut voxels, None, hu.as_ref())?;
+        let hounsfield = outgoing::write_only(&self.output, &mut voxels, None, hu.as_ref(), template.as_ref())?;
         let export_s = start.elapsed().as_secs_f64();
         if self.json {
             return out::json(&json!({

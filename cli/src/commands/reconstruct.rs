@@ -188,7 +188,7 @@ impl ReconstructArgs {
         let hounsfield = match &hu {
             Some(hu) => {
                 let mut voxels = solved.solution.result.voxels(backend.as_ref())?;
-                outgoing::write_only(&folder.file("volume-hu.nii.gz"), voxels.as_mut(), affine, Some(hu))?
+                outgoing::write_only(&folder.file("volume-hu.nii.gz"), voxels.as_mut(), affine, Some(hu), None)?
             }
             None => None,
         };

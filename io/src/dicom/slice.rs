@@ -232,7 +232,7 @@ impl Slice {
 }
 
 /// The first `end` bytes of a file, whose lengths have been checked.
-fn open(path: &Path, end: u64, options: OpenFileOptions) -> Result<DefaultDicomObject> {
+pub(super) fn open(path: &Path, end: u64, options: OpenFileOptions) -> Result<DefaultDicomObject> {
     options.from_reader(files::open(path)?.0.take(end)).map_err(|e| {
         // The outer message says only that reading failed; the causes are nested in it.
         let reasons: Vec<String> =
