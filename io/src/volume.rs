@@ -15,7 +15,7 @@ use std::path::Path;
 /// Reads a volume: NIfTI-1 (any real number type, gzip or not), MetaImage (`.mha`, or `.mhd` with its data file in the
 /// same folder, zlib or not), NRRD (`.nrrd`, or `.nhdr` with its data file in the same folder, gzip or not), a NumPy
 /// array of three axes, the pages of a TIFF file, or a folder: OME-Zarr (0.4), the DICOM files of one series, one slice
-/// each, or TIFF files, one slice each in the order of the numbers in their names.
+/// each (or all slices in one DICOM file), or TIFF files, one slice each in the order of the numbers in their names.
 ///
 /// The content decides, not the name. `grid.center` is `[0, 0, 0]`: the position in the patient stays in `affine`, in
 /// mm, RAS. A NumPy array has no voxel size and gets 1 mm, as do a NRRD and TIFF files that do not say it. Values are
@@ -24,6 +24,7 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     let path = path.as_ref();
     match open(path)? {
         VolumeFile::Series => dicom::read(path),
+        VolumeFile::Enhanced => dicom::enhanced::read(path),
         VolumeFile::Zarr => zarr::read(path),
         VolumeFile::Slices => tiff::read_folder(path),
         VolumeFile::Npy(mut input, head) => from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?),
@@ -38,6 +39,8 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
 pub(crate) enum VolumeFile {
     /// A folder of DICOM files.
     Series,
+    /// One DICOM file with all slices.
+    Enhanced,
     /// A folder of OME-Zarr.
     Zarr,
     /// A folder of TIFF files.
@@ -72,6 +75,9 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
         return Err(Error::unsupported(what, "convert it to NIfTI-1 (.nii or .nii.gz)"));
     }
     if dicom::is_header(&head) {
+        if dicom::enhanced::has_frames(path) {
+            return Ok(VolumeFile::Enhanced);
+        }
         let what = format!("{}: one DICOM file", path.display());
         return Err(Error::unsupported(what, "give the folder that holds the files of its series"));
     }
@@ -138,6 +144,7 @@ pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
         VolumeFormat::Nifti | VolumeFormat::NiftiGz => nifti::check_shape(&path.display().to_string(), shape),
         VolumeFormat::Tiff => tiff::check_shape(&path.display().to_string(), shape),
         VolumeFormat::Dicom => dicom::check_shape(&path.display().to_string(), shape),
+        VolumeFormat::EnhancedDicom => dicom::enhanced::check_one_file(&path.display().to_string(), shape),
         _ => Ok(()),
     }
 }
@@ -145,8 +152,8 @@ pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
 /// Writes a volume in the format of its name, in `f32`: `.nii`, `.nii.gz` (with an sform in mm), `.mha` (zlib,
 /// with the same axes as directions and voxel sizes), `.mhd` (the same as a header, with uncompressed voxels in a
 /// `.raw` next to it), `.nrrd` (gzip, the same axes), `.npy` (C order, without voxel sizes), `.tif` (one page per slice
-/// along z, with voxel sizes), `.zarr` (a folder: OME-Zarr 0.4 with a pyramid) or `.dicom` (a folder: a DICOM series, in
-/// 16 bits).
+/// along z, with voxel sizes), `.zarr` (a folder: OME-Zarr 0.4 with a pyramid) or, in 16 bits, `.dicom` (a folder:
+/// a DICOM series) or `.dcm` (one file: an enhanced CT).
 ///
 /// An affine is kept if its voxel sizes match the grid; without one, the grid's centre is placed at `grid.center`.
 pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
@@ -173,14 +180,15 @@ pub fn write_voxels_of(
 ) -> Result<()> {
     let path = path.as_ref();
     let format = wanted(path)?;
-    if template.is_some() && format != VolumeFormat::Dicom {
-        let expected = "an end of .dicom: other formats have no patient and study for the template";
+    if template.is_some() && !matches!(format, VolumeFormat::Dicom | VolumeFormat::EnhancedDicom) {
+        let expected = "an end of .dicom or .dcm: other formats have no patient and study for the template";
         return Err(Error::invalid(path.display().to_string(), "file name", file_name(path), expected));
     }
     voxels.grid().validate(&path.display().to_string())?;
     match format {
         VolumeFormat::Zarr => return zarr::write(path, voxels),
         VolumeFormat::Dicom => return dicom::write(path, voxels, template),
+        VolumeFormat::EnhancedDicom => return dicom::enhanced::write(path, voxels, template),
         VolumeFormat::MetaImageHeader => return metaimage::write_raw(path, voxels),
         _ => {}
     }
@@ -195,8 +203,8 @@ pub fn write_voxels_of(
         VolumeFormat::Nrrd => nrrd::write(w, path, voxels),
         VolumeFormat::Tiff => tiff::write(w, path, voxels),
         VolumeFormat::MetaImage => metaimage::write(w, path, voxels),
-        VolumeFormat::MetaImageHeader | VolumeFormat::Zarr | VolumeFormat::Dicom => {
-            unreachable!("formats of several files are written above")
+        VolumeFormat::MetaImageHeader | VolumeFormat::Zarr | VolumeFormat::Dicom | VolumeFormat::EnhancedDicom => {
+            unreachable!("these are written above")
         }
     })
 }
@@ -237,7 +245,7 @@ pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Vol
 /// The format for a file name; refuses an unknown extension.
 fn wanted(path: &Path) -> Result<VolumeFormat> {
     let (place, expected) =
-        (path.display().to_string(), "an end of .nii, .nii.gz, .mha, .mhd, .nrrd, .npy, .tif, .zarr or .dicom");
+        (path.display().to_string(), "an end of .nii, .nii.gz, .mha, .mhd, .nrrd, .npy, .tif, .zarr, .dicom or .dcm");
     format_of(path).ok_or_else(|| Error::invalid(place, "file name", file_name(path), expected))
 }
 
@@ -254,6 +262,8 @@ enum VolumeFormat {
     Zarr,
     /// A folder.
     Dicom,
+    /// One file.
+    EnhancedDicom,
 }
 
 fn file_name(path: &Path) -> String {
@@ -273,6 +283,7 @@ fn format_of(path: &Path) -> Option<VolumeFormat> {
         (".tiff", VolumeFormat::Tiff),
         (".zarr", VolumeFormat::Zarr),
         (".dicom", VolumeFormat::Dicom),
+        (".dcm", VolumeFormat::EnhancedDicom),
     ];
     ends.into_iter().find(|(end, _)| name.ends_with(end)).map(|(_, format)| format)
 }

@@ -17,9 +17,10 @@ use std::path::PathBuf;
 /// Rewrite a volume or a scan in another format.
 ///
 /// Volumes: the extension of OUT selects NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd with a .raw), NRRD, NumPy (.npy),
-/// a TIFF stack (.tif), an OME-Zarr folder (.zarr) or a folder with a DICOM series (.dicom, 16 bits). IN may also be a
-/// .nhdr file, or a folder with a DICOM series or TIFF slices. Scans: --to sets the format; r2 and naf keep test views.
-/// --correct corrects faults of a scan; other options select part of it; --bin averages line integrals.
+/// a TIFF stack (.tif), an OME-Zarr folder (.zarr) or, in 16 bits, a folder with a DICOM series (.dicom) or one DICOM
+/// file (.dcm). IN may also be a .nhdr file, or a folder with a DICOM series or TIFF slices. Scans: --to sets the format;
+/// r2 and naf keep test views. --correct corrects faults of a scan; other options select part of it; --bin averages line
+/// integrals.
 #[derive(Args)]
 pub struct ConvertArgs {
     /// A volume or a scan.
@@ -36,7 +37,7 @@ pub struct ConvertArgs {
     values: Values,
     #[command(flatten)]
     units: HounsfieldOption,
-    /// A DICOM file whose patient and study OUT gets, if it is a .dicom folder.
+    /// A DICOM file whose patient and study OUT gets, if it is .dicom or .dcm.
     #[arg(long, value_name = "FILE")]
     dicom_template: Option<PathBuf>,
     #[command(flatten)]

@@ -23,12 +23,12 @@ pub struct ExportArgs {
     #[command(flatten)]
     trained: Trained,
     /// The volume to write: .nii, .nii.gz, .mha, .mhd (with a .raw), .nrrd, .npy, .tif, .zarr (a folder, OME-Zarr)
-    /// or .dicom (a folder, a DICOM series in 16 bits).
+    /// or, in 16 bits, .dicom (a folder, a DICOM series) or .dcm (one file, an enhanced CT).
     #[arg(short, long = "output", visible_alias = "out", value_name = "VOLUME")]
     output: PathBuf,
     #[command(flatten)]
     units: HounsfieldOption,
-    /// A DICOM file whose patient and study VOLUME gets, if it is a .dicom folder.
+    /// A DICOM file whose patient and study VOLUME gets, if it is .dicom or .dcm.
     #[arg(long, value_name = "FILE")]
     dicom_template: Option<PathBuf>,
     /// Replace VOLUME.

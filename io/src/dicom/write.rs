@@ -15,14 +15,15 @@ use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
 use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
 use dicom_object::{FileMetaTableBuilder, InMemDicomObject, OpenFileOptions};
-use std::fs;
-use std::io::{Read, Seek, Write};
+use std::fs::File;
+use std::io::{BufWriter, Read, Seek, Write};
 use std::path::Path;
 use tempfile::SpooledTempFile;
 
 const CT_IMAGE: &str = "1.2.840.10008.5.1.4.1.1.2";
 const EXPLICIT: &str = "1.2.840.10008.1.2.1";
 const PIXELS: Tag = Tag(0x7fe0, 0x0010);
+const CLASS: Tag = Tag(0x0008, 0x0016);
 const STUDY: Tag = Tag(0x0020, 0x000d);
 
 /// The attributes of a patient and a study that a template gives; all are text.
@@ -84,14 +85,14 @@ pub(crate) fn write(path: &Path, voxels: &mut dyn Voxels, template: Option<&Dico
     let place = path.display().to_string();
     check_shape(&place, voxels.grid().shape)?;
     folder::may_replace(path, "DICOM series", is_slice, &["0001.dcm", "00001.dcm"])?;
-    let series = Series::new(path, voxels, template)?;
+    let series = Series::new(path, voxels, template, CT_IMAGE)?;
     write_folder_atomic(path, |folder| series.write(folder))
 }
 
 /// A series whose values are known.
-struct Series {
+pub(super) struct Series {
     /// 32-bit floats, x fastest.
-    values: SpooledTempFile,
+    pub values: SpooledTempFile,
     shape: [usize; 3],
     /// Unit vectors along x, y and z, LPS.
     axes: [[f64; 3]; 3],
@@ -100,12 +101,13 @@ struct Series {
     first: [f64; 3],
     slope: f64,
     /// Attributes that all slices share.
-    shared: InMemDicomObject,
-    digest: Digest,
+    pub shared: InMemDicomObject,
+    pub digest: Digest,
 }
 
 impl Series {
-    fn new(path: &Path, voxels: &mut dyn Voxels, template: Option<&DicomTemplate>) -> Result<Self> {
+    /// Computes the values, for files of the SOP class `class`.
+    pub fn new(path: &Path, voxels: &mut dyn Voxels, template: Option<&DicomTemplate>, class: &str) -> Result<Self> {
         let place = path.display().to_string();
         let (shape, hounsfield) = (voxels.grid().shape, voxels.hounsfield().map(str::to_owned));
         let (ras, _) = affine::of(voxels, &place);
@@ -125,7 +127,7 @@ impl Series {
         file_order::write(&mut spool, path, voxels, FileOrder::XFastest)?;
         let Spool { file: values, mut digest, range } = spool;
         let slope = slope(range);
-        let shared = shared(hounsfield.as_deref(), range.map(f64::from), slope, template);
+        let shared = shared(class, hounsfield.as_deref(), range.map(f64::from), slope, template);
         digest.add(format!("{shape:?} {lps:?} {shared:?}").as_bytes());
         let mut series = Self { values, shape, axes, spacing, first: affine::column(&lps, 3), slope, shared, digest };
         series.identify();
@@ -153,43 +155,76 @@ impl Series {
         let width = self.shape[2].to_string().len().max(4);
         self.values.rewind().map_err(|e| Error::io(folder, e))?;
         for k in 0..self.shape[2] {
-            let file = folder.join(format!("{:0width$}.dcm", k + 1));
-            let bytes = self.slice(&file, k)?;
-            fs::write(&file, bytes).map_err(|e| Error::io(&file, e))?;
+            let path = folder.join(format!("{:0width$}.dcm", k + 1));
+            let mut file = BufWriter::new(File::create(&path).map_err(|e| Error::io(&path, e))?);
+            self.head(&path, &mut file, self.slice(k), &self.digest.uid(&format!("slice {k}")), 1)?;
+            self.pixels(&path, &mut file, 1)?;
+            file.flush().map_err(|e| Error::io(&path, e))?;
         }
         Ok(())
     }
 
-    /// The bytes of slice `k`, whose values are next.
-    fn slice(&mut self, file: &Path, k: usize) -> Result<Vec<u8>> {
+    /// The attributes of slice `k`.
+    fn slice(&self, k: usize) -> InMemDicomObject {
         let mut o = self.shared.clone();
-        let [_, _, z] = self.axes;
-        let step = k as f64 * self.spacing[2];
-        let position: [f64; 3] = std::array::from_fn(|i| self.first[i] + step * z[i]);
-        let uid = self.digest.uid(&format!("slice {k}"));
-        text(&mut o, Tag(0x0008, 0x0018), VR::UI, &uid);
+        let position = self.position(k);
         text(&mut o, Tag(0x0020, 0x0013), VR::IS, &(k + 1).to_string());
         text(&mut o, Tag(0x0020, 0x0032), VR::DS, &numbers(position));
         text(&mut o, Tag(0x0020, 0x1041), VR::DS, &number(dot(position, cross(self.axes[0], self.axes[1]))));
-        let mut raw = vec![0; 4 * self.shape[0] * self.shape[1]];
-        self.values.read_exact(&mut raw).map_err(|e| Error::io(file, e))?;
-        let stored = |bytes: &[u8; 4]| (f64::from(f32::from_le_bytes(*bytes)) / self.slope).round() as i16 as u16;
-        let values: Vec<u16> = raw.as_chunks().0.iter().map(stored).collect();
-        o.put(DataElement::new(PIXELS, VR::OW, PrimitiveValue::U16(values.into())));
+        o
+    }
+
+    /// The centre of the first voxel of slice `k`.
+    pub fn position(&self, k: usize) -> [f64; 3] {
+        std::array::from_fn(|i| self.first[i] + k as f64 * self.spacing[2] * self.axes[2][i])
+    }
+
+    /// Writes `object` with the identifier `uid`, up to the values of `slices` slices.
+    pub fn head(
+        &self,
+        path: &Path,
+        w: &mut dyn Write,
+        mut object: InMemDicomObject,
+        uid: &str,
+        slices: usize,
+    ) -> Result<()> {
+        text(&mut object, Tag(0x0008, 0x0018), VR::UI, uid);
+        let class = object.get(CLASS).and_then(|e| e.to_str().ok()).unwrap_or_default().into_owned();
         let meta = FileMetaTableBuilder::new()
             .transfer_syntax(EXPLICIT)
-            .media_storage_sop_class_uid(CT_IMAGE)
+            .media_storage_sop_class_uid(class)
             .media_storage_sop_instance_uid(uid);
-        let failed = |e: &dyn std::fmt::Display| Error::unsupported(file.display().to_string(), e.to_string());
-        let whole = o.with_meta(meta).map_err(|e| failed(&e))?;
+        let failed = |e: &dyn std::fmt::Display| Error::unsupported(path.display().to_string(), e.to_string());
         let mut bytes = Vec::new();
-        whole.write_all(&mut bytes).map_err(|e| failed(&e))?;
-        Ok(bytes)
+        object.with_meta(meta).map_err(|e| failed(&e))?.write_all(&mut bytes).map_err(|e| failed(&e))?;
+        // The values follow by hand, so that they need not be in memory: PixelData is the last element.
+        let length = 2 * slices * self.shape[0] * self.shape[1];
+        bytes.extend([0xe0, 0x7f, 0x10, 0, b'O', b'W', 0, 0]);
+        bytes.extend((length as u32).to_le_bytes());
+        w.write_all(&bytes).map_err(|e| Error::io(path, e))
+    }
+
+    /// Writes the stored values of the next `slices` slices.
+    pub fn pixels(&mut self, path: &Path, w: &mut dyn Write, slices: usize) -> Result<()> {
+        let mut raw = vec![0; 4 * self.shape[0] * self.shape[1]];
+        let stored = |bytes: &[u8; 4]| (f64::from(f32::from_le_bytes(*bytes)) / self.slope).round() as i16;
+        for _ in 0..slices {
+            self.values.read_exact(&mut raw).map_err(|e| Error::io(path, e))?;
+            let bytes: Vec<u8> = raw.as_chunks().0.iter().flat_map(|b| stored(b).to_le_bytes()).collect();
+            w.write_all(&bytes).map_err(|e| Error::io(path, e))?;
+        }
+        Ok(())
     }
 }
 
 /// The attributes of all slices, without identifiers and geometry.
-fn shared(hu: Option<&str>, [low, high]: [f64; 2], slope: f64, template: Option<&DicomTemplate>) -> InMemDicomObject {
+fn shared(
+    class: &str,
+    hu: Option<&str>,
+    [low, high]: [f64; 2],
+    slope: f64,
+    template: Option<&DicomTemplate>,
+) -> InMemDicomObject {
     let mut o = InMemDicomObject::new_empty();
     let program = concat!("conefield ", env!("CARGO_PKG_VERSION"));
     let derivation = format!(
@@ -205,7 +240,7 @@ fn shared(hu: Option<&str>, [low, high]: [f64; 2], slope: f64, template: Option<
     for (tag, vr, value) in [
         (Tag(0x0008, 0x0005), VR::CS, "ISO_IR 192"),
         (Tag(0x0008, 0x0008), VR::CS, "DERIVED\\SECONDARY\\AXIAL"),
-        (Tag(0x0008, 0x0016), VR::UI, CT_IMAGE),
+        (CLASS, VR::UI, class),
         (Tag(0x0008, 0x0020), VR::DA, ""),
         (Tag(0x0008, 0x0030), VR::TM, ""),
         (Tag(0x0008, 0x0050), VR::SH, ""),
@@ -244,7 +279,7 @@ fn shared(hu: Option<&str>, [low, high]: [f64; 2], slope: f64, template: Option<
     o
 }
 
-fn text(object: &mut InMemDicomObject, tag: Tag, vr: VR, value: &str) {
+pub(super) fn text(object: &mut InMemDicomObject, tag: Tag, vr: VR, value: &str) {
     let value = if value.is_empty() { PrimitiveValue::Empty } else { PrimitiveValue::from(value) };
     object.put(DataElement::new(tag, vr, value));
 }
@@ -265,7 +300,7 @@ fn slope(range: [f32; 2]) -> f64 {
 }
 
 /// The closest number of at most 16 characters, the limit of a decimal string.
-fn number(x: f64) -> String {
+pub(super) fn number(x: f64) -> String {
     let shortest = x.to_string();
     if shortest.len() <= 16 {
         return shortest;
@@ -275,13 +310,13 @@ fn number(x: f64) -> String {
     forms.filter(|form| form.len() <= 16).min_by(|a, b| error(a).total_cmp(&error(b))).unwrap_or(shortest)
 }
 
-fn numbers(all: impl IntoIterator<Item = f64>) -> String {
+pub(super) fn numbers(all: impl IntoIterator<Item = f64>) -> String {
     all.into_iter().map(number).collect::<Vec<_>>().join("\\")
 }
 
 /// FNV-1a of 128 bits.
 #[derive(Clone)]
-struct Digest(u128);
+pub(super) struct Digest(u128);
 
 impl Digest {
     fn new() -> Self {
@@ -294,7 +329,7 @@ impl Digest {
     }
 
     /// An identifier for this `role`: a version-8 UUID as one number (PS3.5, B.2).
-    fn uid(&self, role: &str) -> String {
+    pub fn uid(&self, role: &str) -> String {
         let mut digest = self.clone();
         digest.add(role.as_bytes());
         let uuid = digest.0 & !(0xf << 76) & !(0x3 << 62) | 0x8 << 76 | 0x2 << 62;

@@ -188,3 +188,36 @@ fn what_is_there_stays_unless_it_is_such_a_series() {
     says(crate::check_shape(&path, [70_000, 1, 1]), &["a.dicom: shape", "65535"]);
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
 }
+
+#[test]
+fn one_file_holds_what_a_series_holds() {
+    let dir = tempfile::tempdir().unwrap();
+    let [series, one] = ["a.dicom", "a.dcm"].map(|n| dir.path().join(n));
+    let mut v = volume();
+    v.affine = Some(affine::from_columns([[0.0, 0.75, 0.0], [-0.5, 0.0, 0.0], [0.0, 0.0, 1.0 / 3.0]], [1.0, 2.0, 3.0]));
+    for path in [&series, &one] {
+        write_voxels_of(path, &mut Hu(v.clone()), None).unwrap();
+        assert!(crate::is_volume(path));
+        assert_eq!(crate::volume_voxels(path).unwrap(), 60);
+    }
+    let [a, b] = [&series, &one].map(|path| read_volume(path).unwrap());
+    assert_eq!((a.data, a.grid, a.affine), (b.data, b.grid, b.affine));
+    let bytes = std::fs::read(&one).unwrap();
+    write_voxels_of(&one, &mut Hu(v.clone()), None).unwrap();
+    assert!(bytes == std::fs::read(&one).unwrap());
+    assert_eq!(said(&one, Tag(0x28, 8)), "5");
+    v.data[[0, 1, 2]] = f32::INFINITY;
+    says(write_volume(&one, &v), &["a.dcm: voxel [0, 1, 2]"]);
+    assert!(bytes == std::fs::read(&one).unwrap());
+    says(crate::check_shape(&one, [2000; 3]), &["a.dcm: shape", "4 GiB", ".dicom"]);
+    // A frame less than the header says, and one without a position.
+    let mut object = open_file(&one).unwrap();
+    object.put(DataElement::new(Tag(0x28, 8), VR::IS, PrimitiveValue::from("4")));
+    object.write_to_file(&one).unwrap();
+    says(read_volume(&one), &["a.dcm: PerFrameFunctionalGroupsSequence", "5 items", "4"]);
+    std::fs::write(&one, &bytes).unwrap();
+    let mut object = open_file(&one).unwrap();
+    object.remove_element(Tag(0x5200, 0x9229));
+    object.write_to_file(&one).unwrap();
+    says(read_volume(&one), &["a.dcm: PixelSpacing", "no such element"]);
+}
