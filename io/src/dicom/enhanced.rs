@@ -11,6 +11,7 @@ use conefield_core::error::ensure;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result, allowance};
+use dicom_core::header::HasLength;
 use dicom_core::value::DataSetSequence;
 use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
 use dicom_object::{DefaultDicomObject, InMemDicomObject, OpenFileOptions};
@@ -27,6 +28,23 @@ const POSITION: Tag = Tag(0x0020, 0x9113);
 const ORIENTATION: Tag = Tag(0x0020, 0x9116);
 const MEASURES: Tag = Tag(0x0028, 0x9110);
 const TRANSFORMATION: Tag = Tag(0x0028, 0x9145);
+
+/// The elements that a slice needs, with the groups that may hold them.
+const NEEDED: [(Tag, Tag); 10] = [
+    (POSITION, Tag(0x0020, 0x0032)),
+    (ORIENTATION, Tag(0x0020, 0x0037)),
+    (MEASURES, Tag(0x0028, 0x0030)),
+    (MEASURES, Tag(0x0018, 0x0050)),
+    (MEASURES, Tag(0x0018, 0x0088)),
+    (TRANSFORMATION, Tag(0x0028, 0x1052)),
+    (TRANSFORMATION, Tag(0x0028, 0x1053)),
+    (CONTENT, Tag(0x0008, 0x0060)),
+    (CONTENT, Tag(0x0008, 0x103e)),
+    (CONTENT, Tag(0x0020, 0x000e)),
+];
+
+/// Longest of these elements in bytes.
+const LONGEST: u32 = 1024;
 
 /// Refuses more voxels than one file can hold.
 pub(crate) fn check_one_file(place: &str, shape: [usize; 3]) -> Result<()> {
@@ -184,11 +202,23 @@ impl Head {
         Ok(items)
     }
 
-    /// The item of the sequence `group` for frame `k`: its own, or the one of all frames; empty if there is none.
-    fn group(&self, k: usize, group: Tag) -> InMemDicomObject {
-        let first = |items: Option<&[InMemDicomObject]>, k: usize| items?.get(k)?.get(group)?.items()?.first().cloned();
-        let items = |tag| self.object.get(tag).and_then(|e| e.items());
-        first(items(PER_FRAME), k).or_else(|| first(items(SHARED), 0)).unwrap_or_else(InMemDicomObject::new_empty)
+    /// The elements of frame `k` that a slice needs.
+    fn frame(&self, k: usize) -> InMemDicomObject {
+        let mut o = InMemDicomObject::new_empty();
+        for (group, tag) in NEEDED {
+            let own = self.item(PER_FRAME, k, group).and_then(|i| i.get(tag));
+            let element = own.or_else(|| self.item(SHARED, 0, group)?.get(tag)).or_else(|| self.object.get(tag));
+            // None of them is long; a file may claim otherwise, for every frame again.
+            if let Some(element) = element.filter(|e| e.length().0 <= LONGEST) {
+                o.put(element.clone());
+            }
+        }
+        o
+    }
+
+    /// The first item of `group` in item `k` of the sequence `groups`.
+    fn item(&self, groups: Tag, k: usize, group: Tag) -> Option<&InMemDicomObject> {
+        self.object.get(groups)?.items()?.get(k)?.get(group)?.items()?.first()
     }
 }
 
@@ -219,13 +249,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
     head.storage.must_hold(&place, all.count() as u64, all.bytes as u64)?;
     let slices: Vec<Slice> = (0..frames)
         .map(|k| {
-            // What is not in a group stands in the file itself.
-            let mut o = InMemDicomObject::new_empty();
-            let own = head.object.iter().filter(|e| e.items().is_none()).cloned();
-            let groups = [POSITION, ORIENTATION, MEASURES, TRANSFORMATION].map(|group| head.group(k, group));
-            for element in own.chain(groups.into_iter().flatten()) {
-                o.put(element);
-            }
+            let o = head.frame(k);
             Slice::of(path, head.end, k, &Elements { place: &place, object: &o }, format)
         })
         .collect::<Result<_>>()?;
