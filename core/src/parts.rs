@@ -17,7 +17,7 @@ pub trait Voxels {
     /// Voxel indices to the patient's or file's own coordinates, if known; see [`Volume::affine`].
     fn affine(&self) -> Option<Affine>;
 
-    /// If the values are Hounsfield units: what they are of, for the header of a file, in at most 60 ASCII characters.
+    /// If the values are Hounsfield units: what they are of, for the header of a file, in a few words.
     fn hounsfield(&self) -> Option<&str> {
         None
     }
