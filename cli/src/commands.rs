@@ -28,6 +28,7 @@ mod summary;
 mod tradeoff;
 mod trained;
 mod trial;
+mod units;
 mod watch;
 
 use clap::{ArgAction, Args, Subcommand};

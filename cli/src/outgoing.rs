@@ -3,18 +3,35 @@
 use crate::out::duration;
 use crate::progress::Progress;
 use crate::signals;
+use conefield::hounsfield::{Calibration, Levels};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Volume};
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::MiddleSlices;
+use conefield_io::DicomTemplate;
 use ndarray::{Array3, ArrayViewMut3};
 use std::path::Path;
 use std::time::Instant;
 
-/// Writes `voxels` to `path` without keeping any.
-pub fn write_only(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
-    conefield_io::write_voxels(path, &mut Outgoing::new(path, voxels))
+/// Writes `voxels` to `path` without keeping any, with `affine` if they have none of their own; in Hounsfield units if
+/// there is a calibration, and then returns its water and air. DICOM gets patient and study from `template`.
+pub fn write_only(
+    path: &Path,
+    voxels: &mut dyn Voxels,
+    affine: Option<Affine>,
+    hu: Option<&Calibration>,
+    template: Option<&DicomTemplate>,
+) -> Result<Option<Levels>> {
+    let mut outgoing = Outgoing::new(path, voxels);
+    outgoing.affine = outgoing.affine.or(affine);
+    let levels = hu.map(|hu| hu.measure(&mut outgoing)).transpose()?;
+    outgoing.done = 0;
+    match &levels {
+        Some(levels) => conefield_io::write_voxels_of(path, &mut levels.of(&mut outgoing), template)?,
+        None => conefield_io::write_voxels_of(path, &mut outgoing, template)?,
+    }
+    Ok(levels)
 }
 
 /// What is kept of written voxels.

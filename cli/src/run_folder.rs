@@ -1,5 +1,6 @@
 //! The folder of a run: `metrics.jsonl`, `spec.toml`, `live.png` and `events.out.tfevents.conefield` if requested, and
-//! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `weights.safetensors`, `slices.png` and, last
+//! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `volume-hu.nii.gz` if requested,
+//! `weights.safetensors`, `slices.png` and, last
 //! and only for a finished run, `record.json`.
 
 use conefield::plugins::Used;
@@ -7,6 +8,7 @@ use conefield::record::ScanRecord;
 use conefield::tradeoff::json::{LONGEST, read_json};
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
+use conefield_core::scan::Unit;
 use conefield_core::{Error, Result};
 use conefield_io::{Contents, Lease, Progressed};
 use serde::Deserialize;
@@ -16,8 +18,9 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// All files that a run writes.
-pub const FILES: [&str; 9] = [
+pub const FILES: [&str; 10] = [
     "volume.nii.gz",
+    "volume-hu.nii.gz",
     "metrics.jsonl",
     "spec.toml",
     "weights.safetensors",
@@ -221,6 +224,11 @@ impl RunOnDisk {
     /// The path from which it read the scan.
     pub fn scan_path(&self) -> Option<&Path> {
         self.known.as_ref().map(|k| Path::new(&k.scan.path))
+    }
+
+    /// The unit of its volume, if its record names it.
+    pub fn unit(&self) -> Option<Unit> {
+        self.known.as_ref()?.scan.unit.clone()
     }
 
     /// The reference volume, as named on the command line.

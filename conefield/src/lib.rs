@@ -20,6 +20,7 @@
 //! - [`backend`]: backends; [`memory`]: a run's memory and the available memory; [`scratch`]: arrays beyond it;
 //!   [`machine`]: the current machine.
 //! - [`session`]: every run, from its inputs ([`input`]) to its [`record`].
+//! - [`hounsfield`]: Hounsfield units of a written volume.
 //! - [`explain`]: explanation of a spec; [`score`]: comparison of a volume with its reference.
 //! - [`simulation`], [`pretraining`], [`projection`]: the work of the commands of these names.
 //! - `study`: many runs under one protocol; [`tradeoff`]: time, memory and accuracy of methods.
@@ -30,6 +31,7 @@
 pub mod backend;
 pub mod explain;
 pub mod files;
+pub mod hounsfield;
 pub mod input;
 pub mod machine;
 pub mod memory;

@@ -65,6 +65,13 @@ pub fn offset(text: &str) -> Result<[f64; 2], String> {
     finite(pair(text, ',', "V,U in mm, such as 0,12.5")?)
 }
 
+/// `SIZE` or `V,U` in mm.
+pub fn pixel(text: &str) -> Result<[f64; 2], String> {
+    let form = "a size above 0 in mm, such as 0.8, or V,U such as 0.8,0.5";
+    let both = if text.contains(',') { pair(text, ',', form)? } else { [positive(text, form)?; 2] };
+    if finite(both)?.iter().all(|x| *x > 0.0) { Ok(both) } else { Err(format!("expected {form}")) }
+}
+
 fn finite(numbers: [f64; 2]) -> Result<[f64; 2], String> {
     if numbers.iter().all(|x| x.is_finite()) { Ok(numbers) } else { Err("expected finite numbers".into()) }
 }
@@ -272,6 +279,8 @@ mod tests {
             assert!(bytes(bad).is_err(), "{bad}");
         }
         assert_eq!(detector("64x96"), Ok([64, 96]));
+        assert_eq!((pixel("0.8"), pixel("0.8,0.5")), (Ok([0.8; 2]), Ok([0.8, 0.5])));
+        assert!(["0", "0,1", "-1", "inf", "1,", "a"].iter().all(|bad| pixel(bad).is_err()));
         assert!(detector("64").is_err() && detector("0x4").is_err() && detector("4x-1").is_err());
         assert_eq!(noise("tigre:1e4,10"), Ok(DetectorNoise::Tigre { i0: 1e4, sigma: 10.0 }));
         assert_eq!(noise("poisson:1e5"), Ok(DetectorNoise::Poisson { i0: 1e5 }));

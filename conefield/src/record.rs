@@ -1,5 +1,6 @@
 //! The record of a run.
 
+use crate::hounsfield::Levels;
 use crate::machine::Machine;
 use crate::memory::Memory;
 use crate::plugins::Used;
@@ -9,7 +10,7 @@ use conefield_core::Result;
 use conefield_core::backend::Explain;
 use conefield_core::method::Limits;
 use conefield_core::place::Moved;
-use conefield_core::scan::Scan;
+use conefield_core::scan::{Scan, Unit};
 use conefield_evaluation::metrics::Scores;
 use conefield_evaluation::report::text::stem;
 use serde::{Deserialize, Serialize};
@@ -41,6 +42,9 @@ pub struct RunRecord {
     pub init: Option<String>,
     /// The reference.
     pub reference: Option<String>,
+    /// Water and air of volume-hu.nii.gz, per unit of the scan.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hounsfield: Option<Levels>,
     /// The plugins whose stages the spec names.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub plugins: Vec<Used>,
@@ -136,6 +140,9 @@ pub struct ScanRecord {
     pub projections_fnv1a64: String,
     /// Checksum of geometry and unit.
     pub geometry_fnv1a64: String,
+    /// The unit of the volume's values, per unit; records of earlier versions do not have it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unit: Option<Unit>,
 }
 
 impl ScanRecord {
@@ -149,6 +156,7 @@ impl ScanRecord {
             volume: scan.geometry.volume.shape,
             projections_fnv1a64: checksum(scan.projections.iter().flat_map(|x| x.to_le_bytes())),
             geometry_fnv1a64: checksum(placed.into_bytes().into_iter()),
+            unit: Some(scan.unit.clone()),
         })
     }
 

@@ -224,6 +224,7 @@ impl Run<'_> {
             plan: self.schedule.clone(),
             init: None,
             reference: None,
+            hounsfield: None,
             plugins: plugins::used(&method.loaded.tree),
             backend: method.plan.outline().backend(),
             moved: self.moved(),

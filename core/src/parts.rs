@@ -17,6 +17,11 @@ pub trait Voxels {
     /// Voxel indices to the patient's or file's own coordinates, if known; see [`Volume::affine`].
     fn affine(&self) -> Option<Affine>;
 
+    /// If the values are Hounsfield units: what they are of, for the header of a file, in a few words.
+    fn hounsfield(&self) -> Option<&str> {
+        None
+    }
+
     /// Puts the values of `part` into `out`, which has its shape.
     fn fill(&mut self, part: &Part, out: ArrayViewMut3<'_, f32>) -> Result<()>;
 }

@@ -16,6 +16,16 @@ pub struct Unit {
     pub mm: f64,
 }
 
+/// Names of lengths; other units, such as half the side of a cube, are relative to an object.
+const LENGTHS: [&str; 8] = ["nm", "um", "µm", "mm", "cm", "dm", "m", "inch"];
+
+impl Unit {
+    /// Whether it is a length, so that values per unit are physical attenuation.
+    pub fn is_length(&self) -> bool {
+        LENGTHS.contains(&self.name.as_str())
+    }
+}
+
 impl Default for Unit {
     fn default() -> Self {
         Self { name: "mm".into(), mm: 1.0 }

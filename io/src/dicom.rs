@@ -3,13 +3,21 @@
 //! `dicom-object` reads the elements. This crate adds the rest: [`lengths`] refuses files whose elements claim more
 //! than the file holds before they are read, [`slice`](mod@slice) extracts what a volume needs, [`pixels`] decodes the
 //! values (the decoders of `dicom-pixeldata` index past the end of damaged data and panic), and this module sorts the
-//! slices.
+//! slices. [`write`](mod@write) writes a series,
+//! [`enhanced`] reads and writes one file with all slices.
 
+pub(crate) mod enhanced;
 mod lengths;
 mod pixels;
 mod slice;
 #[cfg(test)]
 mod tests;
+mod write;
+#[cfg(test)]
+mod written;
+
+pub use write::DicomTemplate;
+pub(crate) use write::{check_shape, write};
 
 use crate::{affine, foreign};
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm, sub};
@@ -37,7 +45,7 @@ pub(crate) fn is_series(folder: &Path) -> bool {
 /// units in a CT), padding as well. The affine is RAS, in mm; `grid.center` is `[0, 0, 0]`.
 pub(crate) fn read(folder: &Path) -> Result<Volume> {
     let place = folder.display().to_string();
-    assemble(&place, slices(folder)?)
+    assemble(&place, slices(folder)?, Slice::values)
 }
 
 /// Number of voxels that [`read`] returns, from the headers of the slices.
@@ -91,7 +99,7 @@ fn is_dicom(path: &Path) -> Result<bool> {
     Ok(is_header(&head))
 }
 
-fn assemble(place: &str, mut slices: Vec<Slice>) -> Result<Volume> {
+fn assemble(place: &str, mut slices: Vec<Slice>, values: impl Fn(&Slice) -> Result<Vec<f32>>) -> Result<Volume> {
     for other in &slices[1..] {
         other.must_fit(&slices[0])?;
     }
@@ -121,7 +129,7 @@ fn assemble(place: &str, mut slices: Vec<Slice>) -> Result<Volume> {
     allowance::numbers(place, "voxels", grid.len().unwrap_or(usize::MAX))?;
     let mut data = Array3::zeros(grid.shape);
     for (z, slice) in slices.iter().enumerate() {
-        let values = slice.values()?;
+        let values = values(slice)?;
         let mut plane = data.slice_mut(s![.., .., z]);
         for (y, row) in values.chunks_exact(slice.columns).enumerate() {
             for (x, value) in row.iter().enumerate() {

@@ -1,7 +1,7 @@
 //! Reading and writing of every file format that conefield supports, one module per format.
 //!
 //! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NRRD, NumPy, TIFF stacks,
-//!   OME-Zarr; read only: a DICOM series).
+//!   OME-Zarr, a DICOM series).
 //! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
 //!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
 //!   reads test views.
@@ -65,6 +65,7 @@ mod testing;
 
 pub use atomic::{discard_unfinished, is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
+pub use dicom::DicomTemplate;
 pub use events::EventFile;
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
 pub use lease::{Contents, FolderLock, Lease, Progressed, SharedLease, is_aside, try_alone};
@@ -72,10 +73,10 @@ pub use naf::{read_naf, write_naf};
 pub use r2::{read_r2, write_r2};
 pub use rtk::{read_rtk_geometry, write_rtk_geometry};
 pub use rtk_folder::write_rtk;
-pub use scan::{DataSet, Parts, read_data_set, read_scan, read_truth};
+pub use scan::{DataSet, Parts, read_data_set, read_scan, read_truth, scan_unit};
 pub use scan_folder::write_scan;
 pub use scanner::{Conversion, Counts, I0, OpenBeam, Stored, read_scanner};
 pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};
 pub use text::parse_toml;
-pub use volume::{check_shape, is_volume, packed_bytes, read_volume, write_volume, write_voxels};
+pub use volume::{check_shape, is_volume, packed_bytes, read_volume, write_volume, write_voxels, write_voxels_of};
 pub use weights::{read_weights, write_weights};

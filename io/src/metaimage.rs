@@ -349,8 +349,9 @@ fn lines(path: &Path, voxels: &dyn Voxels, packing: &str, data: &str) -> String 
     let lps = affine::flip(ras);
     let turn = (0..3).flat_map(|k| affine::column(&lps, k).map(|x| x / spacing[k]));
     let [nx, ny, nz] = grid.shape;
+    let comment = voxels.hounsfield().map_or(String::new(), |hu| format!("Comment = {hu}\n"));
     format!(
-        "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\n{packing}\n\
+        "ObjectType = Image\nNDims = 3\n{comment}BinaryData = True\nBinaryDataByteOrderMSB = False\n{packing}\n\
          TransformMatrix = {}\nOffset = {}\nCenterOfRotation = 0 0 0\n\
          ElementSpacing = {}\nDimSize = {nx} {ny} {nz}\nElementType = MET_FLOAT\nElementDataFile = {data}\n",
         list(turn),

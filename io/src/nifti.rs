@@ -248,7 +248,9 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
     put(108, &(DATA as f32).to_le_bytes());
     put(112, &1f32.to_le_bytes());
     put(123, &[2]);
-    put(148, b"conefield");
+    // The field has 80 bytes, the last of them 0.
+    let about = voxels.hounsfield().map_or("conefield".into(), |hu| format!("conefield: {hu}"));
+    put(148, &about.as_bytes()[..about.len().min(79)]);
     put(254, &code.to_le_bytes());
     for (i, x) in affine[..3].iter().flatten().enumerate() {
         put(280 + 4 * i, &(*x as f32).to_le_bytes());

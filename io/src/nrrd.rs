@@ -24,8 +24,9 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
         let [a, b, c] = affine::column(&lps, k);
         format!("({a},{b},{c})")
     };
+    let comment = voxels.hounsfield().map_or(String::new(), |hu| format!("# {hu}\n"));
     let text = format!(
-        "NRRD0004\ntype: float\ndimension: 3\nspace: left-posterior-superior\nsizes: {nx} {ny} {nz}\n\
+        "NRRD0004\n{comment}type: float\ndimension: 3\nspace: left-posterior-superior\nsizes: {nx} {ny} {nz}\n\
          space directions: {} {} {}\nkinds: domain domain domain\nspace units: \"mm\" \"mm\" \"mm\"\nendian: little\n\
          encoding: gzip\nspace origin: {}\n\n",
         vector(0),

@@ -2,7 +2,7 @@
 
 use crate::text::format_of;
 use crate::{Stored, foreign, naf, pickle, r2, scan_folder, scanner};
-use conefield_core::scan::{Scan, Volume};
+use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use std::path::{Path, PathBuf};
 
@@ -82,6 +82,13 @@ pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
         ScanFile::Naf(file) => naf::read_truth(&file),
         ScanFile::Scanner(_) => Ok(None),
     }
+}
+
+/// The unit that the description of conefield's own scan in `folder` states; `None` if there is no such scan.
+pub fn scan_unit(folder: impl AsRef<Path>) -> Result<Option<Unit>> {
+    let folder = folder.as_ref();
+    let file = ["scan.toml", "scan.json"].map(|name| folder.join(name)).into_iter().find(|file| file.is_file());
+    file.map(|file| scan_folder::unit(&file)).transpose()
 }
 
 pub(crate) fn find(path: &Path) -> Result<ScanFile> {

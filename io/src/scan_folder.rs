@@ -91,6 +91,11 @@ fn describe(file: &Path) -> Result<Description> {
     described(file, FORMAT, VERSION)
 }
 
+/// The unit of the scan described by `file`.
+pub(crate) fn unit(file: &Path) -> Result<Unit> {
+    describe(file).map(|d| d.unit)
+}
+
 fn views(place: &str, d: &mut Description) -> Result<Vec<View>> {
     let table = match (d.orbit.take(), d.views.take()) {
         (Some(o), None) => o,

@@ -72,6 +72,7 @@ pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     let product = |shape: &[usize]| shape.iter().fold(1, |n: u64, &s| n.saturating_mul(s as u64));
     let voxels = match volume::open(path)? {
         VolumeFile::Series => dicom::voxels(path)?,
+        VolumeFile::Enhanced => dicom::enhanced::voxels(path)?,
         VolumeFile::Slices => tiff::folder_voxels(path)?,
         VolumeFile::Zarr => product(&zarr::shape(path)?),
         VolumeFile::Npy(mut input, head) => product(&npy::shape(&mut input, head)?),

@@ -1,5 +1,6 @@
 //! Entry points for volumes: they recognize a file's format, and choose a format for a file name.
 
+use crate::dicom::DicomTemplate;
 use crate::input::Input;
 use crate::{dicom, foreign, metaimage, nifti, npy, nrrd, pickle, scan, tiff, write_atomic, zarr};
 use conefield_core::geometry::VoxelGrid;
@@ -14,7 +15,7 @@ use std::path::Path;
 /// Reads a volume: NIfTI-1 (any real number type, gzip or not), MetaImage (`.mha`, or `.mhd` with its data file in the
 /// same folder, zlib or not), NRRD (`.nrrd`, or `.nhdr` with its data file in the same folder, gzip or not), a NumPy
 /// array of three axes, the pages of a TIFF file, or a folder: OME-Zarr (0.4), the DICOM files of one series, one slice
-/// each, or TIFF files, one slice each in the order of the numbers in their names.
+/// each (or all slices in one DICOM file), or TIFF files, one slice each in the order of the numbers in their names.
 ///
 /// The content decides, not the name. `grid.center` is `[0, 0, 0]`: the position in the patient stays in `affine`, in
 /// mm, RAS. A NumPy array has no voxel size and gets 1 mm, as do a NRRD and TIFF files that do not say it. Values are
@@ -23,6 +24,7 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     let path = path.as_ref();
     match open(path)? {
         VolumeFile::Series => dicom::read(path),
+        VolumeFile::Enhanced => dicom::enhanced::read(path),
         VolumeFile::Zarr => zarr::read(path),
         VolumeFile::Slices => tiff::read_folder(path),
         VolumeFile::Npy(mut input, head) => from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?),
@@ -37,6 +39,8 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
 pub(crate) enum VolumeFile {
     /// A folder of DICOM files.
     Series,
+    /// One DICOM file with all slices.
+    Enhanced,
     /// A folder of OME-Zarr.
     Zarr,
     /// A folder of TIFF files.
@@ -71,6 +75,9 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
         return Err(Error::unsupported(what, "convert it to NIfTI-1 (.nii or .nii.gz)"));
     }
     if dicom::is_header(&head) {
+        if dicom::enhanced::has_frames(path) {
+            return Ok(VolumeFile::Enhanced);
+        }
         let what = format!("{}: one DICOM file", path.display());
         return Err(Error::unsupported(what, "give the folder that holds the files of its series"));
     }
@@ -136,14 +143,17 @@ pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
     match wanted(path)? {
         VolumeFormat::Nifti | VolumeFormat::NiftiGz => nifti::check_shape(&path.display().to_string(), shape),
         VolumeFormat::Tiff => tiff::check_shape(&path.display().to_string(), shape),
+        VolumeFormat::Dicom => dicom::check_shape(&path.display().to_string(), shape),
+        VolumeFormat::EnhancedDicom => dicom::enhanced::check_one_file(&path.display().to_string(), shape),
         _ => Ok(()),
     }
 }
 
-/// Writes a volume in the format of its name, always in `f32`: `.nii`, `.nii.gz` (with an sform in mm), `.mha` (zlib,
+/// Writes a volume in the format of its name, in `f32`: `.nii`, `.nii.gz` (with an sform in mm), `.mha` (zlib,
 /// with the same axes as directions and voxel sizes), `.mhd` (the same as a header, with uncompressed voxels in a
 /// `.raw` next to it), `.nrrd` (gzip, the same axes), `.npy` (C order, without voxel sizes), `.tif` (one page per slice
-/// along z, with voxel sizes) or `.zarr` (a folder: OME-Zarr 0.4 with a pyramid).
+/// along z, with voxel sizes), `.zarr` (a folder: OME-Zarr 0.4 with a pyramid) or, in 16 bits, `.dicom` (a folder:
+/// a DICOM series) or `.dcm` (one file: an enhanced CT).
 ///
 /// An affine is kept if its voxel sizes match the grid; without one, the grid's centre is placed at `grid.center`.
 pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
@@ -157,13 +167,28 @@ pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
 
 /// Writes voxels like [`write_volume`], slab by slab. At most 16 MiB of them (or one row) are in memory at once, for
 /// `.mha` also 32 MiB of compressed data, whose rest goes to an unnamed file next to it. For `.zarr` it is eight chunks
-/// of 1 MiB per level.
+/// of 1 MiB per level; for `.dicom` a slice and up to 32 MiB of 32-bit floats, whose rest goes to an unnamed file.
 pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<()> {
+    write_voxels_of(path, voxels, None)
+}
+
+/// Writes voxels like [`write_voxels`], with the patient and study of `template`, which only DICOM can hold.
+pub fn write_voxels_of(
+    path: impl AsRef<Path>,
+    voxels: &mut dyn Voxels,
+    template: Option<&DicomTemplate>,
+) -> Result<()> {
     let path = path.as_ref();
     let format = wanted(path)?;
+    if template.is_some() && !matches!(format, VolumeFormat::Dicom | VolumeFormat::EnhancedDicom) {
+        let expected = "an end of .dicom or .dcm: other formats have no patient and study for the template";
+        return Err(Error::invalid(path.display().to_string(), "file name", file_name(path), expected));
+    }
     voxels.grid().validate(&path.display().to_string())?;
     match format {
         VolumeFormat::Zarr => return zarr::write(path, voxels),
+        VolumeFormat::Dicom => return dicom::write(path, voxels, template),
+        VolumeFormat::EnhancedDicom => return dicom::enhanced::write(path, voxels, template),
         VolumeFormat::MetaImageHeader => return metaimage::write_raw(path, voxels),
         _ => {}
     }
@@ -178,8 +203,8 @@ pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<(
         VolumeFormat::Nrrd => nrrd::write(w, path, voxels),
         VolumeFormat::Tiff => tiff::write(w, path, voxels),
         VolumeFormat::MetaImage => metaimage::write(w, path, voxels),
-        VolumeFormat::MetaImageHeader | VolumeFormat::Zarr => {
-            unreachable!("formats of several files are written above")
+        VolumeFormat::MetaImageHeader | VolumeFormat::Zarr | VolumeFormat::Dicom | VolumeFormat::EnhancedDicom => {
+            unreachable!("these are written above")
         }
     })
 }
@@ -220,7 +245,7 @@ pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Vol
 /// The format for a file name; refuses an unknown extension.
 fn wanted(path: &Path) -> Result<VolumeFormat> {
     let (place, expected) =
-        (path.display().to_string(), "an end of .nii, .nii.gz, .mha, .mhd, .nrrd, .npy, .tif or .zarr");
+        (path.display().to_string(), "an end of .nii, .nii.gz, .mha, .mhd, .nrrd, .npy, .tif, .zarr, .dicom or .dcm");
     format_of(path).ok_or_else(|| Error::invalid(place, "file name", file_name(path), expected))
 }
 
@@ -235,6 +260,10 @@ enum VolumeFormat {
     Nrrd,
     Tiff,
     Zarr,
+    /// A folder.
+    Dicom,
+    /// One file.
+    EnhancedDicom,
 }
 
 fn file_name(path: &Path) -> String {
@@ -253,6 +282,8 @@ fn format_of(path: &Path) -> Option<VolumeFormat> {
         (".tif", VolumeFormat::Tiff),
         (".tiff", VolumeFormat::Tiff),
         (".zarr", VolumeFormat::Zarr),
+        (".dicom", VolumeFormat::Dicom),
+        (".dcm", VolumeFormat::EnhancedDicom),
     ];
     ends.into_iter().find(|(end, _)| name.ends_with(end)).map(|(_, format)| format)
 }

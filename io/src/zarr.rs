@@ -79,6 +79,9 @@ fn attributes(path: &Path, voxels: &dyn Voxels, levels: usize) -> Value {
     if own {
         found["conefield"] = json!({ "affine": affine });
     }
+    if let Some(hu) = voxels.hounsfield() {
+        found["multiscales"][0]["metadata"] = json!({ "values": hu });
+    }
     found
 }
 

@@ -1,4 +1,4 @@
-//! Exchanges volumes with SimpleITK and nibabel.
+//! Exchanges volumes with SimpleITK, pydicom and nibabel.
 //!
 //! `CONEFIELD_PYTHON` names the interpreter; the default is `python3`. Tests are skipped with a note if a module is
 //! missing.
@@ -316,4 +316,54 @@ for name, codec in [('zlib', numcodecs.Zlib()), ('gzip', numcodecs.GZip()), ('no
 ";
     let names = ["zlib46.zarr", "zlib47.zarr", "gzip46.zarr", "gzip47.zarr", "none46.zarr", "none47.zarr"];
     assert_written_by(&["zarr", "numcodecs", "numpy"], &names, zarr);
+}
+
+#[test]
+fn simple_itk_and_pydicom_read_a_written_series_and_one_file() {
+    let Some(python) = python(&["SimpleITK", "numpy", "pydicom"]) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let v = turned();
+    for name in ["a.dicom", "a.dcm"] {
+        write_volume(dir.path().join(name), &v).unwrap();
+    }
+    let back = read_volume(dir.path().join("a.dicom")).unwrap();
+    let values: Vec<f64> = back.data.t().iter().map(|x| f64::from(*x)).collect();
+    let near = |found: &[f64], what: &str| {
+        assert_eq!(found.len(), values.len(), "{what}");
+        assert!(found.iter().zip(&values).all(|(f, w)| (f - w).abs() <= 1e-5), "{what}: {found:?}");
+    };
+    let script = "
+reader = sitk.ImageSeriesReader()
+reader.SetFileNames(reader.GetGDCMSeriesFileNames('a.dicom'))
+show(reader.Execute())
+show(sitk.ReadImage('a.dcm'))
+";
+    let text = run(&python, dir.path(), &format!("{SHOW}\n{script}"));
+    for (line, name) in text.lines().zip(["a.dicom", "a.dcm"]) {
+        let found = numbers(line);
+        assert_affine(&found[..16], &v, 1e-9, name);
+        near(&found[16..], name);
+    }
+    // The attributes that the CT Image IOD requires (PS3.3, A.3), and the values without ITK.
+    let script = "
+import pydicom, glob, numpy as np
+need = '''PatientName PatientID PatientBirthDate PatientSex StudyInstanceUID StudyDate StudyTime ReferringPhysicianName StudyID
+AccessionNumber Modality SeriesInstanceUID SeriesNumber PatientPosition FrameOfReferenceUID PositionReferenceIndicator
+Manufacturer InstanceNumber PixelSpacing ImageOrientationPatient ImagePositionPatient SliceThickness SamplesPerPixel
+PhotometricInterpretation Rows Columns BitsAllocated BitsStored HighBit PixelRepresentation PixelData ImageType
+RescaleIntercept RescaleSlope RescaleType KVP AcquisitionNumber SOPClassUID SOPInstanceUID SpecificCharacterSet'''.split()
+slices = [pydicom.dcmread(f) for f in sorted(glob.glob('a.dicom/*.dcm'))]
+for d in slices:
+    assert not [n for n in need if n not in d]
+    assert d.file_meta.MediaStorageSOPInstanceUID == d.SOPInstanceUID and d.SOPInstanceUID.is_valid
+for d in slices:
+    print(*(d.pixel_array * float(d.RescaleSlope) + float(d.RescaleIntercept)).ravel())
+d = pydicom.dcmread('a.dcm')
+slope = float(d.SharedFunctionalGroupsSequence[0].PixelValueTransformationSequence[0].RescaleSlope)
+print(*(d.pixel_array * slope).ravel())
+";
+    let found = numbers(&run(&python, dir.path(), script));
+    let (series, one) = found.split_at(values.len());
+    near(series, "pydicom, series");
+    near(one, "pydicom, one file");
 }

@@ -51,7 +51,8 @@ class Volume:
         return self.data.shape  # type: ignore[return-value]
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Writes ``.nii``, ``.nii.gz``, ``.mha``, ``.mhd``, ``.nrrd``, ``.npy``, ``.tif`` or ``.zarr``, by the extension.
+        """Writes ``.nii``, ``.nii.gz``, ``.mha``, ``.mhd``, ``.nrrd``, ``.npy``, ``.tif``, ``.zarr``, ``.dicom``
+        (a series) or ``.dcm`` (one file), by the extension.
 
         No partial file is left.
         """

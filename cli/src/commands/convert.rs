@@ -2,6 +2,7 @@
 
 use super::corrections::{CorrectionOptions, corrected_size, log_applied};
 use super::selection::SelectionOptions;
+use super::units::{HounsfieldOption, unit_of};
 use crate::boundary::{Inputs, refuse_existing};
 use crate::out;
 use clap::{Args, ValueEnum};
@@ -9,16 +10,17 @@ use conefield::files;
 use conefield::memory::Memory;
 use conefield::parse::{self, Values};
 use conefield_core::{Error, Result};
-use conefield_io::{DataSet, Parts};
+use conefield_io::{DataSet, DicomTemplate, Parts, write_voxels_of};
 use conefield_scans::diagnosis::survey;
 use std::path::PathBuf;
 
 /// Rewrite a volume or a scan in another format.
 ///
 /// Volumes: the extension of OUT selects NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd with a .raw), NRRD, NumPy (.npy),
-/// a TIFF stack (.tif) or an OME-Zarr folder (.zarr). IN may also be a .nhdr file, or a folder with a DICOM series or
-/// TIFF slices. Scans: --to sets the format; r2 and naf keep test views. --correct corrects faults of a scan; other
-/// options select part of it; --bin averages line integrals.
+/// a TIFF stack (.tif), an OME-Zarr folder (.zarr) or, in 16 bits, a folder with a DICOM series (.dicom) or one DICOM
+/// file (.dcm). IN may also be a .nhdr file, or a folder with a DICOM series or TIFF slices. Scans: --to sets the format;
+/// r2 and naf keep test views. --correct corrects faults of a scan; other options select part of it; --bin averages line
+/// integrals.
 #[derive(Args)]
 pub struct ConvertArgs {
     /// A volume or a scan.
@@ -33,6 +35,11 @@ pub struct ConvertArgs {
     /// Meaning of the voxel values: as-is, hu:MU_WATER or clip:LO,HI.
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
+    #[command(flatten)]
+    units: HounsfieldOption,
+    /// A DICOM file whose patient and study OUT gets, if it is .dicom or .dcm.
+    #[arg(long, value_name = "FILE")]
+    dicom_template: Option<PathBuf>,
     #[command(flatten)]
     corrections: CorrectionOptions,
     #[command(flatten)]
@@ -59,7 +66,7 @@ impl ConvertArgs {
     pub fn run(self) -> Result<()> {
         std::fs::metadata(&self.input).map_err(|e| Error::io(&self.input, e))?;
         refuse_existing(&self.output, self.force)?;
-        let inputs = Inputs::of([&self.input]);
+        let inputs = Inputs::of([&self.input]).and(self.units.path()).and(&self.dicom_template);
         inputs.spare_file(&self.output)?;
         inputs.spare_folder(&self.output)?;
         let (selection, corrections) = (self.selection.selection(), self.corrections.corrections()?);
@@ -70,13 +77,24 @@ impl ConvertArgs {
                 let expected = "a scan: only scans have views and pixels";
                 return Err(Error::invalid(place, option, "a volume", expected));
             }
+            let template = self.dicom_template.as_ref().map(DicomTemplate::read).transpose()?;
             let voxels = conefield_io::volume_voxels(&self.input)?;
             Memory::of_volumes(&[voxels]).check(|_| vec![])?;
             let volume = conefield_io::read_volume(&self.input)?;
             conefield_io::check_shape(&self.output, volume.grid.shape)?;
-            let volume = self.values.apply(volume)?;
-            conefield_io::write_volume(&self.output, &volume)?;
+            let mut volume = &self.values.apply(volume)?;
+            let unit = if self.values == Values::AsIs { unit_of(&self.input)? } else { None };
+            let hu = self.units.open(&self.input, unit.as_ref(), &volume.grid, volume.affine.as_ref())?;
+            match hu.map(|hu| hu.measure(&mut volume)).transpose()? {
+                Some(levels) => write_voxels_of(&self.output, &mut levels.of(&mut volume), template.as_ref())?,
+                None => write_voxels_of(&self.output, &mut volume, template.as_ref())?,
+            }
         } else {
+            let named = [("--hu", self.units.hu.is_some()), ("--dicom-template", self.dicom_template.is_some())];
+            if let Some((option, _)) = named.into_iter().find(|(_, given)| *given) {
+                let expected = "a volume: a scan has line integrals";
+                return Err(Error::invalid(self.input.display().to_string(), option, "a scan", expected));
+            }
             let size = corrected_size(conefield_io::scan_size(&self.input)?, &corrections);
             Memory::of_data_set(&size).check(|_| vec![])?;
             let DataSet { train, test, volume } = conefield_scans::read_data_set(&self.input, Parts::ALL)?;

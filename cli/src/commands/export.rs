@@ -1,13 +1,15 @@
 //! `conefield export`
 
 use super::trained::Trained;
+use super::units::{HounsfieldOption, unit_of};
 use crate::boundary::{Inputs, refuse_existing};
 use crate::{out, outgoing, signals};
 use clap::Args;
 use conefield::memory;
 use conefield_core::Result;
+use conefield_core::scan::Unit;
 use conefield_core::trained::FieldVoxels;
-use conefield_io::{PACKED_BYTES, SLAB_BYTES};
+use conefield_io::{DicomTemplate, PACKED_BYTES, SLAB_BYTES};
 use serde_json::json;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -20,9 +22,15 @@ use std::time::Instant;
 pub struct ExportArgs {
     #[command(flatten)]
     trained: Trained,
-    /// The volume to write: .nii, .nii.gz, .mha, .mhd (with a .raw), .nrrd, .npy, .tif or .zarr (a folder, OME-Zarr).
+    /// The volume to write: .nii, .nii.gz, .mha, .mhd (with a .raw), .nrrd, .npy, .tif, .zarr (a folder, OME-Zarr)
+    /// or, in 16 bits, .dicom (a folder, a DICOM series) or .dcm (one file, an enhanced CT).
     #[arg(short, long = "output", visible_alias = "out", value_name = "VOLUME")]
     output: PathBuf,
+    #[command(flatten)]
+    units: HounsfieldOption,
+    /// A DICOM file whose patient and study VOLUME gets, if it is .dicom or .dcm.
+    #[arg(long, value_name = "FILE")]
+    dicom_template: Option<PathBuf>,
     /// Replace VOLUME.
     #[arg(long)]
     force: bool,
@@ -37,18 +45,24 @@ impl ExportArgs {
         let buffers = FieldVoxels::BYTES + SLAB_BYTES + PACKED_BYTES;
         let opened = self.trained.open(buffers)?;
         let (memory, grid) = (opened.memory(buffers)?, opened.grid);
-        Inputs::of([&opened.file]).spare_file(&self.output)?;
+        let inputs = Inputs::of([&opened.file]).and(self.units.path()).and(&self.dicom_template);
+        inputs.spare_file(&self.output)?;
+        inputs.spare_folder(&self.output)?;
+        let template = self.dicom_template.as_ref().map(DicomTemplate::read).transpose()?;
         conefield_io::check_shape(&self.output, grid.shape)?;
+        let unknown = || Unit { name: "unknown, no record.json names it".into(), mm: opened.field.unit_mm };
+        let unit = unit_of(&opened.file)?.unwrap_or_else(unknown);
+        let hu = self.units.open(&opened.file, Some(&unit), &grid, None)?;
         let backend = self.trained.backend.open()?;
         signals::listen()?;
         let start = Instant::now();
         let mut voxels = opened.field.voxels(backend.as_ref(), grid)?;
-        outgoing::write_only(&self.output, &mut voxels)?;
+        let hounsfield = outgoing::write_only(&self.output, &mut voxels, None, hu.as_ref(), template.as_ref())?;
         let export_s = start.elapsed().as_secs_f64();
         if self.json {
             return out::json(&json!({
                 "volume": self.output, "shape": grid.shape, "spacing_mm": grid.spacing, "export_s": export_s,
-                "memory": memory, "peak_bytes": memory::peak(),
+                "hounsfield": hounsfield, "memory": memory, "peak_bytes": memory::peak(),
             }));
         }
         let [x, y, z] = grid.shape;

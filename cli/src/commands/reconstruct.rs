@@ -1,6 +1,7 @@
 //! `conefield reconstruct`
 
 use super::summary::summary;
+use super::units::HounsfieldOption;
 use super::{calibrate, protocol::RunProtocol, watch};
 use crate::board::Board;
 use crate::boundary::{self, Inputs};
@@ -61,6 +62,8 @@ pub struct ReconstructArgs {
     /// Start from weights of "conefield pretrain", or from a volume.
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
+    #[command(flatten)]
+    units: HounsfieldOption,
     /// Draw the middle slices of a training field to live.png in RUN at this interval, such as 5s.
     #[arg(long, value_name = "SECONDS", value_parser = parse::seconds)]
     live: Option<f64>,
@@ -133,13 +136,20 @@ impl ReconstructArgs {
         let backend = self.protocol.backend.open()?;
         // An invalid spec, and weights that cannot be read or do not fit, are reported before anything is created.
         let session = self.session(backend.as_ref(), begin)?;
-        let inputs = Inputs::of([&self.scan]).and(&self.front).and(&self.init).and(&self.protocol.reference);
+        let inputs = Inputs::of([&self.scan])
+            .and(&self.front)
+            .and(&self.init)
+            .and(&self.protocol.reference)
+            .and(self.units.path());
         let inputs = match session.requested() {
             Some(loaded) if !self.resume => inputs.and_spec(loaded),
             _ => inputs,
         };
         inputs.spare_folder(&self.output)?;
         let (input, scan) = self.input(&folder)?;
+        let affine = input.reference.as_ref().and_then(|r| r.affine);
+        let (unit, grid) = (&input.scan.unit, &input.scan.geometry.volume);
+        let hu = self.units.open(&self.scan, Some(unit), grid, affine.as_ref())?;
 
         let resumed = match session.requested() {
             Some(loaded) if self.resume => {
@@ -175,6 +185,13 @@ impl ReconstructArgs {
         drop(progress);
 
         let (written, _) = write(&folder, &run, &solved, self.protocol.seed, backend.as_ref())?;
+        let hounsfield = match &hu {
+            Some(hu) => {
+                let mut voxels = solved.solution.result.voxels(backend.as_ref())?;
+                outgoing::write_only(&folder.file("volume-hu.nii.gz"), voxels.as_mut(), affine, Some(hu), None)?
+            }
+            None => None,
+        };
         if let Some(mut board) = board {
             board.picture(solved.solution.steps, "slices", &folder.file("slices.png"))?;
         }
@@ -183,6 +200,7 @@ impl ReconstructArgs {
             scan: Some(scan.clone()),
             init: self.init.as_ref().map(path),
             reference: self.protocol.reference.as_ref().map(path),
+            hounsfield,
             ..run.record(&solved, last.as_ref(), written)
         };
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;

@@ -8,7 +8,9 @@ use conefield::memory::Memory;
 use conefield::parse::{self, AnglesOption, Values};
 use conefield::simulation::{self, Changes};
 use conefield_core::Result;
-use conefield_projectors::simulate::DetectorNoise;
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::scan::Unit;
+use conefield_projectors::simulate::{DetectorExtent, DetectorNoise, Protocol};
 use serde_json::json;
 use std::path::PathBuf;
 use tracing::warn;
@@ -28,10 +30,12 @@ pub struct SimulateArgs {
     /// The geometry: r2, the published synthetic set-up, or a TOML or JSON file (docs/guide/formats.md has its keys).
     #[arg(long, default_value = "r2", value_name = "r2|FILE")]
     protocol: String,
-    /// Number of views [default: the protocol's; r2: 50].
+    #[command(flatten)]
+    set_up: SetUp,
+    /// Number of views [default: the protocol's; else 50].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     views: Option<u32>,
-    /// Rows and columns of the detector, at the same size in mm [default: the protocol's; r2: 512x512].
+    /// Rows and columns of the detector, with a protocol at its size in mm [default: the protocol's; r2: 512x512].
     #[arg(long, value_name = "ROWSxCOLS", value_parser = parse::detector)]
     detector: Option<[usize; 2]>,
     /// Shift of the detector along v (from row to row) and u (from column to column), in mm.
@@ -41,7 +45,7 @@ pub struct SimulateArgs {
     #[arg(long, value_name = "START:RANGE|FILE", value_parser = parse::angles, allow_hyphen_values = true)]
     angles: Option<AnglesOption>,
     /// Noise: none, tigre:I0,SIGMA such as tigre:1e4,10 (the published one), or poisson:I0 [default: the protocol's;
-    /// r2: none].
+    /// else none].
     #[arg(long, value_parser = parse::noise)]
     noise: Option<DetectorNoise>,
     /// Average blocks of N x N x N voxels first.
@@ -51,7 +55,7 @@ pub struct SimulateArgs {
     /// of water in 1/mm) or clip:LO,HI (LO to HI becomes 0 to 1).
     #[arg(long, default_value = "as-is", value_parser = parse::values)]
     values: Values,
-    /// Seed of the noise [default: the protocol's; r2: 0].
+    /// Seed of the noise [default: the protocol's; else 0].
     #[arg(long)]
     seed: Option<u64>,
     /// Replace SCAN.
@@ -60,6 +64,31 @@ pub struct SimulateArgs {
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
+}
+
+/// A set-up in mm, in place of a protocol; voxel values are attenuation in 1/mm.
+#[derive(Args)]
+struct SetUp {
+    /// Distance from the source to the rotation axis in mm; takes the place of a protocol, with --dsd, --pixel and
+    /// --detector.
+    #[arg(long, value_name = "MM", value_parser = parse::above_zero, conflicts_with = "protocol",
+        requires_all = ["dsd", "pixel", "detector"])]
+    dso: Option<f64>,
+    /// Distance from the source to the detector in mm.
+    #[arg(long, value_name = "MM", value_parser = parse::above_zero, requires = "dso")]
+    dsd: Option<f64>,
+    /// Size of a pixel in mm, or along v and u.
+    #[arg(long, value_name = "MM|V,U", value_parser = parse::pixel, requires = "dso")]
+    pixel: Option<[f64; 2]>,
+}
+
+impl SetUp {
+    /// The protocol for a volume on `grid`; `None` without a set-up.
+    fn protocol(&self, detector: Option<[usize; 2]>, grid: &VoxelGrid) -> Option<Protocol> {
+        let (dso, dsd, pixel, detector) = (self.dso?, self.dsd?, self.pixel?, detector?);
+        let extent = DetectorExtent::Pixel(pixel);
+        Some(Protocol { unit: Unit::default(), dso, dsd, detector, extent, ..Protocol::r2(grid) })
+    }
 }
 
 impl SimulateArgs {
@@ -73,15 +102,16 @@ impl SimulateArgs {
         let before = files::voxels(&self.volume)?;
         Memory::of_volumes(&[before]).check(|_| vec![])?;
         let volume = simulation::prepared(files::volume(&self.volume)?, self.values, self.downsample.into())?;
+        let set_up = self.set_up.protocol(self.detector, &volume.grid);
         let changes = Changes {
             views: self.views.map(|n| n as usize),
-            detector: self.detector,
+            detector: self.detector.filter(|_| set_up.is_none()),
             offset: self.offset,
             angles: self.angles.clone(),
             noise: self.noise,
             seed: self.seed,
         };
-        let protocol = simulation::protocol(&self.protocol, &volume.grid)?;
+        let protocol = set_up.map_or_else(|| simulation::protocol(&self.protocol, &volume.grid), Ok)?;
         let protocol = simulation::changed(protocol, &changes, "command line")?;
         let (scan, volume) = simulation::scan(volume, self.values, &protocol, &self.volume)?;
         conefield_io::write_scan(&self.output, &scan, Some(&volume))?;

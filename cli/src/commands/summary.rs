@@ -43,6 +43,9 @@ pub fn summary(r: &RunRecord, scan: &ScanRecord, output: &Path) -> String {
     if let Some(s) = &r.written.scores {
         lines.push(evaluate::lines(s));
     }
+    if let Some(levels) = &r.hounsfield {
+        lines.push(format!("volume-hu.nii.gz  {}", levels.note));
+    }
     lines.push(format!("results in {}", output.display()));
     lines.join("\n")
 }

@@ -18,6 +18,7 @@ mod explain;
 #[cfg(unix)]
 mod guide;
 mod help;
+mod hounsfield;
 mod import;
 mod memory;
 mod naf;

@@ -67,13 +67,13 @@ fn unsupported(place: &str, uid: &str) -> Error {
 }
 
 /// The pixel values of `object`, row by row, each mapped through `rescale`.
-pub(super) fn values(
+pub(super) fn values<T>(
     place: &str,
     object: &DefaultDicomObject,
     element: &InMemElement,
     format: &PixelFormat,
-    rescale: impl Fn(i64) -> f32,
-) -> Result<Vec<f32>> {
+    rescale: impl Fn(i64) -> T,
+) -> Result<Vec<T>> {
     let fail = |found: String, expected: String| Error::invalid(place, "PixelData", found, expected);
     // The joined fragments, the stored and returned values, and the intermediate output of a JPEG decoder.
     let held = element.fragments().map_or(0, |all| all.iter().map(|f| f.len() as u64).sum());

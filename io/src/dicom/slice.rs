@@ -4,14 +4,14 @@ use super::lengths::{self, PixelStorage};
 use super::pixels::{self, PixelFormat};
 use conefield_core::geometry::{dot, norm};
 use conefield_core::{Error, Result, allowance, files};
-use dicom_object::{DefaultDicomObject, OpenFileOptions, Tag};
+use dicom_object::{DefaultDicomObject, InMemDicomObject, OpenFileOptions, Tag};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// A tag with its name in errors.
-type Attribute = (Tag, &'static str);
+pub(super) type Attribute = (Tag, &'static str);
 
-const PIXEL_DATA: Attribute = (Tag(0x7fe0, 0x0010), "PixelData");
+pub(super) const PIXEL_DATA: Attribute = (Tag(0x7fe0, 0x0010), "PixelData");
 const SERIES: Attribute = (Tag(0x0020, 0x000e), "SeriesInstanceUID");
 const SERIES_NAME: Attribute = (Tag(0x0008, 0x103e), "SeriesDescription");
 const MODALITY: Attribute = (Tag(0x0008, 0x0060), "Modality");
@@ -25,7 +25,7 @@ const INTERCEPT: Attribute = (Tag(0x0028, 0x1052), "RescaleIntercept");
 const ROWS: Attribute = (Tag(0x0028, 0x0010), "Rows");
 const COLUMNS: Attribute = (Tag(0x0028, 0x0011), "Columns");
 const SAMPLES: Attribute = (Tag(0x0028, 0x0002), "SamplesPerPixel");
-const FRAMES: Attribute = (Tag(0x0028, 0x0008), "NumberOfFrames");
+pub(super) const FRAMES: Attribute = (Tag(0x0028, 0x0008), "NumberOfFrames");
 const ALLOCATED: Attribute = (Tag(0x0028, 0x0100), "BitsAllocated");
 const STORED: Attribute = (Tag(0x0028, 0x0101), "BitsStored");
 const HIGH: Attribute = (Tag(0x0028, 0x0102), "HighBit");
@@ -37,6 +37,8 @@ pub(super) struct Slice {
     path: PathBuf,
     /// The byte after the pixels.
     end: u64,
+    /// Its place in a file of several.
+    pub frame: usize,
     pub series: String,
     /// Modality and description of the series, for messages.
     pub about: String,
@@ -55,13 +57,13 @@ pub(super) struct Slice {
 }
 
 /// The elements of an open file.
-struct Elements<'a> {
-    place: &'a str,
-    object: &'a DefaultDicomObject,
+pub(super) struct Elements<'a> {
+    pub place: &'a str,
+    pub object: &'a InMemDicomObject,
 }
 
 impl Elements<'_> {
-    fn invalid(&self, field: Attribute, found: impl ToString, expected: &str) -> Error {
+    pub fn invalid(&self, field: Attribute, found: impl ToString, expected: &str) -> Error {
         Error::invalid(self.place, field.1, found, expected)
     }
 
@@ -92,7 +94,7 @@ impl Elements<'_> {
     }
 
     /// A whole number that `fits`, or `default` if the element is missing.
-    fn within(
+    pub fn within(
         &self,
         field: Attribute,
         default: Option<i64>,
@@ -106,11 +108,10 @@ impl Elements<'_> {
         }
     }
 
-    fn format(&self) -> Result<PixelFormat> {
+    pub fn format(&self) -> Result<PixelFormat> {
         let side = |field| self.within(field, None, |n| (1..=65535).contains(&n), "1 to 65535");
         let (rows, columns) = (side(ROWS)?, side(COLUMNS)?);
         self.within(SAMPLES, Some(1), |n| n == 1, "1: one number per pixel")?;
-        self.within(FRAMES, Some(1), |n| n == 1, "1: one slice per file (split enhanced files first)")?;
         let allocated = self.within(ALLOCATED, None, |n| matches!(n, 8 | 16 | 32), "8, 16 or 32")?;
         let stored = self.within(STORED, Some(allocated), |n| (1..=allocated).contains(&n), "1 to BitsAllocated")?;
         let in_range = |n| (stored - 1..allocated).contains(&n);
@@ -148,8 +149,14 @@ impl Slice {
         }
         let object = open(path, end, OpenFileOptions::new().read_until(PIXEL_DATA.0))?;
         let e = Elements { place: &place, object: &object };
+        e.within(FRAMES, Some(1), |n| n == 1, "1: one slice per file (a file of several is read by its own name)")?;
         let format = e.format()?;
         pixels.must_hold(&place, format.count() as u64, format.bytes as u64)?;
+        Self::of(path, end, 0, &e, format).map(Some)
+    }
+
+    /// The slice with the elements `e`, stored in `format` as frame `frame` of the first `end` bytes of `path`.
+    pub fn of(path: &Path, end: u64, frame: usize, e: &Elements<'_>, format: PixelFormat) -> Result<Self> {
         let series = e.text(SERIES).ok_or_else(|| e.invalid(SERIES, "no such element", "the series' identifier"))?;
         let modality = e.text(MODALITY).unwrap_or_default();
         let about = format!("{modality}, {}", e.text(SERIES_NAME).unwrap_or_else(|| "no description".into()));
@@ -162,9 +169,10 @@ impl Slice {
         let [slope] = e.numbers(SLOPE)?.unwrap_or([1.0]);
         let [intercept] = e.numbers(INTERCEPT)?.unwrap_or([0.0]);
         let (axes, position) = (e.axes()?, e.required(POSITION)?);
-        Ok(Some(Self {
+        Ok(Self {
             path: path.to_path_buf(),
             end,
+            frame,
             series,
             about,
             modality,
@@ -176,7 +184,7 @@ impl Slice {
             rows: format.rows,
             columns: format.columns,
             format,
-        }))
+        })
     }
 
     /// The file's name.
@@ -220,19 +228,24 @@ impl Slice {
         let object = open(&self.path, self.end, OpenFileOptions::new().read_to(PIXEL_DATA.0))?;
         let element = object.get(PIXEL_DATA.0);
         let element = element.ok_or_else(|| Error::invalid(&place, PIXEL_DATA.1, "no such element", "a picture"))?;
+        let stored = pixels::values(&place, &object, element, &self.format, |v| v as f64)?;
+        self.rescaled(stored)
+    }
+
+    /// The rescaled values of `stored` ones.
+    pub fn rescaled(&self, stored: impl IntoIterator<Item = f64>) -> Result<Vec<f32>> {
         let [slope, intercept] = self.rescale;
-        let rescale = |v| (slope * v as f64 + intercept) as f32;
-        let rescaled = pixels::values(&place, &object, element, &self.format, rescale)?;
+        let rescaled: Vec<f32> = stored.into_iter().map(|v| (slope * v + intercept) as f32).collect();
         if rescaled.iter().any(|x| !x.is_finite()) {
             let expected = "a factor that keeps values in the range of 32-bit floats";
-            return Err(Error::invalid(place, SLOPE.1, slope, expected));
+            return Err(Error::invalid(self.path.display().to_string(), SLOPE.1, slope, expected));
         }
         Ok(rescaled)
     }
 }
 
 /// The first `end` bytes of a file, whose lengths have been checked.
-fn open(path: &Path, end: u64, options: OpenFileOptions) -> Result<DefaultDicomObject> {
+pub(super) fn open(path: &Path, end: u64, options: OpenFileOptions) -> Result<DefaultDicomObject> {
     options.from_reader(files::open(path)?.0.take(end)).map_err(|e| {
         // The outer message says only that reading failed; the causes are nested in it.
         let reasons: Vec<String> =

@@ -38,7 +38,7 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
     let place = path.display().to_string();
     check_shape(&place, grid.shape)?;
     let (affine, _) = affine::of(voxels, &place);
-    let head = Head::of(grid.shape, grid.spacing, &affine);
+    let head = Head::of(grid.shape, grid.spacing, &affine, voxels.hounsfield());
     w.write_all(&head.bytes()).map_err(|e| Error::io(path, e))?;
     file_order::write(w, path, voxels, FileOrder::XFastest)
 }
@@ -54,12 +54,13 @@ struct Head {
 }
 
 impl Head {
-    fn of(shape: [usize; 3], spacing: [f64; 3], affine: &Affine) -> Self {
+    fn of(shape: [usize; 3], spacing: [f64; 3], affine: &Affine, hounsfield: Option<&str>) -> Self {
         let shape = shape.map(|n| n as u64);
         let pages = shape[2];
         let rows: Vec<String> = affine[..3].iter().flatten().map(f64::to_string).collect();
+        let values = hounsfield.map_or(String::new(), |hu| format!("values={hu}\n"));
         let text = format!(
-            "ImageJ=1.54f\nimages={pages}\nslices={pages}\nunit=mm\nspacing={}\nloop=false\n{AFFINE}={}\n\0",
+            "ImageJ=1.54f\nimages={pages}\nslices={pages}\nunit=mm\nspacing={}\nloop=false\n{values}{AFFINE}={}\n\0",
             spacing[2],
             rows.join(" ")
         );
@@ -185,7 +186,7 @@ mod tests {
         let path = dir.path().join("a.tif");
         let (affine, _) = affine::of(&&volume, "a.tif");
         for big in [false, true] {
-            let head = Head { big, ..Head::of([4, 3, 2], [0.5, 0.75, 2.0], &affine) };
+            let head = Head { big, ..Head::of([4, 3, 2], [0.5, 0.75, 2.0], &affine, Some("HU")) };
             assert_eq!(head.bytes().len() as u64, head.length());
             let mut bytes = head.bytes();
             file_order::write(&mut bytes, &path, &mut &volume, FileOrder::XFastest).unwrap();
@@ -195,7 +196,7 @@ mod tests {
             let back = crate::tiff::read_volume(&path).unwrap();
             assert_eq!((&back.data, back.grid, back.affine), (&volume.data, volume.grid, Some(affine)), "{big}");
         }
-        let big = |side| Head::of([side, 1000, 1000], [1.0; 3], &affine).big;
+        let big = |side| Head::of([side, 1000, 1000], [1.0; 3], &affine, None).big;
         assert!(!big(1000) && big(1100));
         says(check_shape("a.tif", [1 << 33, 1, 1]), &["a.tif: shape", "4294967295"]);
     }
