@@ -104,7 +104,8 @@ fn hounsfield_units_without_a_unit_or_a_calibration_are_refused() {
     assert!(convert(&at("none.toml")).contains("none.toml"));
     assert!(refused(1, &["convert", &at("scan"), &at("r2"), "--to", "r2", "--hu", "60keV"]).contains("a volume"));
     let wrong = |hu: &[&str]| {
-        let args = [&["convert", &at("scan/truth.nii.gz"), &at("a.nii"), "--hu"][..], hu].concat();
+        let (truth, out) = (at("scan/truth.nii.gz"), at("a.nii"));
+        let args = [&["convert", &truth, &out, "--hu"][..], hu].concat();
         let output = conefield(&args).assert().code(2).get_output().clone();
         String::from_utf8(output.stderr).unwrap()
     };
@@ -151,7 +152,8 @@ fn a_set_up_by_options_is_the_one_of_a_protocol() {
         (&["--dsd", "500"], "--dso"),
         (&["--dso", "500", "--dsd", "800", "--pixel", "0", "--detector", "6x8"], "above 0"),
     ] {
-        let all = [&["simulate", &at("a.mha"), "-o", &at("no")][..], args].concat();
+        let (volume, out) = (at("a.mha"), at("no"));
+        let all = [&["simulate", &volume, "-o", &out][..], args].concat();
         let output = conefield(&all).assert().code(2).get_output().clone();
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(said.contains(words), "{args:?}: {said}");
