@@ -19,7 +19,7 @@ use crate::folder;
 use crate::input::LONGEST_TEXT;
 use crate::scan_folder::folder_of;
 use crate::stack::Names;
-use crate::text::{read_foreign, shortened};
+use crate::text::{read_foreign, shortened, unread};
 use conefield_core::orbit::CircularOrbit;
 use conefield_core::{Error, Result};
 use std::path::Path;
@@ -41,6 +41,9 @@ const REFERENCE: &str = "Reference Intensity";
 const TRAJECTORY: &str = "Scanning Trajectory";
 const POSITIONS: &str = "Number Of Horizontal Offset Positions";
 const PREFIX: &str = "Filename Prefix";
+
+/// Parts of the names of other keys that may move the images against the axis.
+const MOVING: &[&str] = &["Image Rotation", "crop origin", "Table Feed"];
 
 /// Keys of the geometry: two different values of one are an error.
 const KNOWN: &[&str] = &[
@@ -79,6 +82,7 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
     if keys.text(DIRECTION).is_none() {
         remarks.push(format!("no {DIRECTION}: CC is taken; if it is wrong, the volume is mirrored"));
     }
+    remarks.extend(unread(&keys.others(MOVING, KNOWN)));
     let (projections, count) = projections(&keys, path, step, &mut remarks)?;
     let angles = (0..count).map(|i| (sense * step * i as f64).to_radians()).collect();
     let open = match keys.text(REFERENCE) {
@@ -119,7 +123,7 @@ fn projections(keys: &Keys, path: &Path, step: f64, remarks: &mut Vec<String>) -
     let more = numbered.len() - count;
     if more > 0 {
         let why = if count == turn { "that repeat a full turn" } else { "beyond the number of files" };
-        remarks.push(format!("{more} images {why} are not read"));
+        remarks.push(format!("images {why} are not read: {more}"));
     }
     let names = (0..count).filter_map(|i| numbered.remove(&i)).collect();
     Ok((Names::Many(names), count))
@@ -235,6 +239,11 @@ mod tests {
             let (dir, path) = written(&TEXT.replace(from, to));
             says_just(read_scanner(&path, None), dir.path(), words);
         }
+        let text = TEXT.replace("=ROUND", "=ROUND\r\nImage crop origin X=0\r\nImage Rotation=-0.0380");
+        let (_dir, path) = written(&text);
+        let found = super::scan(&path).unwrap().remarks;
+        assert_eq!(found[0], "not read, though they may change the geometry: Image Rotation = -0.0380");
+        assert_eq!(found[1], "images that repeat a full turn are not read: 1");
         let (dir, path) = written(TEXT);
         fs::remove_file(dir.path().join("bone_~0000000002.tif")).unwrap();
         let words = "bone_~00.log: images: found none, expected image 2 of the 4, such as bone_~0000000002.tif";

@@ -117,24 +117,30 @@ impl Txrm {
         }
     }
 
-    /// The images called `names`, which the file must be large enough to hold.
-    fn images(&mut self, names: &[String], number: Number, [rows, columns]: [usize; 2]) -> Result<Array3<f32>> {
+    /// `count` images, which the file must be large enough to hold; `name` gives each one's name.
+    fn images(
+        &mut self,
+        count: usize,
+        name: impl Fn(usize) -> String,
+        number: Number,
+        [rows, columns]: [usize; 2],
+    ) -> Result<Array3<f32>> {
         let pixels = rows.saturating_mul(columns);
         let bytes = pixels.saturating_mul(number.bytes());
-        let all = (names.len() as u64).saturating_mul(bytes as u64);
-        let found = format!("{} images of {rows} x {columns} pixels in a file of {} bytes", names.len(), self.size);
+        let all = (count as u64).saturating_mul(bytes as u64);
+        let found = format!("{count} images of {rows} x {columns} pixels in a file of {} bytes", self.size);
         ensure(all <= self.size, &self.place, "size", found, format!("a file of at least {all} bytes"))?;
         let mut values: Vec<f32> = Vec::new();
-        memory::grow(&mut values, names.len() * pixels, usize::MAX, &self.place, "images")?;
-        for name in names {
-            let raw = self.bytes(name, bytes)?;
+        memory::grow(&mut values, count * pixels, usize::MAX, &self.place, "images")?;
+        for i in 0..count {
+            let raw = self.bytes(&name(i), bytes)?;
             number.decode(ByteOrder::Little, &raw, &mut values, |x| x as f32);
         }
-        let all = Array3::from_shape_vec((names.len(), rows, columns), values)
+        let all = Array3::from_shape_vec((count, rows, columns), values)
             .map_err(|e| self.invalid("images", e, "as many pixels as rows and columns say"))?;
         match stray(&all) {
             Some(((i, r, c), x)) => {
-                Err(self.invalid(&format!("{}, row {r}, column {c}", names[i]), x, "a finite number"))
+                Err(self.invalid(&format!("{}, row {r}, column {c}", name(i)), x, "a finite number"))
             }
             None => Ok(all),
         }
@@ -150,15 +156,18 @@ pub(super) fn shape(path: &Path) -> Result<[usize; 3]> {
 pub(super) fn read(path: &Path, part: ScanPart) -> Result<Array3<f32>> {
     let mut txrm = Txrm::open(path)?;
     let [count, rows, columns] = txrm.shape()?;
-    let (names, number) = match part {
+    let size = [rows, columns];
+    match part {
         ScanPart::Projections => {
-            let name = |i: usize| format!("ImageData{}/Image{}", i / FOLDER + 1, i + 1);
-            ((0..count).map(name).collect(), txrm.number("ImageInfo/DataType")?)
+            let number = txrm.number("ImageInfo/DataType")?;
+            txrm.images(count, |i| format!("ImageData{}/Image{}", i / FOLDER + 1, i + 1), number, size)
         }
-        ScanPart::Flat => (vec![FLAT.to_owned()], txrm.number("ReferenceData/DataType")?),
-        ScanPart::Dark => return Err(txrm.invalid("dark", "no dark field", "a file that has one")),
-    };
-    txrm.images(&names, number, [rows, columns])
+        ScanPart::Flat => {
+            let number = txrm.number("ReferenceData/DataType")?;
+            txrm.images(1, |_| FLAT.to_owned(), number, size)
+        }
+        ScanPart::Dark => Err(txrm.invalid("dark", "no dark field", "a file that has one")),
+    }
 }
 
 /// The scan in `path`.
