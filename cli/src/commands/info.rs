@@ -189,7 +189,9 @@ pub fn in_short(scan: &Scan, survey: &Survey, counts: Option<&CountsReport>) -> 
     let g = &scan.geometry;
     let (setup, arc, check) = (&survey.setup, &survey.setup.angles, &survey.check);
     let [rows, columns] = g.detector;
-    let [height, width] = setup.pixel_mm.map(short);
+    // A parallel beam has the pixels that its files name where the axis is.
+    let [across, _, along] = setup.supported_voxel_mm;
+    let [height, width] = if g.is_parallel(0) { [along, across] } else { setup.pixel_mm }.map(short);
     let orbit = if setup.circle { "" } else { " (medians: the views are not on one circle)" };
     let values = format!("line integrals from {} to {}", short(check.range[0].into()), short(check.range[1].into()));
     let counts = match counts {

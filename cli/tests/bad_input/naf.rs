@@ -108,7 +108,7 @@ pub fn cases() -> Vec<Case> {
         "a misspelt key that may be missing", key("offOrigin", "offOrigim"), INFO, ["offOrigim", "\"offOrigin\""];
         "a distance that is NaN", float(500.0, f64::NAN), INFO, ["DSO", "finite"];
         "a negative distance", float(800.0, -800.0), INFO, ["DSD", "-800"];
-        "a parallel beam", key("cone", "para"), INFO, ["mode", "\"para\"", "cone"];
+        "a beam of another kind", key("cone", "para"), INFO, ["mode", "\"para\"", "cone"];
         "a projection that is NaN", projection(f32::NAN), INFO, ["train.projections[0, 0, 0]", "NaN"];
         "a projection that is infinite", projection(f32::INFINITY),
             "convert scan.pickle scan", ["train.projections[0, 0, 0]", "inf"];

@@ -23,7 +23,7 @@ pub fn cases() -> Vec<Case> {
         "a rotated detector, which is not read", meta("\"mode\"", "\"rotDetector\": [0, 0.1, 0], \"mode\""),
             INFO, ["not read", "scanner.rotDetector"].ends(End::Warned);
         "a missing key", meta("\"DSO\"", "\"DS0\""), INFO, ["DSO", "nothing"];
-        "a parallel beam", meta("\"cone\"", "\"parallel\""), INFO, ["scanner.mode", "cone"];
+        "a beam of another kind", meta("\"cone\"", "\"fan\""), INFO, ["mode", "fan", "cone"];
         "a negative distance", meta("\"DSO\": 500.0", "\"DSO\": -500.0"), INFO, ["scanner.DSO", "-500"];
         "a number past the range", meta("\"DSO\": 500.0", "\"DSO\": 1e999"), INFO, ["meta_data.json: line"];
         "a detector without rows", meta("\"nDetector\": [\n      4", "\"nDetector\": [\n      0"),
