@@ -224,7 +224,7 @@ fn a_parallel_beam_goes_through_every_command() {
     done(&["simulate", &truth, "-o", &scan, "--protocol", &bench.at("beam.toml")]);
     let said = done(&["info", &scan]);
     assert!(said.contains("none: a parallel beam"), "{said}");
-    done(&["convert", &scan, "-o", &other, "--format", "r2"]);
+    done(&["convert", &scan, &other, "--to", "r2"]);
     let score = |scan: &str, spec: &[&str]| {
         let run = bench.at("run");
         done(&[&["reconstruct", scan, "-o", &run, "--force", "--spec"], spec].concat());
