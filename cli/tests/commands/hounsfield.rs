@@ -55,6 +55,9 @@ fn a_known_volume_becomes_hounsfield_units_in_every_format() {
     // Values that are Hounsfield units already stay.
     done(&["convert", &text(&at("b.nii.gz")), &text(&at("e.dicom")), "--hu", "as-is"]);
     is_hu(&at("e.dicom"), 0.02);
+    // Without that they are no attenuation.
+    let said = refused(1, &["convert", &text(&at("b.nii.gz")), &text(&at("g.nii")), "--hu", "60keV"]);
+    assert!(said.contains("expected attenuation"), "{said}");
     // A series as a template for another one.
     let [template, other] = [at("a.dicom/0001.dcm"), at("f.dicom")].map(|p| text(&p));
     done(&["convert", &text(&at("a.mha")), &other, "--dicom-template", &template]);
