@@ -394,7 +394,8 @@ mod tests {
 
     #[test]
     fn water_is_the_table_and_between_its_energies() {
-        assert_eq!((water(60.0), water(4.9), water(f64::NAN)), (Some(0.1 * 0.2059), None, None));
+        assert_eq!((water(4.9), water(f64::NAN)), (None, None));
+        assert!((water(60.0).unwrap() - 0.02059).abs() < 1e-12);
         let between = water((60.0f64 * 80.0).sqrt()).unwrap();
         assert!((between - 0.1 * (0.2059f64 * 0.1837).sqrt()).abs() < 1e-12, "{between}");
         assert!(WATER.windows(2).all(|p| p[0].0 < p[1].0 && p[0].1 > p[1].1));
@@ -403,14 +404,16 @@ mod tests {
     #[test]
     fn given_and_measured_levels_give_hounsfield_units() {
         let ends = |v: &Volume| [v.data[[0, 0, 0]], v.data[[3, 2, 1]]];
+        let near = |v: &Volume| ends(v).iter().zip([-1000.0, 0.0]).all(|(a, b)| (a - b).abs() < 1e-3);
         let (v, note) = converted("water=0.021,air=0.001", None).unwrap();
-        assert_eq!((ends(&v), &note[..]), ([-1000.0, 0.0], "HU: water 0.021, air 0.001 per mm"));
+        assert!(near(&v), "{v:?}");
+        assert_eq!(note, "HU: water 0.021, air 0.001 per mm");
         // Voxels lie at x = -3, -1, 1 and 3 mm.
         let (v, note) = converted("water=sphere:3,0,1,2.5,air=box:0,-2,-1,-9,2,1", None).unwrap();
-        assert!(ends(&v).iter().zip([-1000.0, 0.0]).all(|(a, b)| (a - b).abs() < 1e-3), "{v:?}");
+        assert!(near(&v), "{v:?}");
         assert_eq!(note, "HU: water 0.021, air 0.001");
         let cm = Unit { name: "cm".into(), mm: 10.0 };
-        assert_eq!(converted("water=0.0021,air=0", Some(cm.clone())).unwrap().0.data[[3, 0, 0]], 0.0);
+        assert!(near(&converted("water=0.0021,air=0.0001", Some(cm.clone())).unwrap().0));
         assert_eq!(converted("60keV", Some(cm)).unwrap().1, "HU: water 0.2059, air 0 per cm at 60 keV");
         assert_eq!(ends(&converted("as-is", None).unwrap().0), [0.001, 0.021]);
     }

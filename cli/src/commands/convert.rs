@@ -7,6 +7,7 @@ use crate::boundary::{Inputs, refuse_existing};
 use crate::out;
 use clap::{Args, ValueEnum};
 use conefield::files;
+use conefield::hounsfield::How;
 use conefield::memory::Memory;
 use conefield::parse::{self, Values};
 use conefield_core::{Error, Result};
@@ -83,6 +84,10 @@ impl ConvertArgs {
             let volume = conefield_io::read_volume(&self.input)?;
             conefield_io::check_shape(&self.output, volume.grid.shape)?;
             let mut volume = &self.values.apply(volume)?;
+            // Hounsfield units, converted once more, would be nonsense that looks like a volume.
+            if self.units.hu.as_ref().is_some_and(|how| *how != How::Already) {
+                parse::must_be_attenuation(volume)?;
+            }
             let unit = if self.values == Values::AsIs { unit_of(&self.input)? } else { None };
             let hu = self.units.open(&self.input, unit.as_ref(), &volume.grid, volume.affine.as_ref())?;
             match hu.map(|hu| hu.measure(&mut volume)).transpose()? {

@@ -72,7 +72,7 @@ struct SetUp {
     /// Distance from the source to the rotation axis in mm; takes the place of a protocol, with --dsd, --pixel and
     /// --detector.
     #[arg(long, value_name = "MM", value_parser = parse::above_zero, conflicts_with = "protocol",
-        requires_all = ["dsd", "pixel", "detector"])]
+        requires = "dsd", requires = "pixel", requires = "detector")]
     dso: Option<f64>,
     /// Distance from the source to the detector in mm.
     #[arg(long, value_name = "MM", value_parser = parse::above_zero, requires = "dso")]

@@ -38,10 +38,11 @@ fn a_known_volume_becomes_hounsfield_units_in_every_format() {
     let at = |name: &str| dir.path().join(name);
     write_volume(at("a.mha"), &ball()).unwrap();
     fs::write(at("scanner.toml"), "water = 0.0206\nair = 0.0\nenergy_kev = 60.0\n").unwrap();
+    let file = text(&at("scanner.toml"));
     let cases = [
         ("a.dicom", "water=0.0206,air=0", 0.02),
         ("b.nii.gz", "water=sphere:0,0,0,20,air=box:30,30,30,50,50,50", 1e-3),
-        ("c.mha", &text(&at("scanner.toml")), 1e-3),
+        ("c.mha", &file[..], 1e-3),
         // The table has 0.02059/mm.
         ("d.nrrd", "60keV", 0.6),
     ];
@@ -55,6 +56,9 @@ fn a_known_volume_becomes_hounsfield_units_in_every_format() {
     // Values that are Hounsfield units already stay.
     done(&["convert", &text(&at("b.nii.gz")), &text(&at("e.dicom")), "--hu", "as-is"]);
     is_hu(&at("e.dicom"), 0.02);
+    // Without that they are no attenuation.
+    let said = refused(1, &["convert", &text(&at("b.nii.gz")), &text(&at("g.nii")), "--hu", "60keV"]);
+    assert!(said.contains("expected attenuation"), "{said}");
     // A series as a template for another one.
     let [template, other] = [at("a.dicom/0001.dcm"), at("f.dicom")].map(|p| text(&p));
     done(&["convert", &text(&at("a.mha")), &other, "--dicom-template", &template]);
@@ -103,14 +107,13 @@ fn hounsfield_units_without_a_unit_or_a_calibration_are_refused() {
     assert!(convert("water=0.02,air=0").contains("cube half side"));
     assert!(convert(&at("none.toml")).contains("none.toml"));
     assert!(refused(1, &["convert", &at("scan"), &at("r2"), "--to", "r2", "--hu", "60keV"]).contains("a volume"));
-    let wrong = |hu: &[&str]| {
-        let (truth, out) = (at("scan/truth.nii.gz"), at("a.nii"));
-        let args = [&["convert", &truth, &out, "--hu"][..], hu].concat();
+    let wrong = |hu: &str| {
+        let args = ["convert", &at("scan/truth.nii.gz"), &at("a.nii"), "--hu", hu];
         let output = conefield(&args).assert().code(2).get_output().clone();
         String::from_utf8(output.stderr).unwrap()
     };
-    assert!(wrong(&["water=0.02"]).contains("such as water=0.0206,air=0"));
-    assert!(wrong(&["2keV"]).contains("5 to 1250 keV"));
+    assert!(wrong("water=0.02").contains("such as water=0.0206,air=0"));
+    assert!(wrong("2keV").contains("5 to 1250 keV"));
 }
 
 #[test]
@@ -146,14 +149,14 @@ fn a_set_up_by_options_is_the_one_of_a_protocol() {
         let [a, b] = ["options", "protocol"].map(|folder| fs::read(dir.path().join(folder).join(file)).unwrap());
         assert!(a == b, "{file}");
     }
+    let [volume, no] = ["a.mha", "no"].map(at);
     for (args, words) in [
         (&["--dso", "500", "--dsd", "800", "--pixel", "4", "--detector", "6x8", "--protocol", "r2"][..], "--protocol"),
         (&["--dso", "500", "--pixel", "4", "--detector", "6x8"], "--dsd"),
         (&["--dsd", "500"], "--dso"),
         (&["--dso", "500", "--dsd", "800", "--pixel", "0", "--detector", "6x8"], "above 0"),
     ] {
-        let (volume, out) = (at("a.mha"), at("no"));
-        let all = [&["simulate", &volume, "-o", &out][..], args].concat();
+        let all = [&["simulate", &volume, "-o", &no][..], args].concat();
         let output = conefield(&all).assert().code(2).get_output().clone();
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(said.contains(words), "{args:?}: {said}");
