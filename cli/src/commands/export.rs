@@ -52,7 +52,7 @@ impl ExportArgs {
         conefield_io::check_shape(&self.output, grid.shape)?;
         let unknown = || Unit { name: "unknown, no record.json names it".into(), mm: opened.field.unit_mm };
         let unit = unit_of(&opened.file)?.unwrap_or_else(unknown);
-        let hu = self.units.open(&opened.file, Some(&unit), &grid, None)?;
+        let hu = self.units.of_attenuation()?.open(&opened.file, Some(&unit), &grid, None)?;
         let backend = self.trained.backend.open()?;
         signals::listen()?;
         let start = Instant::now();

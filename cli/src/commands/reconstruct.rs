@@ -149,7 +149,7 @@ impl ReconstructArgs {
         let (input, scan) = self.input(&folder)?;
         let affine = input.reference.as_ref().and_then(|r| r.affine);
         let (unit, grid) = (&input.scan.unit, &input.scan.geometry.volume);
-        let hu = self.units.open(&self.scan, Some(unit), grid, affine.as_ref())?;
+        let hu = self.units.of_attenuation()?.open(&self.scan, Some(unit), grid, affine.as_ref())?;
 
         let resumed = match session.requested() {
             Some(loaded) if self.resume => {

@@ -4,9 +4,9 @@ use crate::boundary::folder_of;
 use crate::run_folder::RunOnDisk;
 use clap::Args;
 use conefield::hounsfield::{Calibration, How};
-use conefield_core::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::{Affine, Unit};
+use conefield_core::{Error, Result};
 use std::path::Path;
 
 /// Units of a written volume.
@@ -30,6 +30,15 @@ impl HounsfieldOption {
         affine: Option<&Affine>,
     ) -> Result<Option<Calibration>> {
         self.hu.as_ref().map(|how| how.open(&place.display().to_string(), unit, grid, affine)).transpose()
+    }
+
+    /// Itself, for values that are attenuation: refuses `as-is`.
+    pub fn of_attenuation(&self) -> Result<&Self> {
+        if self.hu == Some(How::Already) {
+            let expected = "another form: these values are attenuation (convert takes as-is)";
+            return Err(Error::invalid("command line", "--hu", "as-is", expected));
+        }
+        Ok(self)
     }
 
     /// The file that it names.
