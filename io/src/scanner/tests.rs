@@ -182,7 +182,7 @@ fn hostile_descriptions_and_files_are_refused_in_words() {
         );
     };
     edit("version = 1", "", &["version", "nothing"]);
-    edit("dso = ", "DSO = ", &["line 9", "DSO", "`dso` (the nearest of: dso, dsd"]);
+    edit("dso = ", "DSO = ", &["line 9", "DSO", "`dso` (the nearest of: beam, dso, dsd"]);
     edit("dso = 500.0", "", &["dso", "nothing"]);
     edit("dso = 500.0", "dso = nan", &["circle.dso", "NaN"]);
     edit("u = 2.0, v", "v", &["u", "nothing"]);
@@ -267,6 +267,6 @@ fn parallel_beams_have_no_distances() {
     refused(circle.replace("beam = \"parallel\"\n", ""), &["circle.dso", "found nothing", "beam = \"parallel\""]);
     refused(circle.replace("\"parallel\"", "\"fan\""), &["scanner.toml", "fan", "parallel"]);
     refused(vectors.replace("[-3, 0, 0,", "[0, 0, 0,"), &["parallel_vec[0]", "a direction"]);
-    refused(vectors.replace("parallel_vec", "cone_vec"), &["views[0]"]);
+    refused(vectors.replace("parallel_vec", "cone_vec"), &["views[1]", "a source at"]);
     refused("[vectors]\n".into(), &["vectors", "found nothing", "one of cone_vec and parallel_vec"]);
 }
