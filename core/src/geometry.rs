@@ -121,9 +121,15 @@ impl VoxelGrid {
         std::array::from_fn(|k| self.shape[k] as f64 * self.spacing[k])
     }
 
-    /// Whether a source is so far away that its beam counts as parallel.
+    /// Distance from its centre to `source`, in diagonals of the box.
+    pub fn diagonals_to(&self, source: Vec3) -> f64 {
+        norm(sub(source, self.center)) / norm(self.size())
+    }
+
+    /// Whether positions that count from `source` would round in single precision. A parallel beam is far also for volumes
+    /// much larger than its own.
     pub fn is_far(&self, source: Vec3) -> bool {
-        norm(sub(source, self.center)) > 0.5 * FAR * norm(self.size())
+        self.diagonals_to(source) > 1e3
     }
 
     /// A grid of the same box with `n` voxels along its longest side and nearly cubic voxels.
@@ -207,6 +213,9 @@ pub struct Geometry {
 /// Diagonals of a volume between it and the source of a parallel beam ([`crate::orbit::CircularOrbit::parallel`]): across
 /// the volume, rays come together by 1/100 000.
 pub const FAR: f64 = 1e5;
+/// Diagonals beyond which a beam counts as parallel: less than [`FAR`], so that a volume of several times the size does not
+/// change that.
+pub(crate) const PARALLEL: f64 = 0.1 * FAR;
 
 /// A straight line from the source: `origin + t·direction`, `t` in mm.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -260,7 +269,7 @@ impl Geometry {
 
     /// Whether the beam of `view` is parallel.
     pub fn is_parallel(&self, view: usize) -> bool {
-        self.volume.is_far(self.views[view].source)
+        self.volume.diagonals_to(self.views[view].source) > PARALLEL
     }
 
     /// Number of measured values, or `None` if it overflows `usize`.
@@ -448,6 +457,12 @@ mod tests {
                 assert!(norm([found[0] - want[0], found[1] - want[1], 0.0]) < 1e-6, "{found:?} {want:?}");
             }
         }
+        // Another volume for the same views, as the space around the object.
+        let larger = Geometry { volume: VoxelGrid { spacing: [4.0; 3], ..volume }, ..g.clone() };
+        let [a, b] = [&g, &larger].map(|g| g.ray(0, 3, 11));
+        let along = dot(sub(b.origin, a.origin), a.direction);
+        let apart = norm(sub(b.origin, a.at(along)));
+        assert!(larger.is_parallel(0) && norm(b.origin) < 1000.0 && apart < 1e-6, "{b:?} {apart}");
         let fitted = CircularOrbit::fit(&g.views).unwrap();
         assert_eq!(fitted.beam(&volume), Beam::Parallel);
         let at_axis = fitted.at_axis();

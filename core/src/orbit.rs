@@ -1,6 +1,6 @@
 //! Circular orbits of source and detector, described by a few numbers, and the arcs that views cover.
 
-use crate::geometry::{FAR, Millimetres, Radians, View, VoxelGrid, dot, norm, sub};
+use crate::geometry::{FAR, Millimetres, PARALLEL, Radians, View, VoxelGrid, dot, norm, sub};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 
@@ -50,9 +50,17 @@ impl CircularOrbit {
         Self { dso, dsd, pixel, offset, angles }
     }
 
+    /// Itself, or the parallel beam through `volume` with its pixels, shift and angles.
+    pub fn with_beam(self, beam: Beam, volume: &VoxelGrid) -> Self {
+        match beam {
+            Beam::Cone => self,
+            Beam::Parallel => Self::parallel(volume, self.pixel, self.offset, self.angles),
+        }
+    }
+
     /// How its rays run across `volume`.
     pub fn beam(&self, volume: &VoxelGrid) -> Beam {
-        if volume.is_far([self.dso, 0.0, 0.0]) { Beam::Parallel } else { Beam::Cone }
+        if volume.diagonals_to([self.dso, 0.0, 0.0]) > PARALLEL { Beam::Parallel } else { Beam::Cone }
     }
 
     /// Pixel size and shift of the detector along v and u, projected to the axis, mm.

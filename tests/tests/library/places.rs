@@ -102,7 +102,9 @@ fn places(what: &str) -> Vec<(&'static str, Arc<dyn Place>)> {
 #[test]
 fn projectors_agree_with_double_precision_and_are_adjoint() {
     for (name, place) in places("projectors of voxels") {
-        for (beam, g) in [("cone", geometry()), ("parallel", parallel())] {
+        let mut around = parallel();
+        around.volume.spacing = around.volume.spacing.map(|h| 3.0 * h);
+        for (beam, g) in [("cone", geometry()), ("parallel", parallel()), ("parallel, a larger volume", around)] {
             for settings in all() {
                 let p = projector(settings.clone());
                 let [forward, adjoint, mismatch] = errors(place.as_ref(), p.as_ref(), &g).unwrap();

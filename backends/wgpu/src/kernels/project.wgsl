@@ -7,7 +7,7 @@ struct VoxelRay {
 }
 
 struct ProjectedView {
-    // The source; of a parallel beam, pixel (0, 0): positions far away would round.
+    // The source; if it is far away, pixel (0, 0): positions would round.
     start: vec3<f32>,
     // Share of the way from the pixel to the source at which a ray begins; 1 is the source.
     near: f32,

@@ -38,7 +38,7 @@ fn projected(geometry: &Geometry, view: usize) -> [[f32; 4]; 4] {
     let first = w.pixel(geometry.detector, 0.0, 0.0);
     let corner = sub(first, w.source);
     let (mut start, mut near) = (w.source, 1.0);
-    if geometry.is_parallel(view) {
+    if grid.is_far(w.source) {
         (start, near) = (first, (norm(sub(first, grid.center)) + 2.0 * norm(grid.size())) / norm(corner));
     }
     let [x, y, z, _] = voxels(sub(start, lower));
