@@ -191,11 +191,9 @@ impl Description {
     }
 
     fn orbit(&self, angles: Vec<f64>) -> CircularOrbit {
-        let (pixel, offset) = (self.pixel, [-self.offset[0], self.offset[1]]);
-        match self.beam {
-            Beam::Cone => CircularOrbit { dso: self.dso, dsd: self.dsd, pixel, offset, angles },
-            Beam::Parallel => CircularOrbit::parallel(&self.grid, pixel, offset, angles),
-        }
+        let offset = [-self.offset[0], self.offset[1]];
+        let orbit = CircularOrbit { dso: self.dso, dsd: self.dsd, pixel: self.pixel, offset, angles };
+        orbit.with_beam(self.beam, &self.grid)
     }
 
     /// Geometry and projections of `train` or `val`. Checks shapes before it decodes a number.

@@ -138,10 +138,7 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let orbit = |frames: &[Frame]| {
         let offset = [-s.offDetector[1], s.offDetector[0]];
         let angles = frames.iter().map(|f| f.angle).collect();
-        match s.mode {
-            Beam::Cone => CircularOrbit { dso: s.DSO, dsd: s.DSD, pixel, offset, angles },
-            Beam::Parallel => CircularOrbit::parallel(&grid, pixel, offset, angles),
-        }
+        CircularOrbit { dso: s.DSO, dsd: s.DSD, pixel, offset, angles }.with_beam(s.mode, &grid)
     };
     let scan = |field: &str, frames: &[Frame]| -> Result<Scan> {
         let geometry = Geometry { detector: s.nDetector, views: orbit(frames).views(), volume: grid };

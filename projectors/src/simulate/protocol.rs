@@ -150,11 +150,9 @@ impl Protocol {
         let side = self.side();
         let pixel = std::array::from_fn(|k| mm(side[k] / self.detector[k] as f64));
         let (offset, angles) = (self.offset.map(mm), self.angles.radians().into_iter().map(|a| a.0).collect());
-        let orbit = match self.beam {
-            Beam::Cone => CircularOrbit { dso: mm(self.dso), dsd: mm(self.dsd), pixel, offset, angles },
-            Beam::Parallel => CircularOrbit::parallel(grid, pixel, offset, angles),
-        };
-        let geometry = Geometry { detector: self.detector, views: orbit.views(), volume: *grid };
+        let orbit = CircularOrbit { dso: mm(self.dso), dsd: mm(self.dsd), pixel, offset, angles };
+        let views = orbit.with_beam(self.beam, grid).views();
+        let geometry = Geometry { detector: self.detector, views, volume: *grid };
         geometry.validate("protocol")?;
         Ok(geometry)
     }
