@@ -78,16 +78,7 @@ impl Iterative for Built {
     }
 
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
-        let begun = Instant::now();
-        let opened = self.shared.open(&self.describe(), job, observer)?;
-        let job = &opened.job(job);
-        let mut problem = opened.problem(job);
-        let space = opened.space(job.scan.header());
-        let mut iterate = Iterate::new(&space, self.shared.start(job, &problem, &space)?)?;
-        problem.settle()?;
-        iterate.prepare(&problem)?;
-        let solution = drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)?;
-        Ok(clipped(solution, &problem, self.nonnegative))
+        least_squares(self, self.nonnegative, job, observer, Iterate::new, Iterate::prepare)
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
@@ -101,15 +92,32 @@ impl Iterative for Built {
     }
 }
 
-/// The solution with its volume clipped to the bounds; without `nonnegative` to the upper one.
-pub(super) fn clipped(mut solution: Solution, problem: &Problem<'_>, nonnegative: bool) -> Solution {
+/// Solves a least-squares problem from the known volume by the iterations that `make` allocates and `prepare` begins.
+/// Clips the result to the bounds; without `nonnegative` to the upper one.
+pub(super) fn least_squares<I: Iteration + 'static>(
+    plan: &impl Iterative,
+    nonnegative: bool,
+    job: &Job<'_>,
+    observer: &mut dyn Observer,
+    make: impl FnOnce(&Space, Array) -> Result<I>,
+    prepare: impl FnOnce(&mut I, &Problem<'_>) -> Result<()>,
+) -> Result<Solution> {
+    let (begun, shared) = (Instant::now(), plan.shared());
+    let opened = shared.open(&plan.describe(), job, observer)?;
+    let job = &opened.job(job);
+    let mut problem = opened.problem(job);
+    let space = opened.space(job.scan.header());
+    let mut iterate = make(&space, shared.start(job, &problem, &space)?)?;
+    problem.settle()?;
+    prepare(&mut iterate, &problem)?;
+    let mut solution = drive(job, &shared.stop, begun, &problem, &space, Box::new(iterate), observer)?;
     if let Reconstruction::Volume(volume) = &mut solution.result {
         // The volume is in the scan's unit.
-        let [low, high] = [problem.bounds.low, problem.bounds.high].map(|x| x * problem.scan.unit.mm as f32);
+        let [low, high] = [problem.bounds.low, problem.bounds.high].map(|x| x * job.scan.unit.mm as f32);
         let bounds = Bounds { low: if nonnegative { low } else { f32::NEG_INFINITY }, high };
         volume.data.par_mapv_inplace(|x| bounds.clip(x));
     }
-    solution
+    Ok(solution)
 }
 
 struct Iterate {

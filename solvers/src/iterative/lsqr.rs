@@ -2,13 +2,13 @@
 //! Its volumes are those of conjugate gradients, with less rounding, and it takes a pull: it minimizes
 //! `‖p − A·x‖² + λ²‖x − x₀‖²`.
 
-use super::cgls::clipped;
+use super::cgls::least_squares;
 use super::norms::{distance, norm2};
 use super::order::Subsets;
 use super::plan::{Iterative, IterativePlan};
 use super::problem::copy;
 use super::shared::Shared;
-use super::{Iteration, Pass, Problem, Stop, drive::drive};
+use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::error::{Result, ensure};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
@@ -22,7 +22,6 @@ use conefield_core::voxel::VoxelProjectorSpec;
 use conefield_projectors::voxel::Joseph;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::time::Instant;
 
 /// Settings of `lsqr`.
 #[derive(Serialize, Deserialize, JsonSchema)]
@@ -86,16 +85,8 @@ impl Iterative for Built {
     }
 
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
-        let begun = Instant::now();
-        let opened = self.shared.open(&self.describe(), job, observer)?;
-        let job = &opened.job(job);
-        let mut problem = opened.problem(job);
-        let space = opened.space(job.scan.header());
-        let mut iterate = Iterate::new(&space, self.shared.start(job, &problem, &space)?, self.pull)?;
-        problem.settle()?;
-        iterate.prepare(&problem)?;
-        let solution = drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)?;
-        Ok(clipped(solution, &problem, self.nonnegative))
+        let make = |space: &Space, x| Iterate::new(space, x, self.pull);
+        least_squares(self, self.nonnegative, job, observer, make, Iterate::prepare)
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
