@@ -39,9 +39,8 @@
 //!
 //! `[vectors]` has `cone_vec = [[...], ...]`, ASTRA's twelve numbers per view: source, detector centre, the step to the
 //! next column (u) and to the next row (v), all in mm here, or the name of a file with them. `parallel_vec` has the
-//! direction of the rays in place of the source. `[rtk]` has `file`,
-//! `pixel` and `offset`; see [`read_rtk_geometry`]. `[cil]` has the `file` that CIL wrote. All lengths are mm; angles
-//! are degrees, as their keys say.
+//! direction of the rays in place of the source. `[rtk]` has `file`, `pixel` and `offset`; see [`read_rtk_geometry`].
+//! `[cil]` has the `file` that CIL wrote. All lengths are mm; angles are degrees, as their keys say.
 //!
 //! In an HDF5 file, `scan.h5:/PATH` names a data set; `scan.h5` alone means the projections, open beam, dark field or
 //! angles that DXchange, NXtomo or CIL keep there. A vendor's description may replace this file; see [`Vendor`].

@@ -71,7 +71,8 @@ struct StackFile {
 /// Reads a stack `[view, row, column]` from a sequence of files, each with one view (two axes) or several.
 ///
 /// Names are relative to `folder` and stay in it. A folder stands for its TIFF files, if it has none for its `.npy` files,
-/// and then for the images of a vendor, in the order of the numbers in their names. From an HDF5 file that holds a whole scan, `part` is read.
+/// and then for the images of a vendor, in the order of the numbers in their names. From an HDF5 file that holds a whole
+/// scan, `part` is read.
 pub(crate) fn read(
     folder: &Path,
     place: &str,
