@@ -98,6 +98,17 @@ impl VoxelProjector for Joseph {
     }
 }
 
+impl Trilinear {
+    /// Axis-aligned rays of a parallel beam cross whole numbers of steps. Their counts must not depend on rounding, which
+    /// differs between devices.
+    fn samples(&self) -> f64 {
+        self.samples_per_voxel * (1.0 - 1e-5)
+    }
+    fn walk(&self) -> TrilinearWalk {
+        TrilinearWalk { samples_per_voxel: self.samples() }
+    }
+}
+
 impl VoxelProjector for Trilinear {
     fn operator(&self) -> &dyn VoxelOperator<f32> {
         self
@@ -106,7 +117,7 @@ impl VoxelProjector for Trilinear {
         self
     }
     fn wgsl(&self) -> Option<Fragment> {
-        let samples = format!("const stage_SAMPLES = {:?};\n", self.samples_per_voxel as f32);
+        let samples = format!("const stage_SAMPLES = {:?};\n", self.samples() as f32);
         Some(Fragment::new(&[&samples, include_str!("walk.wgsl"), include_str!("trilinear.wgsl")]))
     }
     fn describe(&self) -> String {
@@ -129,12 +140,10 @@ impl<R: Real> VoxelOperator<R> for Siddon {
 
 impl<R: Real> VoxelOperator<R> for Trilinear {
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, out: ArrayViewMut3<'_, R>) {
-        let walk = TrilinearWalk { samples_per_voxel: self.samples_per_voxel };
-        rays::forward(&walk, geometry, views, volume, out);
+        rays::forward(&self.walk(), geometry, views, volume, out);
     }
     fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, volume: ArrayViewMut3<'_, R>) {
-        let walk = TrilinearWalk { samples_per_voxel: self.samples_per_voxel };
-        rays::adjoint(&walk, geometry, views, p, volume);
+        rays::adjoint(&self.walk(), geometry, views, p, volume);
     }
 }
 
