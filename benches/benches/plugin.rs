@@ -91,7 +91,7 @@ impl Runner {
 
 /// Builds the plugin.
 fn library() -> Result<PathBuf, Box<dyn Error>> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../plugins/tests");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../plugins/examples");
     let target = std::env::temp_dir().join("conefield-bench-plugin");
     let mut cargo = Command::new(env!("CARGO"));
     cargo.current_dir(folder).args(["build", "--release", "--locked", "-p", "rehashed", "--target-dir"]).arg(&target);

@@ -2,13 +2,12 @@
 //!
 //! A [`RowMap`] defines the channels of one row and their gradients. [`ByRow`] makes a complete [`Stage`] of it, with
 //! tiles, double-precision checks and masked channels. Stages that need maximum speed implement [`Stage`] and
-//! [`Kernel`] directly. A field with line integrals of its own defines them ray by ray ([`RayMap`], [`ByRay`]).
+//! [`Kernel`] directly.
 
 use crate::error::{Error, Result};
 use crate::simd::Real;
 use crate::stage::{
-    Encoder, Field, GradKind, Grads, Info, Kernel, Lines, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-    UnitRay,
+    Encoder, Field, GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
 use crate::wgsl::Fragment;
 use std::ops::Range;
@@ -227,82 +226,5 @@ impl<T: RowMap> Field for ByRow<T> {
         let inputs = keep.iter().map(|&c| self.inputs[c]).collect();
         let stage = Self { map: self.map.clone(), inputs, outputs: self.outputs.clone() };
         Ok(Reduced { stage: Box::new(stage), params: self.params(), channels: (0..self.outputs.len()).collect() })
-    }
-}
-
-/// A field of positions with line integrals of its own, one ray at a time. It is called only for rays that cross the
-/// reconstruction box.
-pub trait RayMap: RowMap {
-    /// The line integral along `ray`, in cube sides.
-    fn project<R: Real>(&self, params: &[R], ray: &UnitRay) -> R;
-
-    /// Given `dline = ∂L/∂line`, adds `∂L/∂params` to `grads`.
-    fn backproject<R: Real>(&self, params: &[R], ray: &UnitRay, dline: R, grads: &mut Sums<'_, R>);
-}
-
-/// The stage of a [`RayMap`].
-pub struct ByRay<T>(ByRow<T>);
-
-impl<T: RayMap> ByRay<T> {
-    /// The stage of `map`.
-    pub fn new(map: T) -> Self {
-        Self(ByRow::new(map))
-    }
-}
-
-/// Rays that cross the box, with their associated items.
-fn inside<'a, A>(
-    rays: &'a [UnitRay],
-    with: impl IntoIterator<Item = A> + 'a,
-) -> impl Iterator<Item = (&'a UnitRay, A)> {
-    rays.iter().zip(with).filter(|(ray, _)| ray.inside[1] > ray.inside[0])
-}
-
-impl<T: RayMap, R: Real> Lines<R> for ByRay<T> {
-    fn project(&self, params: &[R], rays: &[UnitRay], out: &mut [R]) {
-        out.fill(R::ZERO);
-        for (ray, out) in inside(rays, out) {
-            *out = self.0.map.project(params, ray);
-        }
-    }
-
-    fn backproject(&self, params: &[R], rays: &[UnitRay], dlines: &[R], grads: Grads<'_, R>) {
-        let mut grads = Sums(grads);
-        for (ray, dline) in inside(rays, dlines) {
-            self.0.map.backproject(params, ray, *dline, &mut grads);
-        }
-    }
-}
-
-impl<T: RayMap> Stage for ByRay<T> {
-    fn info(&self) -> Info {
-        self.0.info()
-    }
-    fn parameters(&self) -> Vec<Parameter> {
-        self.0.parameters()
-    }
-    fn init(&self, seed: u64, params: &mut [f32]) {
-        self.0.init(seed, params);
-    }
-    fn kernel(&self) -> &dyn Kernel<f32> {
-        self.0.kernel()
-    }
-    fn reference(&self) -> Option<&dyn Kernel<f64>> {
-        self.0.reference()
-    }
-    fn wgsl(&self) -> Option<Fragment> {
-        self.0.wgsl()
-    }
-    fn describe(&self) -> String {
-        self.0.describe()
-    }
-}
-
-impl<T: RayMap> Field for ByRay<T> {
-    fn lines(&self) -> Option<&dyn Lines<f32>> {
-        Some(self)
-    }
-    fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
-        Some(self)
     }
 }

@@ -1,7 +1,7 @@
 //! Imports for authors of stages: `use conefield_core::prelude::*;`.
 
 pub use crate::basis::{Basis, BasisOperator, BasisSpec, Expansion};
-pub use crate::by_row::{ByRay, ByRow, RayMap, RowMap, Sums};
+pub use crate::by_row::{ByRow, RowMap, Sums};
 pub use crate::data_term::{DataTerm, DataTermSpec, Misfit};
 pub use crate::error::{Error, Result, ensure};
 pub use crate::geometry::VoxelGrid;
@@ -11,11 +11,11 @@ pub use crate::prior::{Blocks, Prior};
 pub use crate::random::{mix, unit};
 pub use crate::regularizer::{Penalty, Regularizer, RegularizerSpec};
 pub use crate::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LineFieldSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 pub use crate::simd::Real;
 pub use crate::space::Space;
-pub use crate::stage::{Encoder, Field, Grads, Lines, Normalizer, Projector, Samples, Stage, UnitRay};
+pub use crate::stage::{Encoder, Field, Grads, Normalizer, Projector, Samples, Stage, UnitRay};
 pub use crate::stage_type;
 pub use crate::wgsl::Fragment;
 pub use ndarray::{ArrayView3, ArrayViewMut3};

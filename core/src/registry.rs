@@ -8,9 +8,7 @@ use crate::basis::BasisSpec;
 use crate::data_term::DataTermSpec;
 use crate::error::{Error, Result};
 use crate::regularizer::RegularizerSpec;
-use crate::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LineFieldSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
-};
+use crate::settings::{EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec};
 use crate::voxel::VoxelProjectorSpec;
 use schemars::Schema;
 use serde_json::Value;
@@ -78,8 +76,6 @@ kinds! {
         Callback "callback",
     }
     loadable {
-        /// Line integrals of rays, and attenuation at points.
-        LineField "line-field" LineFieldSpec,
         /// Points to features.
         Encoder "encoder" EncoderSpec,
         /// Features to features.

@@ -28,13 +28,6 @@ pub trait FieldSpec: Send + Sync {
     fn build(&self, width: usize) -> Result<Box<dyn Field>>;
 }
 
-/// Settings of a field with line integrals of its own ([`Field::lines`]). It reads positions.
-#[typetag::serde(tag = "type")]
-pub trait LineFieldSpec: Send + Sync {
-    /// The stage.
-    fn build(&self) -> Result<Box<dyn Field>>;
-}
-
 /// Settings of a projector that samples rays for a field.
 #[typetag::serde(tag = "type")]
 pub trait ProjectorSpec: Send + Sync {

@@ -323,13 +323,8 @@ pub trait Field: Stage {
         Err(Error::unsupported(self.describe(), "this field does not support removing inputs"))
     }
 
-    /// Its own line integrals, if it has any ([`crate::settings::LineFieldSpec`]).
-    fn lines(&self) -> Option<&dyn Lines<f32>> {
-        None
-    }
-
-    /// The same formula in double precision, for checking gradients.
-    fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
+    /// Its own line integrals, if it has any.
+    fn lines(&self) -> Option<&dyn Lines> {
         None
     }
 
@@ -356,16 +351,12 @@ pub struct UnitGrid {
     pub shape: [usize; 3],
 }
 
-/// Line integrals computed by a field itself, without samples of a projector, e.g. in closed form or by a walk through
-/// voxels. The field reads positions; its [`Kernel`] gives its values at points, for priors and export.
-pub trait Lines<R: Real>: Send + Sync {
+/// Line integrals computed by a field itself, without samples of a projector. The field reads positions; its [`Kernel`]
+/// gives its values at points, for priors and export. The field's method trains it.
+pub trait Lines: Send + Sync {
     /// Overwrites `out` with the line integrals of `rays`, in cube sides; 0 for a ray that misses the box
     /// ([`UnitRay::inside`]).
-    fn project(&self, params: &[R], rays: &[UnitRay], out: &mut [R]);
-
-    /// Given `dlines = ∂L/∂out`, *adds* `∂L/∂params` to `grads`. The summation order of a parameter's gradient must not
-    /// depend on `grads.range`: hosts assign each range of [`Stage::partition`] to a worker.
-    fn backproject(&self, params: &[R], rays: &[UnitRay], dlines: &[R], grads: Grads<'_, R>);
+    fn project(&self, params: &[f32], rays: &[UnitRay], out: &mut [f32]);
 }
 
 /// A ray in the unit cube: `origin + t·direction`, where `t` counts cube sides.

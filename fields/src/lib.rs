@@ -1,7 +1,6 @@
 //! All of a neural field but its encoder.
 //!
-//! - [`mlp`], [`line_transformer`], [`voxel_grid`], [`voxels_joseph`]: attenuation fields; the last one has line
-//!   integrals of its own.
+//! - [`mlp`], [`line_transformer`], [`voxel_grid`]: attenuation fields.
 //! - [`normalizers`]: between encoder and field; [`initializers`]: of the parameters.
 
 pub mod initializers;
@@ -12,4 +11,3 @@ pub mod normalizers;
 #[cfg(test)]
 mod testing;
 pub mod voxel_grid;
-pub mod voxels_joseph;

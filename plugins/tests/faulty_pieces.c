@@ -1,13 +1,12 @@
-/* A regularizer, a data term, a basis and a line field, one of them with one fault, selected by -DFAULT=…, which the host
+/* A regularizer, a data term and a basis, one of them with one fault, selected by -DFAULT=…, which the host
  * or the conformance kit must detect. Without a fault they are valid: half the squares of coefficients, half the squares of
- * residuals, the voxels themselves, and one blob in the middle of the cube. */
+ * residuals, and the voxels themselves. */
 #include "faulty.h"
 
 enum Fault {
     NONE, R_NO_PROX, R_NEGATIVE, R_NOT_A_NUMBER, R_PAST, R_BELOW, R_FAILS, R_NO_GRID, R_ITSELF, R_TWIN_STATE,
     R_WEIGHT, R_HALVED, R_FORGETS, R_LATER, D_NO_OF, D_NEGATIVE, D_NOT_A_NUMBER, D_PAST, D_NOISE, D_NO_SCAN, D_STEEP,
-    D_LOW_BOUND, D_LATER, B_NO_COEFFICIENTS, B_PAST, B_UNWRITTEN, B_FAILS, B_LONG_ADJOINT, B_LATER, L_NO_LINES,
-    L_PAST, L_MISSED, L_LONG_ADJOINT,
+    D_LOW_BOUND, D_LATER, B_NO_COEFFICIENTS, B_PAST, B_UNWRITTEN, B_FAILS, B_LONG_ADJOINT, B_LATER,
 };
 
 /* Calls of this process. */
@@ -178,104 +177,6 @@ static const struct ConefieldBasis BASIS = {
     .adjoint = adjoint,
 };
 
-/* The line field: a height times a bell of one over 1 + 16 squared distances. */
-
-static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
-    (void)stage;
-    *out = (struct ConefieldInfo){.input = 3, .output = 1, .params = 1, .blocks = 1, .macs = 8, .double_precision = 1,
-                                  .scope = CONEFIELD_SCOPE_ROW, .grads = CONEFIELD_GRADS_DENSE};
-    return CONEFIELD_OK;
-}
-
-static ConefieldStatus parameter(const void *stage, size_t index, struct ConefieldParameter *out) {
-    static const struct ConefieldStr name = TEXT("height");
-    static const size_t one = 1;
-    (void)stage, (void)index;
-    *out = (struct ConefieldParameter){.name = name, .shape = &one, .dimensions = 1};
-    return CONEFIELD_OK;
-}
-
-static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
-    (void)stage, (void)seed, (void)error;
-    for (size_t i = 0; i < length; i++) params[i] = 0.5f;
-    return CONEFIELD_OK;
-}
-
-/* The line integral of the bell along the part of a ray that is inside. */
-static double line(const struct ConefieldRay *ray) {
-    double ahead = 0, square = 0;
-    for (size_t k = 0; k < 3; k++) {
-        double way = 0.5 - (double)ray->origin[k];
-        ahead += way * (double)ray->direction[k];
-        square += way * way;
-    }
-    double wide = sqrt(1.0 / 16 + square - ahead * ahead);
-    return (atan(((double)ray->inside[1] - ahead) / wide) - atan(((double)ray->inside[0] - ahead) / wide)) / (16 * wide);
-}
-
-#define PRECISION(real, Tile, TileMut, Grads, forward, backward, project, backproject) \
-    static ConefieldStatus forward(const void *stage, const real *params, struct Tile x, struct TileMut y, \
-                                   struct TileMut tape, struct ConefieldText *error) { \
-        (void)stage, (void)tape, (void)error; \
-        for (size_t r = 0; r < x.rows; r++) { \
-            double square = 0; \
-            for (size_t k = 0; k < 3; k++) square += pow(x.data[k * x.stride + r] - 0.5, 2); \
-            y.data[r] = (real)(params[0] / (1 + 16 * square)); \
-        } \
-        return CONEFIELD_OK; \
-    } \
-    static ConefieldStatus backward(const void *stage, const real *params, struct Tile x, struct TileMut tape, \
-                                    struct Tile dy, struct Grads grads, struct TileMut dx, struct ConefieldText *error) { \
-        (void)stage, (void)tape, (void)error; \
-        for (size_t r = 0; r < x.rows; r++) { \
-            double square = 0; \
-            for (size_t k = 0; k < 3; k++) square += pow(x.data[k * x.stride + r] - 0.5, 2); \
-            double bell = 1 / (1 + 16 * square); \
-            if (grads.start == 0 && grads.length > 0) grads.data[0] += (real)(dy.data[r] * bell); \
-            for (size_t k = 0; dx.data != NULL && k < 3; k++) \
-                dx.data[k * dx.stride + r] = \
-                    (real)(-32 * dy.data[r] * params[0] * bell * bell * (x.data[k * x.stride + r] - 0.5)); \
-        } \
-        return CONEFIELD_OK; \
-    } \
-    static ConefieldStatus project(const void *stage, const real *params, const struct ConefieldRay *rays, size_t n, \
-                                   real *out, struct ConefieldText *error) { \
-        (void)stage, (void)error; \
-        for (size_t r = 0; r < n; r++) out[r] = rays[r].inside[1] > rays[r].inside[0] ? (real)(params[0] * line(&rays[r])) : 0; \
-        for (size_t r = 0; FAULT == L_MISSED && r < n; r++) out[r] += (real)0.1; \
-        if (FAULT == L_PAST) out[n] = 1; \
-        return CONEFIELD_OK; \
-    } \
-    static ConefieldStatus backproject(const void *stage, const real *params, const struct ConefieldRay *rays, size_t n, \
-                                       const real *dlines, struct Grads grads, struct ConefieldText *error) { \
-        (void)stage, (void)params, (void)error; \
-        if (grads.start > 0 || grads.length == 0) return CONEFIELD_OK; \
-        for (size_t r = 0; r < n; r++) \
-            if (rays[r].inside[1] > rays[r].inside[0]) \
-                grads.data[0] += (real)(dlines[r] * line(&rays[r]) * (FAULT == L_LONG_ADJOINT ? 1.1 : 1.0)); \
-        return CONEFIELD_OK; \
-    }
-
-PRECISION(float, ConefieldTile, ConefieldTileMut, ConefieldGrads, forward, backward, project, backproject)
-PRECISION(double, ConefieldTile64, ConefieldTileMut64, ConefieldGrads64, forward_f64, backward_f64, project_f64,
-          backproject_f64)
-
-static const struct ConefieldMap MAP = {
-    .size = sizeof MAP,
-    .info = info,
-    .parameter = parameter,
-    .init = init,
-    .forward = forward,
-    .backward = backward,
-    .forward_f64 = forward_f64,
-    .backward_f64 = backward_f64,
-    .project = FAULT == L_NO_LINES ? NULL : project,
-    .backproject = backproject,
-    .project_f64 = project_f64,
-    .backproject_f64 = backproject_f64,
-};
-
 PLUGIN(STAGE(CONEFIELD_REGULARIZER, "for tests", .regularizer = &REGULARIZER),
        STAGE(CONEFIELD_DATA_TERM, "for tests", .data_term = &DATA_TERM),
-       STAGE(CONEFIELD_BASIS, "for tests", .basis = &BASIS),
-       STAGE(CONEFIELD_LINE_FIELD, "for tests", .map = &MAP))
+       STAGE(CONEFIELD_BASIS, "for tests", .basis = &BASIS))

@@ -1,7 +1,7 @@
 //! Methods: scan in, volume out.
 //!
-//! - [`neural_field`] and [`line_field`] train an attenuation field by stochastic gradients. [`training`] is their
-//!   loop, with its callbacks; [`pretrain`] trains a field on known volumes, for weights that other scans reuse.
+//! - [`neural_field`] trains an attenuation field by stochastic gradients. [`training`] is its loop,
+//!   with callbacks; [`pretrain`] trains a field on known volumes, for weights that other scans reuse.
 //!   [`losses`], [`priors`] and [`optimizer`] hold the parts of training.
 //! - [`gaussians`] trains a sum of Gaussians on whole views, in the same loop.
 //! - [`fit`] adapts a pipeline to a scan, [`support`] and [`solid`] find the object's support, [`surround`] models
@@ -16,7 +16,6 @@ pub mod field_plan;
 pub mod fit;
 pub mod gaussians;
 pub mod iterative;
-pub mod line_field;
 pub mod losses;
 pub mod neural_field;
 pub mod optimizer;
@@ -29,4 +28,5 @@ pub mod solid;
 pub mod support;
 pub mod surround;
 pub mod training;
+mod waiting;
 mod watched;

@@ -24,7 +24,7 @@ use conefield_core::stage::{
     TileMut, UnitRay,
 };
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
-use conefield_core::wgsl::Fragment;
+use conefield_core::wgsl::{Fragment, Runner};
 use conefield_core::{Error, Result};
 use conefield_projectors::voxel::{Joseph, Siddon};
 use ndarray::{ArrayView3, ArrayViewMut3};

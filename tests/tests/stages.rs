@@ -1,26 +1,16 @@
-//! Every built-in stage, with several settings each, through the conformance kit.
+//! Every registered stage type through the conformance kit: with the settings of its registration, so that a new type is
+//! tried without a word here, and built-in ones with more settings.
 
 mod device;
 
-use conefield_conformance::{
-    Options, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
-    check_loss_wgsl, check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl,
-    check_regularizer, check_settings, check_voxel_projector, check_wgsl, ready,
-};
-use conefield_core::arena::Weights;
-use conefield_core::basis::BasisSpec;
-use conefield_core::data_term::DataTermSpec;
-use conefield_core::loss::Loss;
+use conefield_conformance::{Options, Report, With, check_encoder, check_settings, check_type, check_wgsl};
 use conefield_core::opened::Opened;
-use conefield_core::registry::{Kind, Settings, names};
-use conefield_core::regularizer::RegularizerSpec;
-use conefield_core::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LineFieldSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
-};
+use conefield_core::registry::{Kind, stage_types};
+use conefield_core::settings::{EncoderSpec, InitializerSpec, LossSpec, PriorSpec, ProjectorSpec};
 use conefield_core::spec::stage::read;
-use conefield_core::stage::{Field, Stage};
-use conefield_core::voxel::VoxelProjectorSpec;
-use serde::de::DeserializeOwned;
+use conefield_core::spec::{load, schema};
+use conefield_core::wgsl::Runner;
+use conefield_core::{Result, arena::Weights};
 use serde_json::{Value, json};
 use std::sync::Arc;
 
@@ -35,48 +25,88 @@ fn expect(report: Report) {
     assert!(report.passed(), "{report}\nfails {:?}", report.failed());
 }
 
-/// The stage's WGSL, where there is a device. Every built-in stage that does anything has one, but those that look along
-/// rays.
-fn on_a_device(stage: &dyn Stage, options: &Options) {
-    if stage.wgsl().is_none() {
-        return;
+/// Checks a stage with these settings, on a device too if there is one. Returns the descriptions of those checked.
+fn try_check(kind: Kind, settings: &Value, width: usize, options: &dyn Fn(Options) -> Options) -> Result<Vec<String>> {
+    let shared = device::shared("the WGSL of stages");
+    let device = || shared.as_deref().map(|shared| shared as &dyn Runner).ok_or_else(|| "no adapter".into());
+    let found = check_type(kind, settings, &With { widths: &[width], options, device: &device })?;
+    Ok(found.into_iter().map(|(_, report)| (report.stage.clone(), expect(report)).0).collect())
+}
+
+fn check(kind: Kind, settings: &Value, width: usize, options: &dyn Fn(Options) -> Options) {
+    let found = try_check(kind, settings, width, options).unwrap_or_else(|e| panic!("{settings}: {e}"));
+    assert!(!found.is_empty(), "{settings}");
+}
+
+/// An encoder whose largest difference of single from double precision is `single`.
+fn encoder(settings: Value, single: f64) {
+    check(Kind::Encoder, &settings, 3, &|o| Options { single, ..o });
+}
+
+fn registered(kinds: &[Kind]) {
+    for kind in kinds {
+        let all: Vec<_> = stage_types().into_iter().filter(|t| t.kind == *kind).collect();
+        assert!(!all.is_empty(), "no {kind} is registered");
+        for t in all {
+            println!("{kind} {}", t.name);
+            match kind {
+                // Three channels suit a field that reads positions as well. Larger parameters would saturate the last
+                // sigmoid of a deep one.
+                Kind::Field => check(*kind, &t.example(), 3, &|_| Options {
+                    params: Some(0.2),
+                    single: 5e-5,
+                    ..Options::encoder()
+                }),
+                _ => check(*kind, &t.example(), 20, &|o| Options { single: 4e-5, ..o }),
+            }
+        }
     }
-    if let Some(shared) = device::shared("the WGSL of a stage") {
-        expect(check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows)));
-    }
-}
-
-fn encoder(settings: Value, options: &Options) {
-    let spec: Box<dyn EncoderSpec> = serde_json::from_value(settings).unwrap();
-    let stage = spec.build().unwrap();
-    expect(check_encoder(stage.as_ref(), options));
-    on_a_device(stage.as_ref(), options);
-}
-
-fn normalizer(settings: Value, width: usize, options: &Options) {
-    let spec: Box<dyn NormalizerSpec> = serde_json::from_value(settings).unwrap();
-    let stage = spec.build(width).unwrap();
-    expect(check_normalizer(stage.as_ref(), options));
-    on_a_device(stage.as_ref(), options);
-}
-
-fn field(settings: Value, width: usize, options: &Options) {
-    let spec: Box<dyn FieldSpec> = serde_json::from_value(settings).unwrap();
-    let stage = spec.build(width).unwrap();
-    expect(check_field(stage.as_ref(), options));
-    on_a_device(stage.as_ref(), options);
-}
-
-fn line_field(settings: Value, options: &Options) {
-    let spec: Box<dyn LineFieldSpec> = serde_json::from_value(settings).unwrap();
-    let stage = spec.build().unwrap();
-    expect(check_field(stage.as_ref(), options));
-    on_a_device(stage.as_ref(), options);
 }
 
 #[test]
-fn identity() {
-    encoder(json!({"type": "identity"}), &Options::encoder());
+fn registered_encoders_and_normalizers() {
+    registered(&[Kind::Encoder, Kind::Normalizer]);
+}
+
+#[test]
+fn registered_fields_and_projectors() {
+    registered(&[Kind::Field, Kind::Projector]);
+}
+
+#[test]
+fn registered_losses_and_priors() {
+    registered(&[Kind::Loss, Kind::Prior]);
+}
+
+#[test]
+fn registered_parts_of_iterative_methods() {
+    registered(&[Kind::VoxelProjector, Kind::Basis, Kind::DataTerm, Kind::Regularizer]);
+}
+
+/// Those without a file of weights: the others are tried in tests of their own.
+#[test]
+fn registered_initializers() {
+    for t in stage_types().into_iter().filter(|t| t.kind == Kind::Initializer) {
+        let spec = read::<dyn InitializerSpec>(t.example()).unwrap();
+        let built = spec.build(&|_| Ok(Weights::default())).unwrap();
+        if t.name == "random" || built.volume().is_some() {
+            check(Kind::Initializer, &t.example(), 0, &|o| o);
+        }
+    }
+}
+
+/// Every type is in the schema that editors read. The refusal of an unknown type lists the known ones.
+#[test]
+fn every_type_is_in_the_schema_and_in_refusals() {
+    let schema = schema::spec().to_string();
+    for t in stage_types() {
+        assert!(schema.contains(&format!("\"{}.{}\"", t.kind.name(), t.name)), "{} {}", t.kind, t.name);
+    }
+    for t in stage_types().into_iter().filter(|t| t.kind == Kind::Encoder) {
+        let text = "type = 'neural-field'\nfield = 'mlp'\nprojector = 'ray-march'\nencoder = 'none'\n";
+        let e = load::parse(text, "a.toml", &[], &[]).err().unwrap().to_string();
+        assert!(e.contains(t.name), "{e}");
+    }
 }
 
 #[test]
@@ -88,16 +118,14 @@ fn frequency() {
         // A product f·x is rounded to 2⁻²⁴ of up to f turns.
         (json!({"type": "frequency", "bands": 7, "spacing": "linear", "max_frequency": 100.0}), 5e-5),
     ] {
-        encoder(settings, &Options { single, ..Options::encoder() });
+        encoder(settings, single);
     }
 }
 
 #[test]
 fn frequency_outside_the_cube() {
-    encoder(
-        json!({"type": "frequency", "bands": 3, "max_frequency": 4.0}),
-        &Options { inputs: -30.0..30.0, ..Options::encoder() },
-    );
+    let settings = json!({"type": "frequency", "bands": 3, "max_frequency": 4.0});
+    check(Kind::Encoder, &settings, 3, &|o| Options { inputs: -30.0..30.0, ..o });
 }
 
 #[test]
@@ -108,7 +136,7 @@ fn dense_grid() {
         json!({"type": "dense-grid", "levels": 2, "base_resolution": 3, "features": 8, "growth": 1.0}),
         json!({"type": "dense-grid", "levels": 2, "base_resolution": 30, "features": 4}),
     ] {
-        encoder(settings, &Options { single: 4e-5, ..Options::encoder() });
+        encoder(settings, 4e-5);
     }
 }
 
@@ -124,7 +152,7 @@ fn hash_grid() {
         // Positions in fine cells are rounded to 2⁻²⁴ of the resolution.
         (json!({"type": "hash-grid", "levels": 8, "features": 4, "log2_table_size": 12}), 5e-4),
     ] {
-        encoder(settings, &Options { single, ..Options::encoder() });
+        encoder(settings, single);
     }
 }
 
@@ -138,7 +166,7 @@ fn permutohedral() {
         // As for the hash grid.
         (json!({"type": "permutohedral", "levels": 8, "features": 4, "log2_table_size": 12}), 5e-4),
     ] {
-        encoder(settings, &Options { single, ..Options::encoder() });
+        encoder(settings, single);
     }
 }
 
@@ -151,7 +179,7 @@ fn b_spline_grid() {
         // More than one range of a level.
         json!({"type": "b-spline-grid", "levels": 1, "base_resolution": 78, "features": 1}),
     ] {
-        encoder(settings, &Options { single: 4e-5, ..Options::encoder() });
+        encoder(settings, 4e-5);
     }
 }
 
@@ -163,7 +191,7 @@ fn planes() {
         json!({"type": "planes", "form": "tri-plane", "levels": 2, "base_resolution": 7, "features": 2}),
         json!({"type": "planes", "form": "tri-plane", "levels": 1, "base_resolution": 1, "features": 8}),
     ] {
-        encoder(settings, &Options { single: 4e-5, ..Options::encoder() });
+        encoder(settings, 4e-5);
     }
 }
 
@@ -178,7 +206,7 @@ fn concat() {
         json!([frequency, dense, hash]),
         json!([hash, {"type": "concat", "encoders": [{"type": "identity"}, dense]}, dense]),
     ] {
-        encoder(json!({"type": "concat", "encoders": encoders}), &Options { single: 4e-5, ..Options::encoder() });
+        encoder(json!({"type": "concat", "encoders": encoders}), 4e-5);
     }
 }
 
@@ -203,22 +231,22 @@ fn layer_norm() {
         (json!({"type": "layer-norm", "eps": 0.1}), 2),
         (json!({"type": "layer-norm"}), 33),
     ] {
-        normalizer(settings.clone(), width, &Options { params: Some(1.0), ..Options::features() });
-        normalizer(settings, width, &Options::features());
+        check(Kind::Normalizer, &settings, width, &|o| Options { params: Some(1.0), ..o });
+        check(Kind::Normalizer, &settings, width, &|o| o);
     }
 }
 
 #[test]
 fn layer_norm_of_one_channel() {
-    normalizer(json!({"type": "layer-norm"}), 1, &Options::features());
+    check(Kind::Normalizer, &json!({"type": "layer-norm"}), 1, &|o| o);
 }
 
 #[test]
 fn level_attention() {
     for (features, width) in [(2, 20), (4, 16), (1, 5), (3, 3)] {
         let settings = json!({"type": "level-attention", "features": features});
-        normalizer(settings.clone(), width, &Options { params: Some(1.0), single: 4e-5, ..Options::features() });
-        normalizer(settings, width, &Options { single: 4e-5, ..Options::features() });
+        check(Kind::Normalizer, &settings, width, &|o| Options { params: Some(1.0), single: 4e-5, ..o });
+        check(Kind::Normalizer, &settings, width, &|o| Options { single: 4e-5, ..o });
     }
 }
 
@@ -229,7 +257,7 @@ fn line_attention() {
         (json!({"type": "line-attention", "segment": 3, "heads": 2, "head_width": 3, "expansion": 2}), 5),
         (json!({"type": "line-attention", "segment": 1, "heads": 1, "head_width": 1, "expansion": 1}), 1),
     ] {
-        normalizer(settings, width, &Options { single: 1e-4, ..Options::features() });
+        check(Kind::Normalizer, &settings, width, &|o| Options { single: 1e-4, ..o });
     }
 }
 
@@ -243,7 +271,7 @@ fn line_transformer() {
         ),
         (json!({"type": "line-transformer", "width": 4, "activation": "gelu", "output": "squareplus"}), 3),
     ] {
-        field(settings, width, &Options { single: 1e-4, ..Options::features() });
+        check(Kind::Field, &settings, width, &|o| Options { single: 1e-4, ..o });
     }
 }
 
@@ -258,7 +286,9 @@ fn opened() {
         let (stage, options) = (spec.build().unwrap(), Options { single: 4e-5, ..Options::encoder() });
         let opened = Opened::new(Arc::from(stage), channels).unwrap();
         expect(check_encoder(&opened, &options));
-        on_a_device(&opened, &options);
+        if let Some(shared) = device::shared("the WGSL of a stage") {
+            expect(check_wgsl(&opened, &options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows)));
+        }
     }
     let of = |settings| serde_json::from_value::<Box<dyn EncoderSpec>>(settings).unwrap().build().unwrap();
     let refused = Opened::new(Arc::from(of(json!({"type": "frequency"}))), 3).err().unwrap().to_string();
@@ -280,7 +310,7 @@ fn mlp() {
         ),
         (json!({"type": "mlp", "width": 8, "activation": "squareplus", "init": "glorot", "output": "gelu"}), 4),
     ] {
-        field(settings, width, &Options { single: 5e-5, ..Options::features() });
+        check(Kind::Field, &settings, width, &|o| Options { single: 5e-5, ..o });
     }
 }
 
@@ -293,148 +323,76 @@ fn voxel_grid() {
         json!({"type": "voxel-grid", "resolution": [7, 8, 4], "output": "relu"}),
         json!({"type": "voxel-grid", "resolution": 70, "output": "squareplus"}),
     ] {
-        field(settings, 3, &Options { single: 4e-5, ..Options::encoder() });
+        check(Kind::Field, &settings, 3, &|_| Options { single: 4e-5, ..Options::encoder() });
     }
 }
 
-/// Every registered type of a kind with default settings, and others of them.
-fn each<T: Settings + ?Sized>(others: &[Value]) -> Vec<Box<T>>
-where
-    Box<T>: DeserializeOwned,
-{
-    let all = names(T::KIND);
-    assert!(!all.is_empty(), "no {}", T::KIND);
-    let settings = all.iter().map(|name| json!({ "type": name })).chain(others.iter().cloned());
-    settings.map(|s| read(s).unwrap()).collect()
-}
-
 #[test]
-fn voxels_joseph() {
-    for settings in [
-        json!({"type": "voxels-joseph", "resolution": 16}),
-        json!({"type": "voxels-joseph", "resolution": [12, 17, 9]}),
-        // More than one range of voxels.
-        json!({"type": "voxels-joseph", "resolution": [41, 37, 43]}),
+fn parts_of_iterative_methods() {
+    for (kind, settings) in [
+        (Kind::VoxelProjector, json!({"type": "trilinear", "samples_per_voxel": 5.0})),
+        (Kind::Regularizer, json!({"type": "total-variation", "weight": {"fixed": 0.1}, "inner": 1})),
     ] {
-        line_field(settings, &Options { single: 4e-5, ..Options::encoder() });
-    }
-}
-
-/// Line fields do, in both precisions; fields that a projector samples do not.
-#[test]
-fn line_fields_alone_bring_line_integrals() {
-    let lines = |stage: &dyn Field| [stage.lines().is_some(), stage.lines_reference().is_some()];
-    for spec in each::<dyn FieldSpec>(&[]) {
-        assert_eq!(lines(spec.build(3).unwrap().as_ref()), [false; 2], "{}", spec.typetag_name());
-    }
-    for spec in each::<dyn LineFieldSpec>(&[]) {
-        assert_eq!(lines(spec.build().unwrap().as_ref()), [true; 2], "{}", spec.typetag_name());
-    }
-}
-
-#[test]
-fn voxel_projectors() {
-    for spec in each::<dyn VoxelProjectorSpec>(&[json!({"type": "trilinear", "samples_per_voxel": 5.0})]) {
-        expect(check_voxel_projector(spec.build().unwrap().as_ref()));
-    }
-}
-
-#[test]
-fn bases() {
-    for spec in each::<dyn BasisSpec>(&[]) {
-        expect(check_basis(spec.build().unwrap().as_ref()));
-    }
-}
-
-#[test]
-fn data_terms() {
-    for spec in each::<dyn DataTermSpec>(&[]) {
-        expect(check_data_term(spec.build().unwrap().as_ref()));
-    }
-}
-
-#[test]
-fn regularizers() {
-    for spec in each::<dyn RegularizerSpec>(&[json!({"type": "total-variation", "weight": {"fixed": 0.1}, "inner": 1})])
-    {
-        expect(check_regularizer(spec.build().unwrap().as_ref()));
+        check(kind, &settings, 0, &|o| o);
     }
 }
 
 #[test]
 fn ray_projectors() {
     for settings in [
-        json!({"type": "ray-march"}),
         json!({"type": "ray-march", "samples": 1}),
         json!({"type": "ray-march", "samples": 9, "sampling": "end-to-end"}),
         json!({"type": "ray-march", "sampling": "stratified", "extent": "clipped"}),
         json!({"type": "ray-march", "step_mm": 3.0, "extent": "published"}),
     ] {
-        let spec: Box<dyn ProjectorSpec> = serde_json::from_value(settings).unwrap();
-        let projector = spec.build().unwrap();
-        expect(check_projector(projector.as_ref()));
-        assert!(projector.wgsl().is_some());
-        if let Some(shared) = device::shared("the WGSL of a projector") {
-            expect(check_projector_wgsl(projector.as_ref(), &|p, rays| shared.samples(p, rays)));
-        }
+        check(Kind::Projector, &settings, 0, &|o| o);
     }
 }
 
+/// Settings are written and read again, and those out of range are refused by name.
 #[test]
-fn random_initializer() {
-    let spec: Box<dyn InitializerSpec> = serde_json::from_value(json!({"type": "random"})).unwrap();
-    expect(check_initializer(spec.build(&|_| Ok(Weights::default())).unwrap().as_ref()));
-}
-
-fn loss(loss: &dyn Loss) {
-    expect(check_loss(loss));
-    assert!(loss.wgsl().is_some(), "{} offers no WGSL", loss.describe());
-    if let Some(shared) = device::shared("the WGSL of a loss") {
-        expect(check_loss_wgsl(loss, &|l, pairs| shared.losses(l, pairs)));
-    }
-}
-
-/// Every registered loss by its defaults, and with `more` settings.
-#[test]
-fn losses() {
-    let more = [("huber", json!({"delta": 0.5})), ("huber", json!({"delta": 3.0}))];
-    let all = names(Kind::Loss).into_iter().map(|name| (name, json!({}))).chain(more);
-    for (name, settings) in all {
-        expect(check_settings::<dyn LossSpec>(name, &settings));
-        let mut table = settings;
-        table["type"] = json!(name);
-        let built = read::<dyn LossSpec>(table).unwrap().build().unwrap();
-        loss(built.as_ref());
-        if let Some(fitted) = ready(built.as_ref()) {
-            loss(fitted.as_ref());
-        }
-    }
-    let refused = read::<dyn LossSpec>(json!({"type": "huber", "delta": 0.0})).unwrap().build().err().unwrap();
-    assert!(refused.to_string().contains("delta"), "{refused}");
-}
-
-/// Every registered prior by its defaults, and with `more` settings.
-#[test]
-fn priors() {
-    let more = [
-        ("total-variation", json!({"edge": 2, "blocks": 3, "smoothing": 0.01})),
-        ("total-variation", json!({"edge": 5, "weight": 0.0, "spacing": 2.5, "smoothing": 0.3})),
+fn losses_and_priors() {
+    let losses = [json!({"type": "huber", "delta": 0.5}), json!({"type": "huber", "delta": 3.0})];
+    let priors = [
+        json!({"type": "total-variation", "edge": 2, "blocks": 3, "smoothing": 0.01}),
+        json!({"type": "total-variation", "edge": 5, "weight": 0.0, "spacing": 2.5, "smoothing": 0.3}),
     ];
-    let all = names(Kind::Prior).into_iter().map(|name| (name, json!({}))).chain(more);
-    for (name, settings) in all {
-        expect(check_settings::<dyn PriorSpec>(name, &settings));
-        let mut table = settings;
-        table["type"] = json!(name);
-        let built = read::<dyn PriorSpec>(table).unwrap().build().unwrap();
-        expect(check_prior(built.as_ref()));
-        assert!(built.wgsl().is_some(), "{} offers no WGSL", built.describe());
-        if let Some(shared) = device::shared("the WGSL of a prior") {
-            expect(check_prior_wgsl(built.as_ref(), &|p, values| shared.penalty(p, values)));
-        }
+    let defaults = |kind| stage_types().into_iter().filter(move |t| t.kind == kind).map(|t| json!({"type": t.name}));
+    for settings in defaults(Kind::Loss).chain(losses) {
+        expect(check_settings::<dyn LossSpec>(settings["type"].as_str().unwrap(), &settings));
+        check(Kind::Loss, &settings, 0, &|o| o);
     }
-    for wrong in ["edge", "blocks", "spacing", "smoothing"] {
-        let settings = json!({"type": "total-variation", wrong: 0});
-        let refused = read::<dyn PriorSpec>(settings).unwrap().build().err().unwrap();
+    for settings in defaults(Kind::Prior).chain(priors) {
+        expect(check_settings::<dyn PriorSpec>(settings["type"].as_str().unwrap(), &settings));
+        check(Kind::Prior, &settings, 0, &|o| o);
+    }
+    for (kind, wrong) in [
+        (Kind::Loss, "delta"),
+        (Kind::Prior, "edge"),
+        (Kind::Prior, "blocks"),
+        (Kind::Prior, "spacing"),
+        (Kind::Prior, "smoothing"),
+    ] {
+        let name = if kind == Kind::Loss { "huber" } else { "total-variation" };
+        let refused = try_check(kind, &json!({"type": name, wrong: 0.0}), 0, &|o| o).unwrap_err();
         assert!(refused.to_string().contains(wrong), "{refused}");
+    }
+}
+
+/// Every built-in stage that computes anything runs on a device, except those that combine the samples of a ray.
+#[test]
+fn built_in_stages_have_wgsl() {
+    let on_the_cpu = ["line-attention", "line-transformer"];
+    for t in stage_types().into_iter().filter(|t| !on_the_cpu.contains(&t.name)) {
+        let offers = |has: bool| assert!(has, "{} {} offers no WGSL", t.kind, t.name);
+        match t.kind {
+            Kind::Encoder => offers(read::<dyn EncoderSpec>(t.example()).unwrap().build().unwrap().wgsl().is_some()),
+            Kind::Loss => offers(read::<dyn LossSpec>(t.example()).unwrap().build().unwrap().wgsl().is_some()),
+            Kind::Prior => offers(read::<dyn PriorSpec>(t.example()).unwrap().build().unwrap().wgsl().is_some()),
+            Kind::Projector => {
+                offers(read::<dyn ProjectorSpec>(t.example()).unwrap().build().unwrap().wgsl().is_some());
+            }
+            _ => {}
+        }
     }
 }

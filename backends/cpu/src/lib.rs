@@ -5,11 +5,10 @@
 //! processes its share in groups: normalize, evaluate the field, integrate, compute the loss and run backward, tile by
 //! tile, while a tile is in the cache ([`rows`]). Dense stages sum their gradients in one copy per slot, merged in
 //! order. Stages with scattered parameters process the rows of the wave a second time, each worker with its own range
-//! of parameters ([`step`]). A field with line integrals of its own takes another path ([`lines`]). The number of slots
+//! of parameters ([`step`]). The number of slots
 //! and the order of every sum depend on the plan only, so that results are bit-identical on any number of threads.
 
 pub mod adam;
-pub mod lines;
 pub mod rows;
 pub mod step;
 
@@ -97,24 +96,16 @@ impl Executable for CpuExecutable {
         }
         self.clean = false;
         let pipeline = &model.pipeline;
-        let lines = pipeline.field.lines();
-        let sampled = Work { rays: if lines.is_some() { &[] } else { work.rays }, ..work.clone() };
-        let mut stats = StepStats::default();
-        if lines.is_none() || !work.points.is_empty() || !work.priors.is_empty() {
-            stats = self.slots.get_or_insert_with(|| Slots::new(&kernels)).step(
-                &kernels,
-                pipeline.projector.as_ref(),
-                &model.arena.params,
-                &mut model.arena.grads,
-                &sampled,
-            );
+        if pipeline.field.lines().is_some() {
+            return Err(Error::unsupported(pipeline.field.describe(), "its method trains it"));
         }
-        if let Some(lines) = lines {
-            // Such a field is the only stage: the arena is its own.
-            let (params, grads) = (&model.arena.params, &mut model.arena.grads);
-            stats.loss += lines::step(pipeline.field.as_ref(), lines, params, grads, work);
-            stats.samples += work.rays.len() as u64;
-        }
+        let stats = self.slots.get_or_insert_with(|| Slots::new(&kernels)).step(
+            &kernels,
+            pipeline.projector.as_ref(),
+            &model.arena.params,
+            &mut model.arena.grads,
+            work,
+        );
         pipeline.fault()?;
         work.fault()?;
         Ok(stats)
@@ -151,7 +142,8 @@ impl Executable for CpuExecutable {
 
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()> {
         if let Some(lines) = model.pipeline.field.lines() {
-            lines::project(lines, &model.arena.params, rays, out);
+            let parts = out.par_chunks_mut(CHUNK_RAYS).zip(rays.par_chunks(CHUNK_RAYS));
+            parts.for_each(|(out, rays)| lines.project(&model.arena.params, rays, out));
             return model.pipeline.fault();
         }
         let kernels = kernels(&model.pipeline);

@@ -12,12 +12,11 @@ use conefield_core::error::Result;
 use conefield_core::loss::Loss;
 use conefield_core::prior::Prior;
 use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
+use conefield_core::wgsl::Runner;
 use wgpu::BufferUsages as U;
 
-impl Shared {
-    /// Runs a stage forward and backward on `x` and `dy`, channel-major with `rows` rows. Returns its outputs, the
-    /// gradients of its parameters and those of its inputs.
-    pub fn pass(&self, stage: &dyn Stage, params: &[f32], x: &[f32], dy: &[f32], rows: usize) -> Result<[Vec<f32>; 3]> {
+impl Runner for Shared {
+    fn pass(&self, stage: &dyn Stage, params: &[f32], x: &[f32], dy: &[f32], rows: usize) -> Result<[Vec<f32>; 3]> {
         let (gpu, target) = (&self.gpu, self.target());
         let chain = Chain::single(stage, target)?;
         let info = stage.info();
@@ -63,8 +62,7 @@ impl Shared {
         Ok([y?, arena.grads.to_vec(), dx?])
     }
 
-    /// The samples of `rays`, each with its seed where positions are random.
-    pub fn samples(&self, projector: &dyn Projector, rays: &[(UnitRay, Option<u64>)]) -> Result<Vec<Samples>> {
+    fn samples(&self, projector: &dyn Projector, rays: &[(UnitRay, Option<u64>)]) -> Result<Vec<Samples>> {
         let gpu = &self.gpu;
         let mut all = vec![];
         let source = compose::sample(projector)?;
@@ -104,8 +102,7 @@ impl Shared {
         Ok(all)
     }
 
-    /// A loss and its derivative at pairs of a predicted and a measured value.
-    pub fn losses(&self, loss: &dyn Loss, pairs: &[[f32; 2]]) -> Result<Vec<[f32; 2]>> {
+    fn losses(&self, loss: &dyn Loss, pairs: &[[f32; 2]]) -> Result<Vec<[f32; 2]>> {
         // A kernel adds up the losses of 64 points: each pair stands for as many.
         let each = GROUP as usize;
         let of = |k: usize| pairs.iter().flat_map(|p| vec![p[k]; each]).collect::<Vec<f32>>();
@@ -117,8 +114,7 @@ impl Shared {
         Ok(sums.iter().zip(slopes.iter().step_by(each)).map(|(sum, slope)| [sum / each as f32, *slope]).collect())
     }
 
-    /// A prior's penalty of one block with these values, and its derivative by each of them.
-    pub fn penalty(&self, prior: &dyn Prior, values: &[f32]) -> Result<(f32, Vec<f32>)> {
+    fn penalty(&self, prior: &dyn Prior, values: &[f32]) -> Result<(f32, Vec<f32>)> {
         let rows = values.len() as u32;
         let step = Step { rows, blocks: 1, edge: prior.blocks().edge as u32, block_scale: 1.0, ..Step::default() };
         let source = compose::penalty_of_blocks(prior)?;
@@ -126,7 +122,9 @@ impl Shared {
         let [sum, slopes] = self.derivatives("penalty of blocks", &source, step, &inputs, 1)?;
         Ok((sum[0], slopes))
     }
+}
 
+impl Shared {
     /// Runs a kernel that makes derivatives by μ, a group for each of the `losses`. Returns these and the derivatives.
     fn derivatives(
         &self,

@@ -1,7 +1,7 @@
 //! A pipeline with stages of plugins gives the same bits as the same code built in, for weights and volume, also after
 //! a kill.
 
-use crate::build::{cargo, example, library, sources};
+use crate::build::example;
 use crate::common::{conefield, done, json, refused, text};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::{Backend, BlockWork, Work};
@@ -235,8 +235,7 @@ fn mapping_consistency() {
 #[test]
 fn initializers_of_plugins() {
     let place = place();
-    cargo(&sources().join("plugins/tests"), &["build", "--release", "--locked", "-p", "rehashed"]);
-    let plugin = text(&library("rehashed"));
+    let plugin = text(&example("rehashed"));
     let [scan, weights] = [&place.scan, &place.dir.path().join("weights.safetensors")].map(|p| text(p));
     let small = ["--set", "encoder.log2_table_size=10", "--set", "pretraining.points=200", "--steps", "20"];
     done(&[&["pretrain", "phantom:head:16", "--spec", "fast", "-o", &weights][..], &small].concat());
@@ -278,8 +277,7 @@ fn initializers_of_plugins() {
 #[test]
 fn masks_of_plugins() {
     let place = place();
-    cargo(&sources().join("plugins/tests"), &["build", "--release", "--locked", "-p", "rehashed"]);
-    let plugin = text(&library("rehashed"));
+    let plugin = text(&example("rehashed"));
     let runs = ["hash-grid", "rehashed"].map(|encoder| {
         let spec = text(&place.dir.path().join(format!("{encoder}.toml")));
         let lines = format!(

@@ -22,8 +22,6 @@ pub fn cargo(folder: &Path, args: &[&str]) {
     let _one = CARGO.lock().unwrap_or_else(|e| e.into_inner());
     let mut command = Command::new(env!("CARGO"));
     command.current_dir(folder).args(args).env("CARGO_TARGET_DIR", target());
-    // Compiling takes longer than the plugins' computations here.
-    command.env("CARGO_PROFILE_RELEASE_OPT_LEVEL", "1");
     let output = command.output().expect("cargo starts");
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "cargo {args:?} in {}: {said}", folder.display());
@@ -35,7 +33,7 @@ pub fn library(name: &str) -> PathBuf {
     target().join("release").join(format!("{}{name}{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX))
 }
 
-/// The example plugins in Rust, built.
+/// A plugin of the workspace of examples, built.
 pub fn example(name: &str) -> PathBuf {
     cargo(&sources().join("plugins/examples"), &["build", "--release", "--locked", "-p", name]);
     library(name)

@@ -7,7 +7,6 @@ use crate::common::{done, json, text};
 fn rust_examples_pass_their_own_tests() {
     let folder = sources().join("plugins/examples");
     cargo(&folder, &["fmt", "--all", "--check"]);
-    cargo(&sources().join("plugins/tests"), &["fmt", "--all", "--check"]);
     cargo(&folder, &["test", "--release", "--locked"]);
 }
 

@@ -1,7 +1,7 @@
 //! Plugins with one fault each, and the outcome: refused when loaded, refused in the trial, found by the check, or an
 //! error of the run. `faulty.md` is generated from this; `CONEFIELD_BLESS=1` writes it.
 
-use crate::build::{cargo, cc, library, sources};
+use crate::build::{cc, example, sources};
 use crate::common::{conefield, done, text};
 use rayon::prelude::*;
 use std::fmt::Write as _;
@@ -114,7 +114,7 @@ const PRIOR_FAULTS: &[Fault] = faults! {
     fault "a prior's gradient that overwrites", "OVERWRITES", ["", "gradients add", ""];
 };
 
-/// Faults of parts of iterative methods and of line fields: `faulty_pieces.c`, with the spec that uses them.
+/// Faults of parts of iterative methods: `faulty_pieces.c`, with the spec that uses them.
 const PIECE_FAULTS: &[(&str, &[Fault])] = &[
     (
         "prior.type=faulty",
@@ -160,18 +160,6 @@ const PIECE_FAULTS: &[(&str, &[Fault])] = &[
             untried "a basis that fails", "B_FAILS", "expand failed: no more numbers";
             fault "an adjoint that is 1 % too long", "B_LONG_ADJOINT", ["", "adjoint: single precision", ""];
             fault "a basis that fails later", "B_LATER", ["", "no fault", "expand failed: no more numbers"];
-        },
-    ),
-    (
-        "field.type=faulty",
-        faults! {
-            untried "a line field without line integrals", "L_NO_LINES", "it has no line integrals of its own";
-            untried "a line field that writes past its line integrals", "L_PAST",
-                "it writes outside its line integrals: 1 past 4 numbers";
-            untried "a line integral of a ray that is not inside", "L_MISSED",
-                "refused: a ray that is not inside has a line integral";
-            fault "an adjoint of line integrals that is 10 % too long", "L_LONG_ADJOINT",
-                ["", "lines: finite differences", ""];
         },
     ),
 ];
@@ -268,16 +256,7 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
     let encoder = of_fast(&["encoder.type=faulty", "--set", "projector.samples=16"]);
     let [rays, loss, prior] =
         ["projector.type=faulty", "loss.type=faulty", "priors.0.type=faulty"].map(|set| of_fast(&[set]));
-    let lines = dir.path().join("lines.toml");
-    std::fs::write(&lines, "type = 'line-field'\nfield = 'voxels-joseph'\ntraining = { steps = 20, rays = 16 }\n")
-        .unwrap();
-    let lines = text(&lines);
-    let of_piece = |set: &'static str| -> Vec<&str> {
-        match set.starts_with("field") {
-            true => vec!["--spec", &lines, "--set", set],
-            false => vec!["--spec", "fista", "--steps", "40", "--set", set],
-        }
-    };
+    let of_piece = |set: &'static str| vec!["--spec", "fista", "--steps", "40", "--set", set];
     let pieces =
         PIECE_FAULTS.iter().flat_map(|(set, faults)| faults.iter().map(|f| (f, "faulty_pieces.c", of_piece(set))));
     let all = FAULTS
@@ -306,8 +285,7 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         Row::of(fault.what, [&list, &check, &run], [fault.list, fault.check, fault.reconstruct])
     });
     let mut rows: Vec<Row> = rows.collect();
-    cargo(&sources().join("plugins/tests"), &["build", "--release", "--locked", "-p", "panics"]);
-    let panics = library("panics");
+    let panics = example("panics");
     let folder = panics.parent().unwrap();
     for (i, (what, when, [check, run])) in PANICS.iter().enumerate() {
         let library = text(&panics);

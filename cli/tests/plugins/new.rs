@@ -5,9 +5,8 @@ use crate::common::{done, json, refused, text};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-const KINDS: [&str; 11] = [
-    "encoder", "normalizer", "field", "line-field", "projector", "initializer", "loss", "prior", "regularizer",
-    "data-term", "basis",
+const KINDS: [&str; 10] = [
+    "encoder", "normalizer", "field", "projector", "initializer", "loss", "prior", "regularizer", "data-term", "basis",
 ];
 
 /// Kinds that are parts of iterative methods.
@@ -42,26 +41,39 @@ fn use_it(kind: &str, folder: &Path, library: &Path, scan: &Path) -> serde_json:
     record
 }
 
+/// Makes a plugin of every kind in `dir`, as one workspace with the profile and the versions of the examples: nothing else
+/// is downloaded, and what the examples' builds have compiled is used again.
+fn workspace(dir: &Path) {
+    let examples = sources().join("plugins/examples");
+    for kind in KINDS {
+        let name = format!("new-{kind}");
+        let said = done(&["plugins", "new", &name, "--kind", kind, "--lang", "rust", "--into", &text(dir)]);
+        assert!(said.contains("cargo build --release") && said.contains("some minutes"), "{said}");
+        let path = dir.join(&name).join("Cargo.toml");
+        let manifest = std::fs::read_to_string(&path).unwrap();
+        // Paths of this machine would not mean anything on another.
+        assert!(manifest.contains("path = \"../"), "{manifest}");
+        let (package, alone) = manifest.split_once("# Independent of any enclosing workspace.").unwrap();
+        assert_eq!(alone.trim(), "[workspace]");
+        std::fs::write(path, package).unwrap();
+    }
+    let profile = std::fs::read_to_string(examples.join("Cargo.toml")).unwrap();
+    let profile = &profile[profile.find("[profile.release]").unwrap()..];
+    let workspace = format!("[workspace]\nresolver = \"3\"\nmembers = [\"new-*\"]\n\n{profile}");
+    std::fs::write(dir.join("Cargo.toml"), workspace).unwrap();
+    std::fs::copy(examples.join("Cargo.lock"), dir.join("Cargo.lock")).unwrap();
+}
+
 #[test]
 fn in_rust() {
     let dir = tempfile::tempdir().unwrap();
     let scan = scan(dir.path());
+    workspace(dir.path());
+    cargo(dir.path(), &["build", "--release"]);
+    cargo(dir.path(), &["test", "--release", "-p", "new-encoder"]);
     for kind in KINDS {
         let name = format!("new-{kind}");
-        let into = text(dir.path());
-        let said = done(&["plugins", "new", &name, "--kind", kind, "--lang", "rust", "--into", &into]);
-        assert!(said.contains("cargo build --release") && said.contains("some minutes"), "{said}");
-        let folder = dir.path().join(&name);
-        // Paths of this machine would not mean anything on another.
-        let manifest = std::fs::read_to_string(folder.join("Cargo.toml")).unwrap();
-        assert!(manifest.contains("path = \"../"), "{manifest}");
-        // The versions of this build, so that nothing else is downloaded.
-        std::fs::copy(sources().join("Cargo.lock"), folder.join("Cargo.lock")).unwrap();
-        cargo(&folder, &["build", "--release"]);
-        if kind == "encoder" {
-            cargo(&folder, &["test", "--release"]);
-        }
-        let record = use_it(kind, &folder, &library(&name), &scan);
+        let record = use_it(kind, &dir.path().join(&name), &library(&name), &scan);
         assert_eq!(record["plugins"][0]["name"], name.as_str());
         assert_eq!(record["plugins"][0]["version"], "0.1.0");
         assert_eq!(record["steps"], 12);

@@ -89,7 +89,7 @@ fn plugins_are_found_where_they_are_looked_for() {
     assert_eq!(found["plugins"][0]["place"], "environment");
     let found = list(conefield(&["plugins", "list", "--json", "--plugin"]).arg(&library));
     assert_eq!(found["plugins"][0]["place"], "named");
-    assert_eq!(found["plugins"][0]["plugin"]["abi"], "3.0");
+    assert_eq!(found["plugins"][0]["plugin"]["abi"], "4.0");
     // The same file twice counts as one plugin.
     let found =
         list(conefield(&["plugins", "list", "--json"]).env("XDG_DATA_HOME", &home).arg("--plugin").arg(&library));

@@ -1,4 +1,4 @@
-/* The contract between conefield and its plugins, version 3.0. Made from plugins/abi/src/lib.rs. */
+/* The contract between conefield and its plugins, version 4.0. Made from plugins/abi/src/lib.rs. */
 
 #ifndef CONEFIELD_PLUGIN_H
 #define CONEFIELD_PLUGIN_H
@@ -9,7 +9,7 @@
 /*
  Major version of this contract. Plugins with another one are refused.
  */
-#define CONEFIELD_ABI_MAJOR 3
+#define CONEFIELD_ABI_MAJOR 4
 
 /*
  Minor version: increases whenever tables grow.
@@ -65,11 +65,6 @@
  Coefficients to voxels, for iterative methods.
  */
 #define CONEFIELD_BASIS 9
-
-/*
- A field with line integrals of its own.
- */
-#define CONEFIELD_LINE_FIELD 10
 
 /*
  A row depends on itself only.
@@ -380,33 +375,7 @@ typedef struct ConefieldReduced {
 } ConefieldReduced;
 
 /*
- A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.
- */
-typedef struct ConefieldRay {
-  /*
-   Start.
-   */
-  float origin[3];
-  /*
-   Unit vector.
-   */
-  float direction[3];
-  /*
-   Entry into and exit from the reconstruction box; equal if the ray misses it.
-   */
-  float inside[2];
-  /*
-   Beginning and end of the published sampling range (near, far).
-   */
-  float published[2];
-  /*
-   Cube sides per millimetre.
-   */
-  float per_mm;
-} ConefieldRay;
-
-/*
- Functions of an encoder, normalizer, field or line field. `stage` is the result of `create`.
+ Functions of an encoder, normalizer or field. `stage` is the result of `create`.
  */
 typedef struct ConefieldMap {
   /*
@@ -517,47 +486,33 @@ typedef struct ConefieldMap {
                                  double *cells,
                                  size_t count,
                                  struct ConefieldText *error);
-  /*
-   For a line field: overwrites `out` with the line integrals of `count` rays, in cube sides; 0 for a ray that
-   misses the box. NULL otherwise.
-   */
-  ConefieldStatus (*project)(const void *stage,
-                             const float *params,
-                             const struct ConefieldRay *rays,
-                             size_t count,
-                             float *out,
-                             struct ConefieldText *error);
-  /*
-   The adjoint of `project`: given `dlines` = ∂L/∂out, adds ∂L/∂params to `grads`. The summation order of a
-   parameter's gradient must not depend on the range in `grads`. NULL if `project` is NULL.
-   */
-  ConefieldStatus (*backproject)(const void *stage,
-                                 const float *params,
-                                 const struct ConefieldRay *rays,
-                                 size_t count,
-                                 const float *dlines,
-                                 struct ConefieldGrads grads,
-                                 struct ConefieldText *error);
-  /*
-   `project` in double precision, for checking gradients. Required for a line field.
-   */
-  ConefieldStatus (*project_f64)(const void *stage,
-                                 const double *params,
-                                 const struct ConefieldRay *rays,
-                                 size_t count,
-                                 double *out,
-                                 struct ConefieldText *error);
-  /*
-   `backproject` in double precision. Required for a line field.
-   */
-  ConefieldStatus (*backproject_f64)(const void *stage,
-                                     const double *params,
-                                     const struct ConefieldRay *rays,
-                                     size_t count,
-                                     const double *dlines,
-                                     struct ConefieldGrads64 grads,
-                                     struct ConefieldText *error);
 } ConefieldMap;
+
+/*
+ A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.
+ */
+typedef struct ConefieldRay {
+  /*
+   Start.
+   */
+  float origin[3];
+  /*
+   Unit vector.
+   */
+  float direction[3];
+  /*
+   Entry into and exit from the reconstruction box; equal if the ray misses it.
+   */
+  float inside[2];
+  /*
+   Beginning and end of the published sampling range (near, far).
+   */
+  float published[2];
+  /*
+   Cube sides per millimetre.
+   */
+  float per_mm;
+} ConefieldRay;
 
 /*
  Lengths of a scene that projector settings may be relative to.
@@ -1107,7 +1062,7 @@ typedef struct ConefieldStage {
    */
   ConefieldStatus (*describe)(const void *stage, struct ConefieldText *text);
   /*
-   Functions of an encoder, normalizer, field or line field; otherwise NULL.
+   Functions of an encoder, normalizer or field; otherwise NULL.
    */
   const struct ConefieldMap *map;
   /*

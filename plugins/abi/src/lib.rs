@@ -22,7 +22,7 @@
 use std::ffi::c_void;
 
 /// Major version of this contract. Plugins with another one are refused.
-pub const CONEFIELD_ABI_MAJOR: u32 = 3;
+pub const CONEFIELD_ABI_MAJOR: u32 = 4;
 /// Minor version: increases whenever tables grow.
 pub const CONEFIELD_ABI_MINOR: u32 = 0;
 
@@ -59,8 +59,26 @@ pub const CONEFIELD_REGULARIZER: u32 = 7;
 pub const CONEFIELD_DATA_TERM: u32 = 8;
 /// Coefficients to voxels, for iterative methods.
 pub const CONEFIELD_BASIS: u32 = 9;
-/// A field with line integrals of its own.
-pub const CONEFIELD_LINE_FIELD: u32 = 10;
+
+/// Hands the macro `$then` every kind: for each table of functions its type, its field in [`ConefieldStage`], the
+/// functions that it must have, and the kinds that use it, by conefield's name and by their code. The host's dispatch, its
+/// checks and the exports of Rust plugins are made from this list.
+#[macro_export]
+macro_rules! kinds {
+    ($then:ident) => {
+        $then! {
+            ConefieldMap map [info forward backward]:
+                Encoder CONEFIELD_ENCODER, Normalizer CONEFIELD_NORMALIZER, Field CONEFIELD_FIELD;
+            ConefieldProjector projector [max_samples sample]: Projector CONEFIELD_PROJECTOR;
+            ConefieldInitializer initializer [apply]: Initializer CONEFIELD_INITIALIZER;
+            ConefieldLoss loss [at]: Loss CONEFIELD_LOSS;
+            ConefieldPrior prior [blocks block]: Prior CONEFIELD_PRIOR;
+            ConefieldRegularizer regularizer [on weight value prox]: Regularizer CONEFIELD_REGULARIZER;
+            ConefieldDataTerm data_term [of noise differentiate curve spread]: DataTerm CONEFIELD_DATA_TERM;
+            ConefieldBasis basis [on info expand adjoint]: Basis CONEFIELD_BASIS;
+        }
+    };
+}
 
 /// A row depends on itself only.
 pub const CONEFIELD_SCOPE_ROW: u32 = 0;
@@ -249,7 +267,7 @@ pub struct ConefieldReduced {
     pub channels_count: usize,
 }
 
-/// Functions of an encoder, normalizer, field or line field. `stage` is the result of `create`.
+/// Functions of an encoder, normalizer or field. `stage` is the result of `create`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ConefieldMap {
@@ -365,54 +383,6 @@ pub struct ConefieldMap {
             stage: *const c_void,
             cells: *mut f64,
             count: usize,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// For a line field: overwrites `out` with the line integrals of `count` rays, in cube sides; 0 for a ray that
-    /// misses the box. NULL otherwise.
-    pub project: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            params: *const f32,
-            rays: *const ConefieldRay,
-            count: usize,
-            out: *mut f32,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// The adjoint of `project`: given `dlines` = ∂L/∂out, adds ∂L/∂params to `grads`. The summation order of a
-    /// parameter's gradient must not depend on the range in `grads`. NULL if `project` is NULL.
-    pub backproject: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            params: *const f32,
-            rays: *const ConefieldRay,
-            count: usize,
-            dlines: *const f32,
-            grads: ConefieldGrads,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// `project` in double precision, for checking gradients. Required for a line field.
-    pub project_f64: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            params: *const f64,
-            rays: *const ConefieldRay,
-            count: usize,
-            out: *mut f64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// `backproject` in double precision. Required for a line field.
-    pub backproject_f64: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            params: *const f64,
-            rays: *const ConefieldRay,
-            count: usize,
-            dlines: *const f64,
-            grads: ConefieldGrads64,
             error: *mut ConefieldText,
         ) -> ConefieldStatus,
     >,
@@ -914,7 +884,7 @@ pub struct ConefieldStage {
     pub destroy: Option<unsafe extern "C" fn(stage: *mut c_void)>,
     /// A one-line description of a stage, such as `10 levels x 2`.
     pub describe: Option<unsafe extern "C" fn(stage: *const c_void, text: *mut ConefieldText) -> ConefieldStatus>,
-    /// Functions of an encoder, normalizer, field or line field; otherwise NULL.
+    /// Functions of an encoder, normalizer or field; otherwise NULL.
     pub map: *const ConefieldMap,
     /// Functions of a projector; otherwise NULL.
     pub projector: *const ConefieldProjector,

@@ -18,7 +18,7 @@ fn the_header_is_current() {
         style: cbindgen::Style::Both,
         documentation_style: cbindgen::DocumentationStyle::C,
         header: Some(
-            "/* The contract between conefield and its plugins, version 3.0. Made from plugins/abi/src/lib.rs. */"
+            "/* The contract between conefield and its plugins, version 4.0. Made from plugins/abi/src/lib.rs. */"
                 .into(),
         ),
         trailer: Some(
@@ -54,7 +54,7 @@ fn the_header_is_current() {
 #[test]
 #[cfg(target_pointer_width = "64")]
 fn the_layout_is_pinned() {
-    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (3, 0));
+    assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (4, 0));
     let sizes = [
         size_of::<ConefieldStr>(),
         size_of::<ConefieldText>(),
@@ -85,129 +85,41 @@ fn the_layout_is_pinned() {
         size_of::<ConefieldStage>(),
         size_of::<ConefieldPlugin>(),
     ];
-    let first = [16, 24, 32, 32, 24, 80, 32, 16, 40, 144, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32];
+    let first = [16, 24, 32, 32, 24, 80, 32, 16, 40, 112, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32];
     assert_eq!(sizes[..20], first);
     assert_eq!(sizes[20..], [72, 32, 64, 56, 88, 56, 152, 88]);
-    let plugin = [
-        offset_of!(ConefieldPlugin, size),
-        offset_of!(ConefieldPlugin, abi_major),
-        offset_of!(ConefieldPlugin, abi_minor),
-        offset_of!(ConefieldPlugin, name),
-        offset_of!(ConefieldPlugin, version),
-        offset_of!(ConefieldPlugin, licence),
-        offset_of!(ConefieldPlugin, stages),
-        offset_of!(ConefieldPlugin, stage_count),
-        offset_of!(ConefieldPlugin, stage_size),
-    ];
+    macro_rules! offsets {
+        ($table:ident: $($field:ident)*) => { [$(offset_of!($table, $field)),*] };
+    }
+    let plugin = offsets!(ConefieldPlugin: size abi_major abi_minor name version licence stages stage_count stage_size);
     assert_eq!(plugin, [0, 8, 12, 16, 32, 48, 64, 72, 80]);
-    let stage = [
-        offset_of!(ConefieldStage, kind),
-        offset_of!(ConefieldStage, name),
-        offset_of!(ConefieldStage, doc),
-        offset_of!(ConefieldStage, schema),
-        offset_of!(ConefieldStage, context),
-        offset_of!(ConefieldStage, create),
-        offset_of!(ConefieldStage, destroy),
-        offset_of!(ConefieldStage, describe),
-        offset_of!(ConefieldStage, map),
-        offset_of!(ConefieldStage, projector),
-        offset_of!(ConefieldStage, initializer),
-        offset_of!(ConefieldStage, loss),
-        offset_of!(ConefieldStage, prior),
-        offset_of!(ConefieldStage, regularizer),
-        offset_of!(ConefieldStage, data_term),
-        offset_of!(ConefieldStage, basis),
-    ];
+    let stage = offsets! { ConefieldStage:
+        kind name doc schema context create destroy describe map projector initializer loss prior regularizer data_term
+        basis
+    };
     assert_eq!(stage, [0, 8, 24, 40, 56, 64, 72, 80, 88, 96, 104, 112, 120, 128, 136, 144]);
-    let map = [
-        offset_of!(ConefieldMap, size),
-        offset_of!(ConefieldMap, info),
-        offset_of!(ConefieldMap, parameter),
-        offset_of!(ConefieldMap, init),
-        offset_of!(ConefieldMap, forward),
-        offset_of!(ConefieldMap, backward),
-        offset_of!(ConefieldMap, forward_f64),
-        offset_of!(ConefieldMap, backward_f64),
-        offset_of!(ConefieldMap, partition),
-        offset_of!(ConefieldMap, reduce),
-        offset_of!(ConefieldMap, wgsl),
-        offset_of!(ConefieldMap, passes),
-        offset_of!(ConefieldMap, forward_pass),
-        offset_of!(ConefieldMap, resolutions),
-        offset_of!(ConefieldMap, project),
-        offset_of!(ConefieldMap, backproject),
-        offset_of!(ConefieldMap, project_f64),
-        offset_of!(ConefieldMap, backproject_f64),
-    ];
-    let at: Vec<usize> = (0..18).map(|i| 8 * i).collect();
-    assert_eq!(map[..], at);
-    let projector = [
-        offset_of!(ConefieldProjector, size),
-        offset_of!(ConefieldProjector, max_samples),
-        offset_of!(ConefieldProjector, sample),
-        offset_of!(ConefieldProjector, integrate),
-        offset_of!(ConefieldProjector, adjoint),
-        offset_of!(ConefieldProjector, fitted),
-        offset_of!(ConefieldProjector, wgsl),
-    ];
-    assert_eq!(projector, [0, 8, 16, 24, 32, 40, 48]);
-    let info = [
-        offset_of!(ConefieldInfo, input),
-        offset_of!(ConefieldInfo, output),
-        offset_of!(ConefieldInfo, params),
-        offset_of!(ConefieldInfo, blocks),
-        offset_of!(ConefieldInfo, partitions),
-        offset_of!(ConefieldInfo, tape),
-        offset_of!(ConefieldInfo, macs),
-        offset_of!(ConefieldInfo, scope),
-        offset_of!(ConefieldInfo, grads),
-        offset_of!(ConefieldInfo, identity),
-        offset_of!(ConefieldInfo, coarse_to_fine),
-        offset_of!(ConefieldInfo, double_precision),
-    ];
+    // In the tables a pointer follows the other.
+    macro_rules! pointers {
+        ($($table:ident: $($field:ident)*;)*) => {$(
+            let found = offsets!($table: size $($field)*);
+            assert!(found.iter().enumerate().all(|(i, at)| *at == 8 * i), "{}: {found:?}", stringify!($table));
+            assert_eq!(8 * found.len(), size_of::<$table>(), "{}", stringify!($table));
+        )*};
+    }
+    pointers! {
+        ConefieldMap: info parameter init forward backward forward_f64 backward_f64 partition reduce wgsl passes forward_pass resolutions;
+        ConefieldProjector: max_samples sample integrate adjoint fitted wgsl;
+        ConefieldInitializer: apply check weights with_weights volume;
+        ConefieldLoss: at needs_scan fitted wgsl;
+        ConefieldPrior: blocks block wgsl;
+        ConefieldRegularizer: bytes on weight value prox state adapt;
+        ConefieldDataTerm: bytes of noise differentiate curve spread;
+        ConefieldBasis: on info expand adjoint expand_f64 adjoint_f64;
+    }
+    let info = offsets! { ConefieldInfo:
+        input output params blocks partitions tape macs scope grads identity coarse_to_fine double_precision
+    };
     assert_eq!(info, [0, 8, 16, 24, 32, 40, 48, 56, 60, 64, 68, 72]);
-}
-
-#[test]
-#[cfg(target_pointer_width = "64")]
-fn the_layout_of_pieces_of_iterative_methods_is_pinned() {
-    let regularizer = [
-        offset_of!(ConefieldRegularizer, size),
-        offset_of!(ConefieldRegularizer, bytes),
-        offset_of!(ConefieldRegularizer, on),
-        offset_of!(ConefieldRegularizer, weight),
-        offset_of!(ConefieldRegularizer, value),
-        offset_of!(ConefieldRegularizer, prox),
-        offset_of!(ConefieldRegularizer, state),
-    ];
-    let data_term = [
-        offset_of!(ConefieldDataTerm, size),
-        offset_of!(ConefieldDataTerm, bytes),
-        offset_of!(ConefieldDataTerm, of),
-        offset_of!(ConefieldDataTerm, noise),
-        offset_of!(ConefieldDataTerm, differentiate),
-        offset_of!(ConefieldDataTerm, curve),
-        offset_of!(ConefieldDataTerm, spread),
-    ];
-    let basis = [
-        offset_of!(ConefieldBasis, size),
-        offset_of!(ConefieldBasis, on),
-        offset_of!(ConefieldBasis, info),
-        offset_of!(ConefieldBasis, expand),
-        offset_of!(ConefieldBasis, adjoint),
-        offset_of!(ConefieldBasis, expand_f64),
-        offset_of!(ConefieldBasis, adjoint_f64),
-    ];
-    assert_eq!([regularizer, data_term, basis], [[0, 8, 16, 24, 32, 40, 48]; 3]);
-    assert_eq!(offset_of!(ConefieldRegularizer, adapt), 56);
-    let grid =
-        [offset_of!(ConefieldGrid, shape), offset_of!(ConefieldGrid, spacing), offset_of!(ConefieldGrid, center)];
-    assert_eq!(grid, [0, 24, 48]);
-    let expansion = [
-        offset_of!(ConefieldExpansion, coefficients),
-        offset_of!(ConefieldExpansion, scratch),
-        offset_of!(ConefieldExpansion, samples),
-        offset_of!(ConefieldExpansion, double_precision),
-    ];
-    assert_eq!(expansion, [0, 72, 80, 84]);
+    assert_eq!(offsets!(ConefieldGrid: shape spacing center), [0, 24, 48]);
+    assert_eq!(offsets!(ConefieldExpansion: coefficients scratch samples double_precision), [0, 72, 80, 84]);
 }

@@ -67,20 +67,20 @@ unsafe impl Send for Type {}
 // SAFETY: as above; nothing here is mutated.
 unsafe impl Sync for Type {}
 
-/// The function tables: the kinds that have them, their field in the stage's table, their size in the first minor
-/// version, and their required functions.
+/// Makes the functions of a stage, and their checks, from the list of the contract.
 macro_rules! tables {
-    ($($functions:ident($table:ident) $($code:ident $kind:ident)+: $field:ident, from $least:expr, needs [$($needed:ident)*];)*) => {
+    ($($table:ident $field:ident [$($needed:ident)*]: $($kind:ident $code:ident),+;)*) => {
         /// The functions of a stage.
         #[derive(Clone, Copy)]
+        #[allow(non_camel_case_types)]
         pub(crate) enum Functions {
-            $($functions($table),)*
+            $($field($table),)*
         }
 
         $(impl FunctionsOf for $table {
             fn of(functions: Functions) -> Option<Self> {
                 match functions {
-                    Functions::$functions(table) => Some(table),
+                    Functions::$field(table) => Some(table),
                     _ => None,
                 }
             }
@@ -89,23 +89,28 @@ macro_rules! tables {
         impl Functions {
             /// The kind of the stage `t` and its functions; `at` describes the stage in words.
             unsafe fn read(t: &ConefieldStage, place: &str, at: &str) -> Result<(Kind, Self)> {
-                $(
-                    let kind = match t.kind {
-                        $($code => Some(Kind::$kind),)+
-                        _ => None,
-                    };
-                    if let Some(kind) = kind {
+                match t.kind {
+                    $($($code)|+ => {
+                        let kind = [$(($code, Kind::$kind)),+].into_iter().find(|(code, _)| *code == t.kind);
+                        // A later minor version that adds functions needs the size of this one here.
+                        let least = size_of::<$table>();
                         // SAFETY: see the top of this file.
-                        let table = unsafe { sized(t.$field, place, &format!("{at}: functions"), $least)? };
+                        let table = unsafe { sized(t.$field, place, &format!("{at}: functions"), least)? };
                         $(ensure(table.$needed.is_some(), place, at, concat!("no function ", stringify!($needed)), "one")?;)*
-                        return Ok((kind, Self::$functions(table)));
-                    }
-                )*
-                Err(Error::invalid(place, at, format!("kind {}", t.kind), "0 to 10"))
+                        kind.map(|(_, kind)| (kind, Self::$field(table)))
+                    })*
+                    _ => None,
+                }
+                .ok_or_else(|| {
+                    let known = [$($($code),+),*].len() - 1;
+                    Error::invalid(place, at, format!("kind {}", t.kind), format!("0 to {known}"))
+                })
             }
         }
     };
 }
+
+conefield_plugin_abi::kinds! { tables }
 
 /// The functions of one kind of stage.
 pub(crate) trait FunctionsOf: Copy {
@@ -113,31 +118,13 @@ pub(crate) trait FunctionsOf: Copy {
     fn of(functions: Functions) -> Option<Self>;
 }
 
-tables! {
-    Map(ConefieldMap)
-        CONEFIELD_ENCODER Encoder CONEFIELD_NORMALIZER Normalizer CONEFIELD_FIELD Field CONEFIELD_LINE_FIELD LineField:
-        map, from size_of::<ConefieldMap>(), needs [info forward backward];
-    Projector(ConefieldProjector) CONEFIELD_PROJECTOR Projector:
-        projector, from size_of::<ConefieldProjector>(), needs [max_samples sample];
-    Initializer(ConefieldInitializer) CONEFIELD_INITIALIZER Initializer:
-        initializer, from size_of::<ConefieldInitializer>(), needs [apply];
-    Loss(ConefieldLoss) CONEFIELD_LOSS Loss: loss, from size_of::<ConefieldLoss>(), needs [at];
-    Prior(ConefieldPrior) CONEFIELD_PRIOR Prior: prior, from size_of::<ConefieldPrior>(), needs [blocks block];
-    Regularizer(ConefieldRegularizer) CONEFIELD_REGULARIZER Regularizer:
-        regularizer, from size_of::<ConefieldRegularizer>(), needs [on weight value prox];
-    DataTerm(ConefieldDataTerm) CONEFIELD_DATA_TERM DataTerm:
-        data_term, from size_of::<ConefieldDataTerm>(), needs [of noise differentiate curve spread];
-    Basis(ConefieldBasis) CONEFIELD_BASIS Basis:
-        basis, from size_of::<ConefieldBasis>(), needs [on info expand adjoint];
-}
-
 /// Checks dependencies between functions, beyond the required ones.
 fn consistent(functions: &Functions) -> Result<(), (&'static str, &'static str)> {
     match functions {
-        Functions::Projector(p) if p.integrate.is_some() != p.adjoint.is_some() => {
+        Functions::projector(p) if p.integrate.is_some() != p.adjoint.is_some() => {
             Err(("one of integrate and adjoint", "both or none"))
         }
-        Functions::Initializer(i) if i.weights.is_some() && i.with_weights.is_none() => {
+        Functions::initializer(i) if i.weights.is_some() && i.with_weights.is_none() => {
             Err(("no function with_weights", "one"))
         }
         _ => Ok(()),

@@ -18,8 +18,7 @@ use conefield_core::prior::Prior;
 use conefield_core::registry::{self, Kind, Make, NewType};
 use conefield_core::regularizer::{Regularizer, RegularizerSpec};
 use conefield_core::settings::{
-    EncoderSpec, FieldSpec, Initializer, InitializerSpec, LineFieldSpec, LossSpec, NormalizerSpec, PriorSpec,
-    ProjectorSpec,
+    EncoderSpec, FieldSpec, Initializer, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 use conefield_core::stage::{Encoder, Field, Normalizer, Projector};
 use serde::{Serialize, Serializer};
@@ -99,7 +98,6 @@ kinds! {
     Encoder EncoderSpec(self) -> dyn Encoder { self.map(3) }
     Normalizer NormalizerSpec(self, width: usize) -> dyn Normalizer { self.map(width) }
     Field FieldSpec(self, width: usize) -> dyn Field { self.map(width) }
-    LineField LineFieldSpec(self) -> dyn Field { self.map(3) }
     Projector ProjectorSpec(self) -> dyn Projector { build(&self.ty, &self.settings, 0, ProjectorStage::tried) }
     Loss LossSpec(self) -> dyn Loss { build(&self.ty, &self.settings, 0, LossStage::tried) }
     Prior PriorSpec(self) -> dyn Prior { build(&self.ty, &self.settings, 0, PriorStage::tried) }

@@ -156,6 +156,30 @@ macro_rules! call {
 }
 use call;
 
+/// Methods of a stage's trait whose answers its `Foreign` holds.
+macro_rules! said {
+    ($own:tt:) => {};
+    ($own:tt: describe $($rest:ident)*) => {
+        fn describe(&self) -> String {
+            self.$own.describe.clone()
+        }
+        said! { $own: $($rest)* }
+    };
+    ($own:tt: fault $($rest:ident)*) => {
+        fn fault(&self) -> conefield_core::error::Result<()> {
+            self.$own.fault.take()
+        }
+        said! { $own: $($rest)* }
+    };
+    ($own:tt: wgsl $($rest:ident)*) => {
+        fn wgsl(&self) -> Option<conefield_core::wgsl::Fragment> {
+            self.$own.fragment(self.$own.functions.wgsl)
+        }
+        said! { $own: $($rest)* }
+    };
+}
+use said;
+
 type WgslFn = unsafe extern "C" fn(*const c_void, *mut ConefieldText) -> ConefieldStatus;
 
 /// A grid in the format of the ABI.

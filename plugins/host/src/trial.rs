@@ -10,7 +10,7 @@ use conefield_core::error::{Error, Result};
 use conefield_core::pages::Pages;
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
-use conefield_core::stage::{GradKind, Grads, Lines, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
+use conefield_core::stage::{GradKind, Grads, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
 use ndarray::{Array3, ArrayView3, ArrayViewMut3};
 use std::ops::Range;
 use std::sync::mpsc;
@@ -243,21 +243,6 @@ pub(crate) fn projector(ty: &Type, cast: impl Fn(&UnitRay, Option<u64>, usize) -
         }
     }
     Ok(())
-}
-
-/// Tries the line integrals of a line field of type `ty`.
-pub(crate) fn lines(ty: &Type, stage: &dyn Stage, lines: &dyn Lines<f32>) -> Result<()> {
-    let info = stage.info();
-    let range = stage.partition().into_iter().min_by_key(Range::len).unwrap_or(0..info.params);
-    let mut params = Guarded::zeroed(info.params);
-    let (rays, mut out, mut grads) = (rays(), Guarded::new(4), Guarded::zeroed(range.len()));
-    lines.project(params.inner(), &rays, out.inner());
-    lines.backproject(params.inner(), &rays, &[1.0; 4], Grads { values: grads.inner(), range });
-    stage.fault()?;
-    let complaint = out.complaint("line integrals").or_else(|| grads.complaint("gradients of line integrals"));
-    let missed = out.inner()[3] != 0.0;
-    let complaint = complaint.or_else(|| params.broken("parameters"));
-    settled(ty, complaint.or_else(|| missed.then(|| "a ray that is not inside has a line integral".into())))
 }
 
 /// Tries a loss of type `ty`: `at` compares pairs of a predicted and a measured value.

@@ -9,8 +9,8 @@ use conefield_core::prior::Prior;
 use conefield_core::registry::{Kind, StageType};
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
 use conefield_core::settings::{
-    EncoderSpec, FieldSpec, Initializer, InitializerSpec, KnownVolume, LineFieldSpec, LossSpec, NormalizerSpec,
-    PriorSpec, ProjectorSpec,
+    EncoderSpec, FieldSpec, Initializer, InitializerSpec, KnownVolume, LossSpec, NormalizerSpec, PriorSpec,
+    ProjectorSpec,
 };
 use conefield_core::spec::stage::read;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
@@ -32,46 +32,94 @@ pub struct Built {
     pub shape: [usize; 3],
 }
 
+/// Defines the kinds of stages with their settings, which may need the number of input channels, and the parts that
+/// stages make for a grid or a scan.
 macro_rules! any_stage {
-    ($($kind:ident $($name:ident)?: $stage:ty,)*) => {
-        /// A stage of any kind, or a part made for a grid or a scan.
+    (
+        stages { $($kind:ident $name:ident: $stage:ident from $spec:ident($($width:ident)?),)* }
+        parts { $($part:ident $part_name:ident,)* }
+    ) => {
+        /// A stage of any kind, or a part.
         pub enum AnyStage {
-            $($kind(Box<$stage>),)*
+            $($kind(Box<dyn $stage>),)*
+            $($part(Box<dyn $part>),)*
+            Initializer(Box<dyn Initializer>),
             /// An initializer whose weights are not read yet.
             Waiting(Waiting),
         }
 
-        $(impl From<Box<$stage>> for AnyStage {
-            fn from(stage: Box<$stage>) -> Self {
+        $(impl From<Box<dyn $stage>> for AnyStage {
+            fn from(stage: Box<dyn $stage>) -> Self {
                 Self::$kind(stage)
             }
         })*
 
+        $(impl From<Box<dyn $part>> for AnyStage {
+            fn from(stage: Box<dyn $part>) -> Self {
+                Self::$part(stage)
+            }
+        })*
+
+        impl AnyStage {
+            /// The stage of type `t` with `settings`, which include the type.
+            fn new(t: &StageType, settings: Value, width: usize) -> Result<Self> {
+                let refused = |e: String| Error::invalid("spec", "", e, "settings of this type");
+                Ok(match t.kind {
+                    $(Kind::$kind => {
+                        $(let $width = width;)?
+                        Self::from(read::<dyn $spec>(settings).map_err(refused)?.build($($width)?)?)
+                    })*
+                    Kind::Initializer => Waiting::build(read::<dyn InitializerSpec>(settings).map_err(refused)?)?,
+                    other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
+                })
+            }
+
+            pub fn describe(&self) -> String {
+                match self {
+                    $(Self::$kind(stage) => stage.describe(),)*
+                    $(Self::$part(_) => String::new(),)*
+                    Self::Initializer(stage) => stage.describe(),
+                    Self::Waiting(w) => format!("waits for {}", w.path),
+                }
+            }
+        }
+
         impl Built {
-            $($(pub fn $name(&self) -> Result<&$stage> {
+            $(#[allow(dead_code)]
+            pub fn $name(&self) -> Result<&dyn $stage> {
                 match &self.stage {
                     AnyStage::$kind(stage) => Ok(stage.as_ref()),
                     other => Err(other.is_no(stringify!($name))),
                 }
-            })?)*
+            })*
+
+            $(pub fn $part_name(&self) -> Result<&dyn $part> {
+                match &self.stage {
+                    AnyStage::$part(stage) => Ok(stage.as_ref()),
+                    other => Err(other.is_no(stringify!($part_name))),
+                }
+            })*
         }
     };
 }
 
 any_stage! {
-    Encoder encoder: dyn Encoder,
-    Normalizer: dyn Normalizer,
-    Field field: dyn Field,
-    Projector projector: dyn Projector,
-    Initializer initializer: dyn Initializer,
-    Loss loss: dyn Loss,
-    Prior prior: dyn Prior,
-    Regularizer regularizer: dyn Regularizer,
-    Penalty penalty: dyn Penalty,
-    DataTerm data_term: dyn DataTerm,
-    Misfit misfit: dyn Misfit,
-    Basis basis: dyn Basis,
-    Expansion expansion: dyn Expansion,
+    stages {
+        Encoder encoder: Encoder from EncoderSpec(),
+        Normalizer normalizer: Normalizer from NormalizerSpec(width),
+        Field field: Field from FieldSpec(width),
+        Projector projector: Projector from ProjectorSpec(),
+        Loss loss: Loss from LossSpec(),
+        Prior prior: Prior from PriorSpec(),
+        Regularizer regularizer: Regularizer from RegularizerSpec(),
+        DataTerm data_term: DataTerm from DataTermSpec(),
+        Basis basis: Basis from BasisSpec(),
+    }
+    parts {
+        Penalty penalty,
+        Misfit misfit,
+        Expansion expansion,
+    }
 }
 
 /// Settings of an initializer that names a weights file.
@@ -118,26 +166,7 @@ impl Built {
             return Err(Error::invalid("spec", "", &settings, "a table of settings"));
         };
         keys.insert("type".into(), t.name.into());
-        let refused = |e: String| Error::invalid("spec", "", e, "settings of this type");
-        macro_rules! built {
-            ($spec:ident $($width:ident)?) => {
-                AnyStage::from(read::<dyn $spec>(settings).map_err(refused)?.build($($width)?)?)
-            };
-        }
-        Ok(Self::of(match t.kind {
-            Kind::Encoder => built!(EncoderSpec),
-            Kind::Normalizer => built!(NormalizerSpec width),
-            Kind::Field => built!(FieldSpec width),
-            Kind::LineField => built!(LineFieldSpec),
-            Kind::Projector => built!(ProjectorSpec),
-            Kind::Initializer => Waiting::build(read::<dyn InitializerSpec>(settings).map_err(refused)?)?,
-            Kind::Loss => built!(LossSpec),
-            Kind::Prior => built!(PriorSpec),
-            Kind::Regularizer => built!(RegularizerSpec),
-            Kind::DataTerm => built!(DataTermSpec),
-            Kind::Basis => built!(BasisSpec),
-            other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
-        }))
+        Ok(Self::of(AnyStage::new(t, settings, width)?))
     }
 
     /// The host's object for `stage`.
@@ -159,6 +188,18 @@ impl Built {
     /// Returns the stage, whatever its kind.
     pub fn any(&self) -> Result<&Self> {
         Ok(self)
+    }
+
+    /// As [`Self::any`], mutable.
+    pub fn any_mut(&mut self) -> Result<&mut Self> {
+        Ok(self)
+    }
+
+    pub fn initializer(&self) -> Result<&dyn Initializer> {
+        match &self.stage {
+            AnyStage::Initializer(stage) => Ok(stage.as_ref()),
+            other => Err(other.is_no("initializer")),
+        }
     }
 
     /// As a map of rows, with its properties.
@@ -201,24 +242,6 @@ impl AnyStage {
             Self::Normalizer(s) => Some(s.as_ref()),
             Self::Field(s) => Some(s.as_ref()),
             _ => None,
-        }
-    }
-
-    pub fn describe(&self) -> String {
-        match self {
-            Self::Encoder(s) => s.describe(),
-            Self::Normalizer(s) => s.describe(),
-            Self::Field(s) => s.describe(),
-            Self::Projector(s) => s.describe(),
-            Self::Initializer(s) => s.describe(),
-            Self::Loss(s) => s.describe(),
-            Self::Prior(s) => s.describe(),
-            Self::Regularizer(s) => s.describe(),
-            Self::DataTerm(s) => s.describe(),
-            Self::Misfit(s) => s.describe(),
-            Self::Basis(s) => s.describe(),
-            Self::Waiting(w) => format!("waits for {}", w.path),
-            Self::Penalty(_) | Self::Expansion(_) => String::new(),
         }
     }
 

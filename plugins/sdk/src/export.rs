@@ -75,19 +75,14 @@ fn stage(t: &'static StageType) -> Option<ConefieldStage> {
         data_term: ptr::null(),
         basis: ptr::null(),
     };
-    match t.kind {
-        Kind::Encoder => (stage.kind, stage.map) = (CONEFIELD_ENCODER, &shims::MAP),
-        Kind::Normalizer => (stage.kind, stage.map) = (CONEFIELD_NORMALIZER, &shims::MAP),
-        Kind::Field => (stage.kind, stage.map) = (CONEFIELD_FIELD, &shims::MAP),
-        Kind::Projector => (stage.kind, stage.projector) = (CONEFIELD_PROJECTOR, &shims::PROJECTOR),
-        Kind::Initializer => (stage.kind, stage.initializer) = (CONEFIELD_INITIALIZER, &shims::INITIALIZER),
-        Kind::Loss => (stage.kind, stage.loss) = (CONEFIELD_LOSS, &shims::LOSS),
-        Kind::Prior => (stage.kind, stage.prior) = (CONEFIELD_PRIOR, &shims::PRIOR),
-        Kind::LineField => (stage.kind, stage.map) = (CONEFIELD_LINE_FIELD, &shims::MAP),
-        Kind::Regularizer => (stage.kind, stage.regularizer) = (CONEFIELD_REGULARIZER, &shims::REGULARIZER),
-        Kind::DataTerm => (stage.kind, stage.data_term) = (CONEFIELD_DATA_TERM, &shims::DATA_TERM),
-        Kind::Basis => (stage.kind, stage.basis) = (CONEFIELD_BASIS, &shims::BASIS),
-        Kind::Method | Kind::Callback | Kind::VoxelProjector => return None,
+    macro_rules! filled {
+        ($($table:ident $field:ident [$($needed:ident)*]: $($kind:ident $code:ident),+;)*) => {
+            match t.kind {
+                $($(Kind::$kind => (stage.kind, stage.$field) = ($code, &shims::$field::TABLE),)+)*
+                _ => return None,
+            }
+        };
     }
+    conefield_plugin_abi::kinds! { filled }
     Some(stage)
 }

@@ -186,9 +186,8 @@ impl Bundle {
     }
 }
 
-/// The line integral of a shape of density 1 along a ray, and the derivatives of `density` times it; `None` if the ray
-/// misses the shape.
-fn along(shape: &Shape, ray: &UnitRay) -> Option<(f64, Slope)> {
+/// The line integral of a shape of density 1 along a ray; `None` if the ray misses the shape.
+fn along(shape: &Shape, ray: &UnitRay) -> Option<f64> {
     if ray.inside[1] <= ray.inside[0] {
         return None;
     }
@@ -196,49 +195,31 @@ fn along(shape: &Shape, ray: &UnitRay) -> Option<(f64, Slope)> {
     let length = dot(d, d).sqrt();
     let d = d.map(|x| x / length);
     let y = less(shape.centre, ray.origin.map(f64::from));
-    let (m, z, w) = (&shape.inverse, apply(&shape.inverse, y), apply(&shape.inverse, d));
-    let (a, b, off) = (dot(w, w), dot(z, w), cross(z, w));
+    let (z, w) = (apply(&shape.inverse, y), apply(&shape.inverse, d));
+    let (a, off) = (dot(w, w), cross(z, w));
     let e = dot(off, off) / a;
-    if e > view::EXTENT * view::EXTENT {
-        return None;
-    }
-    let line = (TAU / a).sqrt() * (-0.5 * e).exp();
-    let k = -shape.density * line / a;
-    let by: V3 = std::array::from_fn(|i| a * z[i] - b * w[i]);
-    let zz = dot(z, z);
-    let inverse = std::array::from_fn(|i| {
-        std::array::from_fn(|j| k * ((1.0 - e) * w[i] * d[j] + by[i] * y[j] + (zz * w[i] - b * z[i]) * d[j]))
-    });
-    let centre = std::array::from_fn(|j| k * (0..3).map(|i| m[i][j] * by[i]).sum::<f64>());
-    Some((line, Slope { centre, inverse, density: line }))
+    (e <= view::EXTENT * view::EXTENT).then(|| (TAU / a).sqrt() * (-0.5 * e).exp())
 }
 
-impl<R: Real> Lines<R> for Mixture {
-    fn project(&self, params: &[R], rays: &[UnitRay], out: &mut [R]) {
+impl Mixture {
+    /// The line integrals of `rays`, in cube sides.
+    pub(super) fn along<R: Real>(&self, params: &[R], rays: &[UnitRay], out: &mut [R]) {
         let mut sums = vec![0.0; rays.len()];
         if let Some(bundle) = Bundle::of(rays) {
             for (_, p) in present(params, 0..self.most).filter(|(_, p)| bundle.near(p)) {
                 let shape = Shape::of(p);
                 for (sum, ray) in sums.iter_mut().zip(rays) {
-                    *sum += along(&shape, ray).map_or(0.0, |(line, _)| shape.density * line);
+                    *sum += along(&shape, ray).map_or(0.0, |line| shape.density * line);
                 }
             }
         }
         out.iter_mut().zip(sums).for_each(|(out, sum)| *out = R::of(sum));
     }
+}
 
-    fn backproject(&self, params: &[R], rays: &[UnitRay], dlines: &[R], mut grads: Grads<'_, R>) {
-        let Some(bundle) = Bundle::of(rays) else { return };
-        for (index, p) in present(params, touched(&grads.range)).filter(|(_, p)| bundle.near(p)) {
-            let shape = Shape::of(p);
-            let mut all = Slope::default();
-            for (ray, by) in rays.iter().zip(dlines) {
-                if let Some((_, slope)) = along(&shape, ray) {
-                    all.add(&slope, by.f64());
-                }
-            }
-            add(&mut grads, params, &shape, index, &all);
-        }
+impl Lines for Mixture {
+    fn project(&self, params: &[f32], rays: &[UnitRay], out: &mut [f32]) {
+        self.along(params, rays, out);
     }
 }
 
@@ -289,11 +270,7 @@ impl Stage for Mixture {
 }
 
 impl Field for Mixture {
-    fn lines(&self) -> Option<&dyn Lines<f32>> {
-        Some(self)
-    }
-
-    fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
+    fn lines(&self) -> Option<&dyn Lines> {
         Some(self)
     }
 

@@ -2,10 +2,10 @@
 //! rays and points.
 
 use super::grid::Grid;
-use super::shape::{DENSITY, FREE, NUMBERS, Shape, Slope, V3, apply, cross, dot};
+use super::shape::{FREE, NUMBERS, Slope, V3, apply, cross, dot};
 use super::stage::{Mixture, shapes};
 use super::view::{Beam, EXTENT, Sight};
-use conefield_core::stage::{Grads, Kernel, Lines, Tile, TileMut, UnitGrid, UnitRay};
+use conefield_core::stage::{Grads, Kernel, Tile, TileMut, UnitGrid, UnitRay};
 
 const ROWS: usize = 24;
 const COLUMNS: usize = 29;
@@ -113,7 +113,10 @@ fn line_integrals_are_those_of_quadrature() {
 #[test]
 fn derivatives_of_a_view_are_finite_differences() {
     let (p, by) = (parameters(), weights(&beam()));
-    let worst = off(&p, &gradient(&p, &by).0, |p| dot_all(&project(p), &by));
+    let slopes = gradient(&p, &by).0;
+    let worst = off(&p, &slopes, |p| dot_all(&project(p), &by));
+    // A free slot gets no gradient.
+    assert!(slopes[3 * NUMBERS..4 * NUMBERS].iter().all(|g| *g == 0.0));
     assert!(worst < 1e-7, "{worst:e}");
     // A wrong derivative is detected.
     let mut wrong = gradient(&p, &by).0;
@@ -162,7 +165,7 @@ fn a_view_is_its_rays_in_both_precisions() {
                 per_mm: 1.0,
             };
             let mut line = [f64::NAN];
-            Lines::<f64>::project(&mixture, &p, &[ray], &mut line);
+            mixture.along(&p, &[ray], &mut line);
             let at = row * stride + column;
             let differences = [line[0] - image[at], f64::from(narrow[at]) - image[at]].map(f64::abs);
             unlike += usize::from(differences.iter().any(|d| *d > 2e-5 * most));
@@ -232,31 +235,4 @@ fn a_grid_is_its_points_and_so_are_derivatives() {
         };
         assert!(((moved(h) - moved(-h)) / (2.0 * h) - dx[at]).abs() < 1e-6, "{at}");
     }
-}
-
-#[test]
-fn derivatives_of_rays_are_finite_differences() {
-    let p = parameters();
-    let mixture = Mixture { most: p.len() / NUMBERS };
-    let rays: Vec<UnitRay> = (0..12)
-        .map(|i| {
-            let d = [-1.0, -0.9 + 0.02 * i as f32, 0.01 * i as f32 - 0.05];
-            let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
-            let origin = [1.9, 1.8 - 0.05 * i as f32, 0.4];
-            UnitRay { origin, direction: d.map(|x| x / length), inside: [0.5, 3.0], published: [0.5, 3.0], per_mm: 1.0 }
-        })
-        .collect();
-    let by: Vec<f64> = (0..12).map(|i| f64::from(i % 5) - 2.0).collect();
-    let mut g = vec![0.0; p.len()];
-    mixture.backproject(&p, &rays, &by, Grads::all(&mut g));
-    let loss = |p: &[f64]| {
-        let mut lines = vec![0.0; rays.len()];
-        mixture.project(p, &rays, &mut lines);
-        dot_all(&lines, &by)
-    };
-    assert!(loss(&p) != 0.0 && off(&p, &g, loss) < 1e-7);
-    // A free slot gets no gradient.
-    assert!(g[3 * NUMBERS..4 * NUMBERS].iter().all(|g| *g == 0.0));
-    assert_eq!(Shape::of(&p[3 * NUMBERS..]).density, 0.0);
-    assert_eq!(p[3 * NUMBERS + DENSITY], f64::from(FREE));
 }

@@ -11,7 +11,7 @@ mod call;
 mod channels;
 mod data_terms;
 mod gradients;
-mod lines;
+mod kinds;
 mod losses;
 mod priors;
 mod rays;
@@ -28,6 +28,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 pub use bases::check_basis;
 pub use data_terms::check_data_term;
+pub use kinds::{WIDTHS, With, check_package, check_type};
 pub use losses::{Compare, check_loss, check_loss_wgsl, ready};
 pub use priors::{Penalise, check_prior, check_prior_wgsl};
 pub use rays::check_projector;
@@ -167,10 +168,9 @@ pub fn check_normalizer(stage: &dyn Normalizer, options: &Options) -> Report {
     report
 }
 
-/// [`check`], and the properties of a field with reduced channels and of its own line integrals.
+/// [`check`], and the properties of a field with reduced channels.
 pub fn check_field(stage: &dyn Field, options: &Options) -> Report {
     let mut report = check(stage, options);
     report.add("keep inputs", || channels::field_inputs(stage, options));
-    lines::check(&mut report, stage, options);
     report
 }

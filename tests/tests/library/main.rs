@@ -13,7 +13,6 @@ mod crates;
 mod drift;
 mod gaussians;
 mod guard;
-mod lines;
 mod live;
 mod masks;
 mod patience;

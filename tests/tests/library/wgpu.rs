@@ -14,7 +14,7 @@ use conefield_core::prior::Prior;
 use conefield_core::random::{mix, unit};
 use conefield_core::scene::Scene;
 use conefield_core::stage::{Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
-use conefield_core::wgsl::Fragment;
+use conefield_core::wgsl::{Fragment, Runner};
 use conefield_solvers::losses::{Huber, L1, L2};
 use conefield_solvers::priors::TotalVariation;
 use serde_json::{Value, json};

@@ -3,15 +3,9 @@
 use crate::{out, program};
 use clap::Args;
 use conefield::{parse, plugins};
-use conefield_backend_wgpu::{Shared, Wgpu};
-use conefield_conformance::{
-    Options, Outcome, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
-    check_loss_wgsl, check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl,
-    check_regularizer, check_wgsl,
-};
-use conefield_core::arena::Weights;
-use conefield_core::registry::{self, Make, Origin};
-use conefield_core::stage::{Projector, Stage};
+use conefield_backend_wgpu::Wgpu;
+use conefield_conformance::{Options, Outcome, Report, WIDTHS, With, check_type};
+use conefield_core::wgsl::Runner;
 use conefield_core::{Error, Result};
 use conefield_plugins::library::Type;
 use conefield_plugins::spec::with_defaults;
@@ -219,94 +213,20 @@ impl Check {
 
     /// Checks one stage type with one set of settings, at all sensible widths.
     fn stage(&self, t: &Type, settings: &Value, device: &Device, all: &mut Vec<StageReport>) -> Result<()> {
-        let Some(Origin::Loaded { make, .. }) = registry::find(t.kind, &t.name).map(|t| &t.origin) else {
-            return Err(Error::unsupported(&t.name, "it is not registered"));
+        let mut table = settings.clone();
+        table["type"] = t.name.clone().into();
+        let with = With {
+            widths: &self.widths(),
+            options: &|options| Options { single: self.single, ..options },
+            device: &|| device.runner(),
         };
-        let options = |o: Options| Options { single: self.single, ..o };
-        let widest = self.widths().into_iter().max().unwrap_or(0);
-        let mut add = |width, report| all.push(StageReport::of(t, settings, width, report));
-        match make {
-            Make::Encoder(make) => {
-                let stage = make(settings.clone())?.build()?;
-                let options = options(Options::encoder());
-                add(None, device.map(check_encoder(stage.as_ref(), &options), stage.as_ref(), &options, true));
-            }
-            Make::Normalizer(make) => {
-                for width in self.widths() {
-                    let stage = make(settings.clone())?.build(width)?;
-                    let options = options(Options::features());
-                    let report = check_normalizer(stage.as_ref(), &options);
-                    add(Some(width), device.map(report, stage.as_ref(), &options, width == widest));
-                }
-            }
-            Make::Field(make) => {
-                let mut refused = None;
-                let mut built = false;
-                for width in self.widths() {
-                    // A field may accept only points of the unit cube.
-                    let stage = match make(settings.clone())?.build(width) {
-                        Ok(stage) => stage,
-                        Err(e) => {
-                            refused = Some(e);
-                            continue;
-                        }
-                    };
-                    built = true;
-                    let options = options(Options::features());
-                    let report = check_field(stage.as_ref(), &options);
-                    add(Some(width), device.map(report, stage.as_ref(), &options, width == widest));
-                }
-                if let (false, Some(e)) = (built, refused) {
-                    return Err(e);
-                }
-            }
-            Make::Projector(make) => {
-                let stage = make(settings.clone())?.build()?;
-                add(None, device.projector(check_projector(stage.as_ref()), stage.as_ref()));
-            }
-            Make::Initializer(make) => {
-                let none =
-                    |path: &str| -> Result<Weights> { Err(Error::unsupported(path, "no weights are read here")) };
-                let stage = make(settings.clone())?.build(&none)?;
-                add(None, check_initializer(stage.as_ref()));
-            }
-            Make::Loss(make) => {
-                let stage = make(settings.clone())?.build()?;
-                let report = check_loss(stage.as_ref());
-                add(
-                    None,
-                    device.beside(report, stage.wgsl().is_some(), |shared| {
-                        check_loss_wgsl(stage.as_ref(), &|l, pairs| shared.losses(l, pairs))
-                    }),
-                );
-            }
-            Make::Prior(make) => {
-                let stage = make(settings.clone())?.build()?;
-                let report = check_prior(stage.as_ref());
-                add(
-                    None,
-                    device.beside(report, stage.wgsl().is_some(), |shared| {
-                        check_prior_wgsl(stage.as_ref(), &|p, values| shared.penalty(p, values))
-                    }),
-                );
-            }
-            Make::LineField(make) => {
-                let stage = make(settings.clone())?.build()?;
-                let options = options(Options::encoder());
-                add(None, device.map(check_field(stage.as_ref(), &options), stage.as_ref(), &options, true));
-            }
-            Make::Regularizer(make) => add(None, check_regularizer(make(settings.clone())?.build()?.as_ref())),
-            Make::DataTerm(make) => add(None, check_data_term(make(settings.clone())?.build()?.as_ref())),
-            Make::Basis(make) => add(None, check_basis(make(settings.clone())?.build()?.as_ref())),
-            Make::VoxelProjector(_) => {
-                return Err(Error::unsupported(&t.name, format!("a {} cannot come from a plugin", t.kind)));
-            }
-        }
+        let found = check_type(t.kind, &table, &with)?;
+        all.extend(found.into_iter().map(|(width, report)| StageReport::of(t, settings, width, report)));
         Ok(())
     }
 
     fn widths(&self) -> Vec<usize> {
-        if self.width.is_empty() { vec![1, 3, 8, 20] } else { self.width.iter().map(|&w| w.into()).collect() }
+        if self.width.is_empty() { WIDTHS.to_vec() } else { self.width.iter().map(|&w| w.into()).collect() }
     }
 }
 
@@ -317,33 +237,9 @@ const FAILED: &str = "failed";
 struct Device(OnceLock<Result<Wgpu, String>>);
 
 impl Device {
-    /// Adds the checks of the stage's WGSL to the report.
-    fn beside(&self, mut report: Report, offers: bool, check: impl FnOnce(&Shared) -> Report) -> Report {
-        let open = || Wgpu::open(None).map_err(|e| e.to_string());
-        let skipped = |why: String| vec![("WGSL parity", Outcome::Skipped(why))];
-        report.entries.extend(match offers.then(|| self.0.get_or_init(open)) {
-            None => skipped("the stage offers none".into()),
-            Some(Err(why)) => skipped(why.clone()),
-            Some(Ok(device)) => check(device.shared()).entries,
-        });
-        report
-    }
-
-    /// The same for stages that map rows, at one width: compilation is slow on some devices.
-    fn map(&self, report: Report, stage: &dyn Stage, options: &Options, this_width: bool) -> Report {
-        if !this_width {
-            return report;
-        }
-        self.beside(report, stage.wgsl().is_some(), |shared| {
-            check_wgsl(stage, options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows))
-        })
-    }
-
-    /// The same for projectors.
-    fn projector(&self, report: Report, stage: &dyn Projector) -> Report {
-        self.beside(report, stage.wgsl().is_some(), |shared| {
-            check_projector_wgsl(stage, &|p, rays| shared.samples(p, rays))
-        })
+    fn runner(&self) -> Result<&dyn Runner, String> {
+        let opened = self.0.get_or_init(|| Wgpu::open(None).map_err(|e| e.to_string()));
+        opened.as_ref().map(|device| &**device.shared() as &dyn Runner).map_err(String::clone)
     }
 }
 

@@ -58,10 +58,9 @@ struct Start {
     build: &'static str,
 }
 
-/// Kinds of stages and their templates: the stage in C (without the common start and end) and in Rust, and the test of
-/// the latter.
+/// Kinds of stages and their templates: the stage in C, without the common start and end, and in Rust.
 macro_rules! kinds {
-    ($($kind:ident $file:literal $test:literal,)*) => {
+    ($($kind:ident $file:literal,)*) => {
         #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
         enum StageKind {
             $($kind,)*
@@ -74,18 +73,10 @@ macro_rules! kinds {
                 }
             }
 
-            fn c(self) -> &'static str {
-                match self {
-                    $(Self::$kind => template!(concat!("c/", $file, ".c")),)*
-                }
-            }
-
-            fn rust(self) -> (&'static str, String) {
-                match self {
-                    $(Self::$kind => {
-                        let test = template!(concat!("rust/", $test, "_test.rs"));
-                        (template!(concat!("rust/", $file, ".rs")), test.replace("@kind@", $file))
-                    })*
+            fn template(self, language: Language) -> &'static str {
+                match (self, language) {
+                    $((Self::$kind, Language::C) => template!(concat!("c/", $file, ".c")),)*
+                    $((Self::$kind, Language::Rust) => template!(concat!("rust/", $file, ".rs")),)*
                 }
             }
         }
@@ -93,17 +84,16 @@ macro_rules! kinds {
 }
 
 kinds! {
-    Encoder "encoder" "encoder",
-    Normalizer "normalizer" "normalizer",
-    Field "field" "field",
-    LineField "line_field" "line_field",
-    Projector "projector" "projector",
-    Initializer "initializer" "initializer",
-    Loss "loss" "piece",
-    Prior "prior" "piece",
-    Regularizer "regularizer" "piece",
-    DataTerm "data_term" "piece",
-    Basis "basis" "piece",
+    Encoder "encoder",
+    Normalizer "normalizer",
+    Field "field",
+    Projector "projector",
+    Initializer "initializer",
+    Loss "loss",
+    Prior "prior",
+    Regularizer "regularizer",
+    DataTerm "data_term",
+    Basis "basis",
 }
 
 impl New {
@@ -154,12 +144,11 @@ impl New {
     }
 
     fn rust(&self) -> Result<Start> {
-        let (stage, test) = self.kind.rust();
         let files = vec![
             ("Cargo.toml".into(), self.fill(template!("rust/manifest.toml"))?),
             (".gitignore".into(), "/target\n".into()),
-            ("src/lib.rs".into(), self.fill(stage)?),
-            ("tests/conformance.rs".into(), self.fill(&test)?),
+            ("src/lib.rs".into(), self.fill(self.kind.template(Language::Rust))?),
+            ("tests/conformance.rs".into(), self.fill(template!("rust/test.rs"))?),
             ("spec.toml".into(), self.spec()),
         ];
         let name = self.name.replace('-', "_");
@@ -172,7 +161,7 @@ impl New {
         let [head, plugin] = [template!("c/head.c"), template!("c/plugin.c")].map(str::trim_end);
         let named = |text: &str| text.replace("@head@", head).replace("@plugin@", plugin).replace("@name@", &self.name);
         let files = vec![
-            (format!("{}.c", self.name), named(self.kind.c())),
+            (format!("{}.c", self.name), named(self.kind.template(Language::C))),
             ("conefield_plugin.h".into(), conefield_plugin_abi::HEADER.into()),
             ("Makefile".into(), named(template!("c/Makefile"))),
             ("spec.toml".into(), self.spec()),
@@ -198,7 +187,6 @@ impl New {
             Kind::Regularizer => of_fista("[prior]"),
             Kind::DataTerm => of_fista("[data]"),
             Kind::Basis => of_fista("[basis]"),
-            Kind::LineField => format!("type = \"line-field\"\n{about}, trained on rays.\"\n{}", stage("[field]")),
             _ => of_fast(&format!("[{kind}]")),
         }
     }

@@ -2,7 +2,7 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, SMALL, call, raw_grid};
+use super::{Foreign, SMALL, call, raw_grid, said};
 use crate::library::Handle;
 use crate::trial;
 use conefield_core::basis::{Basis, BasisOperator, Expansion};
@@ -57,9 +57,7 @@ impl Basis for BasisStage {
         Ok(Box::new(self.made_on(grid)?))
     }
 
-    fn describe(&self) -> String {
-        self.0.describe.clone()
-    }
+    said! { 0: describe }
 }
 
 /// A basis that a library made for one grid.
@@ -90,9 +88,7 @@ impl Expansion for ExpansionOn {
         (self.info.double_precision != 0).then_some(self)
     }
 
-    fn fault(&self) -> Result<()> {
-        self.own.fault.take()
-    }
+    said! { own: fault }
 }
 
 /// Passes arrays to a library as contiguous numbers. Failure leaves NaN.

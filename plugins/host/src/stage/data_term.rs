@@ -2,7 +2,7 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call};
+use super::{Foreign, call, said};
 use crate::library::Handle;
 use crate::trial;
 use conefield_core::data_term::{DataTerm, Misfit};
@@ -59,9 +59,7 @@ impl DataTerm for DataTermStage {
         self.bytes(header)[1]
     }
 
-    fn describe(&self) -> String {
-        self.0.describe.clone()
-    }
+    said! { 0: describe }
 }
 
 /// A data term that a library made for one scan.
@@ -90,11 +88,5 @@ impl Misfit for MisfitOn {
         self.0.functions.noise.map_or(f64::NAN, |f| unsafe { f(self.0.handle.stage) })
     }
 
-    fn fault(&self) -> Result<()> {
-        self.0.fault.take()
-    }
-
-    fn describe(&self) -> String {
-        self.0.describe.clone()
-    }
+    said! { 0: describe fault }
 }

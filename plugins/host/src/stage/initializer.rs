@@ -2,7 +2,7 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call};
+use super::{Foreign, call, said};
 use crate::library::{self, Handle, Type};
 use crate::trial::{UNTOUCHED, timed};
 use conefield_core::arena::{Arena, Block, InitReport, Layout, Weights};
@@ -137,7 +137,5 @@ impl Initializer for InitializerStage {
         self.volume.clone()
     }
 
-    fn describe(&self) -> String {
-        self.own.describe.clone()
-    }
+    said! { own: describe }
 }

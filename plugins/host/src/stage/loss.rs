@@ -2,12 +2,11 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call};
+use super::{Foreign, call, said};
 use crate::library::Handle;
 use crate::trial;
 use conefield_core::error::Result;
 use conefield_core::loss::{Loss, NoiseModel};
-use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 
 /// A loss from a library.
@@ -56,10 +55,6 @@ impl Loss for LossStage {
         self.own.noted(done, (f64::NAN, f64::NAN))
     }
 
-    fn wgsl(&self) -> Option<Fragment> {
-        self.own.fragment(self.own.functions.wgsl)
-    }
-
     fn needs_scan(&self) -> bool {
         self.needs_scan
     }
@@ -68,11 +63,5 @@ impl Loss for LossStage {
         self.own.noted(self.try_fitted(noise), None)
     }
 
-    fn fault(&self) -> Result<()> {
-        self.own.fault.take()
-    }
-
-    fn describe(&self) -> String {
-        self.own.describe.clone()
-    }
+    said! { own: describe fault wgsl }
 }

@@ -1,17 +1,15 @@
-//! Encoders, normalizers, fields and line fields.
+//! Encoders, normalizers and fields.
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call, raw_ray};
+use super::{Foreign, call, said};
 use crate::library::Handle;
 use crate::trial::{self, GUARD, UNTOUCHED_64};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::Kind;
 use conefield_core::stage::{
-    Encoder, Field, GradKind, Grads, Info, Kernel, Lines, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-    UnitRay,
+    Encoder, Field, GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
-use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -42,9 +40,6 @@ impl MapStage {
         let found = format!("{width} channels for a stage that takes {}", stage.info.input);
         ensure(stage.info.input == width, "spec", "", found, "as many as it was made for")?;
         trial::map(stage.own.ty(), &stage)?;
-        if let Some(lines) = stage.lines() {
-            trial::lines(stage.own.ty(), &stage, lines)?;
-        }
         Ok(stage)
     }
 
@@ -151,17 +146,11 @@ fn sound(i: &ConefieldInfo) -> Result<Info, String> {
 /// Checks that the functions needed for the reported properties exist.
 fn able(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<(), &'static str> {
     let f = &own.functions;
-    let lines = own.ty().kind == Kind::LineField;
     let all = [
         (i.params == 0 || f.init.is_some(), "there are parameters and no function init"),
         (
             i.double_precision == 0 || (f.forward_f64.is_some() && f.backward_f64.is_some()),
             "it declares double-precision kernels but has none",
-        ),
-        (!lines || (f.project.is_some() && f.backproject.is_some()), "it has no line integrals of its own"),
-        (
-            !lines || (f.project_f64.is_some() && f.backproject_f64.is_some()),
-            "it has no line integrals in double precision",
         ),
     ];
     all.into_iter().find(|(holds, _)| !holds).map_or(Ok(()), |(_, what)| Err(what))
@@ -380,17 +369,7 @@ impl Stage for MapStage {
         self.partition.clone()
     }
 
-    fn fault(&self) -> Result<()> {
-        self.own.fault.take()
-    }
-
-    fn wgsl(&self) -> Option<Fragment> {
-        self.own.fragment(self.own.functions.wgsl)
-    }
-
-    fn describe(&self) -> String {
-        self.own.describe.clone()
-    }
+    said! { own: describe fault wgsl }
 }
 
 impl Encoder for MapStage {
@@ -413,14 +392,6 @@ impl Field for MapStage {
         let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
         Ok(Reduced { stage: Box::new(stage), params, channels })
     }
-
-    fn lines(&self) -> Option<&dyn Lines<f32>> {
-        (self.own.ty().kind == Kind::LineField).then_some(self)
-    }
-
-    fn lines_reference(&self) -> Option<&dyn Lines<f64>> {
-        (self.own.ty().kind == Kind::LineField).then_some(self)
-    }
 }
 
 impl Normalizer for MapStage {
@@ -429,29 +400,3 @@ impl Normalizer for MapStage {
         Ok(Reduced { stage: Box::new(stage), params, channels })
     }
 }
-
-macro_rules! lines {
-    ($real:ty, $grads:ident, $project:ident $backproject:ident) => {
-        impl Lines<$real> for MapStage {
-            fn project(&self, params: &[$real], rays: &[UnitRay], out: &mut [$real]) {
-                let rays: Vec<ConefieldRay> = rays.iter().map(raw_ray).collect();
-                let (at, to) = (rays.as_ptr(), out.as_mut_ptr());
-                if let Err(e) = call!(self.own, $project(params.as_ptr(), at, rays.len(), to)) {
-                    self.own.fault.set(e);
-                    out.fill(<$real>::NAN);
-                }
-            }
-
-            fn backproject(&self, params: &[$real], rays: &[UnitRay], dlines: &[$real], grads: Grads<'_, $real>) {
-                let rays: Vec<ConefieldRay> = rays.iter().map(raw_ray).collect();
-                let (start, length) = (grads.range.start, grads.values.len());
-                let to = $grads { data: grads.values.as_mut_ptr(), start, length };
-                let (params, at, dlines) = (params.as_ptr(), rays.as_ptr(), dlines.as_ptr());
-                self.own.noted(call!(self.own, $backproject(params, at, rays.len(), dlines, to)), ());
-            }
-        }
-    };
-}
-
-lines! { f32, ConefieldGrads, project backproject }
-lines! { f64, ConefieldGrads64, project_f64 backproject_f64 }

@@ -2,12 +2,11 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call};
+use super::{Foreign, call, said};
 use crate::library::Handle;
 use crate::trial;
 use conefield_core::error::Result;
 use conefield_core::prior::{Blocks, Prior};
-use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 
 /// A prior from a library.
@@ -50,15 +49,5 @@ impl Prior for PriorStage {
         self.own.noted(self.penalty(values, scale, gradient.as_mut_ptr()), f64::NAN)
     }
 
-    fn wgsl(&self) -> Option<Fragment> {
-        self.own.fragment(self.own.functions.wgsl)
-    }
-
-    fn fault(&self) -> Result<()> {
-        self.own.fault.take()
-    }
-
-    fn describe(&self) -> String {
-        self.own.describe.clone()
-    }
+    said! { own: describe fault wgsl }
 }

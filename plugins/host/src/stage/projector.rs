@@ -2,12 +2,11 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call, raw_ray};
+use super::{Foreign, call, raw_ray, said};
 use crate::library::Handle;
 use crate::trial;
 use conefield_core::error::Result;
 use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
-use conefield_core::wgsl::Fragment;
 use conefield_plugin_abi::*;
 use std::ptr;
 
@@ -119,15 +118,5 @@ impl Projector for ProjectorStage {
         Ok(Some(Box::new(trial::timed(self.0.ty(), move || Self::tried(handle))?)))
     }
 
-    fn fault(&self) -> Result<()> {
-        self.0.fault.take()
-    }
-
-    fn describe(&self) -> String {
-        self.0.describe.clone()
-    }
-
-    fn wgsl(&self) -> Option<Fragment> {
-        self.0.fragment(self.0.functions.wgsl)
-    }
+    said! { 0: describe fault wgsl }
 }

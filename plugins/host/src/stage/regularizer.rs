@@ -2,7 +2,7 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, SMALL, call, raw_grid};
+use super::{Foreign, SMALL, call, raw_grid, said};
 use crate::library::{Handle, text};
 use crate::trial;
 use conefield_core::error::{Result, ensure};
@@ -78,9 +78,7 @@ impl Regularizer for RegularizerStage {
         Ok(weight)
     }
 
-    fn describe(&self) -> String {
-        self.0.describe.clone()
-    }
+    said! { 0: describe }
 }
 
 /// A penalty that a library made for one grid.
@@ -175,7 +173,5 @@ impl Penalty for PenaltyOn {
         all
     }
 
-    fn fault(&self) -> Result<()> {
-        self.own.fault.take()
-    }
+    said! { own: fault }
 }

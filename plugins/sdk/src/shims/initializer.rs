@@ -1,21 +1,13 @@
 //! Initializers.
 
-use super::{built, guard, hand_over, many, many_mut, shims, text};
+use super::{guard, hand_over, many, many_mut, shims, table, text};
 use crate::built::AnyStage;
 use conefield_core::arena::{Arena, Block, Layout, Weights};
 use conefield_core::error::{Error, Result};
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
-use std::ptr;
 
-pub static INITIALIZER: ConefieldInitializer = ConefieldInitializer {
-    size: size_of::<ConefieldInitializer>(),
-    apply: Some(apply),
-    check: Some(check),
-    weights: Some(weights),
-    with_weights: Some(with_weights),
-    volume: Some(volume),
-};
+table! { ConefieldInitializer: apply check weights with_weights volume }
 
 unsafe fn layout(blocks: *const ConefieldBlock, count: usize) -> Result<Layout> {
     let block = |b: &ConefieldBlock| -> Result<Block> {

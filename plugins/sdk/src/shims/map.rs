@@ -1,36 +1,16 @@
-//! Encoders, normalizers, fields and line fields.
+//! Encoders, normalizers and fields.
 
-use super::projector::ray;
-use super::{built, guard, many, many_mut, shims, wgsl};
+use super::{guard, many, many_mut, shims, table, wgsl};
 use crate::built::MapInfo;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::simd::Real;
-use conefield_core::stage::{Grads, Kernel, Lines, Stage, Tile, TileMut, UnitRay};
+use conefield_core::stage::{Grads, Kernel, Stage, Tile, TileMut};
 use conefield_plugin_abi::*;
 use std::borrow::Cow;
 use std::ffi::c_void;
 use std::ptr;
 
-pub static MAP: ConefieldMap = ConefieldMap {
-    size: size_of::<ConefieldMap>(),
-    info: Some(info),
-    parameter: Some(parameter),
-    init: Some(init),
-    forward: Some(forward),
-    backward: Some(backward),
-    forward_f64: Some(forward_f64),
-    backward_f64: Some(backward_f64),
-    partition: Some(partition),
-    reduce: Some(reduce),
-    wgsl: Some(wgsl),
-    passes: Some(passes),
-    forward_pass: Some(forward_pass),
-    resolutions: Some(resolutions),
-    project: Some(project),
-    backproject: Some(backproject),
-    project_f64: Some(project_f64),
-    backproject_f64: Some(backproject_f64),
-};
+table! { ConefieldMap: info parameter init forward backward forward_f64 backward_f64 partition reduce wgsl passes forward_pass resolutions }
 
 shims! {
     fn info(map: map, out: *mut ConefieldInfo) {
@@ -228,59 +208,5 @@ shims! {
     ) {
         let kernel = have(map.0.reference(), "kernel in double precision")?;
         run_backward(map, kernel, params, [x.into(), tape.into(), dy.into(), dx.into()], grads64(to))?;
-    }
-}
-
-/// Line integrals of a line field.
-unsafe fn run_project<R: Real>(
-    (stage, known): Map<'_>,
-    lines: Option<&dyn Lines<R>>,
-    params: *const R,
-    (rays, count): (*const ConefieldRay, usize),
-    out: *mut R,
-) -> Result<()> {
-    // SAFETY: see `shims/mod.rs`.
-    let (params, rays, out) = unsafe { (many(params, known.info.params), many(rays, count), many_mut(out, count)) };
-    let rays: Vec<UnitRay> = rays.iter().map(ray).collect();
-    have(lines, "line integrals of its own")?.project(params, &rays, out);
-    stage.fault()
-}
-
-unsafe fn run_backproject<R: Real>(
-    (stage, known): Map<'_>,
-    lines: Option<&dyn Lines<R>>,
-    params: *const R,
-    (rays, count): (*const ConefieldRay, usize),
-    dlines: *const R,
-    grads: Grads<'_, R>,
-) -> Result<()> {
-    // SAFETY: see `shims/mod.rs`.
-    let (params, rays, dlines) = unsafe { (many(params, known.info.params), many(rays, count), many(dlines, count)) };
-    let rays: Vec<UnitRay> = rays.iter().map(ray).collect();
-    have(lines, "line integrals of its own")?.backproject(params, &rays, dlines, grads);
-    stage.fault()
-}
-
-shims! {
-    fn project(stage: any, params: *const f32, rays: *const ConefieldRay, count: usize, out: *mut f32; error) {
-        run_project(stage.map()?, stage.field()?.lines(), params, (rays, count), out)?;
-    }
-
-    fn backproject(
-        stage: any, params: *const f32, rays: *const ConefieldRay, count: usize, dlines: *const f32, to: ConefieldGrads;
-        error
-    ) {
-        run_backproject(stage.map()?, stage.field()?.lines(), params, (rays, count), dlines, grads(to))?;
-    }
-
-    fn project_f64(stage: any, params: *const f64, rays: *const ConefieldRay, count: usize, out: *mut f64; error) {
-        run_project(stage.map()?, stage.field()?.lines_reference(), params, (rays, count), out)?;
-    }
-
-    fn backproject_f64(
-        stage: any, params: *const f64, rays: *const ConefieldRay, count: usize, dlines: *const f64,
-        to: ConefieldGrads64; error
-    ) {
-        run_backproject(stage.map()?, stage.field()?.lines_reference(), params, (rays, count), dlines, grads64(to))?;
     }
 }

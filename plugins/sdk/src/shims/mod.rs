@@ -6,29 +6,38 @@
 // these functions. Every unsafe block in this folder relies on that alone.
 #![allow(unsafe_code)]
 
-mod initializer;
-mod iterative;
-mod map;
-mod projector;
-mod training;
+pub mod basis;
+pub mod data_term;
+pub mod initializer;
+pub mod loss;
+pub mod map;
+pub mod prior;
+pub mod projector;
+pub mod regularizer;
 
 use crate::built::{AnyStage, Built};
 use conefield_core::error::{Error, Result};
+use conefield_core::geometry::VoxelGrid;
 use conefield_core::registry::StageType;
+use conefield_core::scan::ScanHeader;
+use conefield_core::simd::Real;
 use conefield_plugin_abi::*;
+use ndarray::{ArrayView3, ArrayViewMut3};
 use std::ffi::c_void;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::{mem, ptr, slice};
 
-pub use initializer::INITIALIZER;
-pub use iterative::{BASIS, DATA_TERM, REGULARIZER};
-pub use map::MAP;
-pub use projector::PROJECTOR;
-pub use training::{LOSS, PRIOR};
+/// The table of a kind, with these functions.
+macro_rules! table {
+    ($table:ident: $($function:ident)*) => {
+        pub static TABLE: $table = $table { size: size_of::<$table>(), $($function: Some($function),)* };
+    };
+}
+use table;
 
 /// Defines functions of tables. Each one gets the stage behind its first pointer, as the kind named after it, and runs
-/// inside [`guard`]. A function with an error text as last argument reports a reason; one with a result of its own
-/// defines its value on failure.
+/// inside [`guard`]. A `mut` stage is not used by other calls meanwhile. A function with an error text as last argument
+/// reports a reason; one with a result of its own defines its value on failure.
 macro_rules! shims {
     () => {};
     (fn $name:ident($stage:ident: $kind:ident $(, $arg:ident: $ty:ty)* $(; $error:ident)?) $body:block $($rest:tt)*) => {
@@ -37,10 +46,26 @@ macro_rules! shims {
             $(, $arg: $ty)*
             $(, $error: *mut ConefieldText)?
         ) -> ConefieldStatus {
-            let error = [$($error,)? ptr::null_mut()][0];
+            let error = [$($error,)? std::ptr::null_mut()][0];
             // SAFETY: see `shims/mod.rs`.
             guard(error, || unsafe {
-                let $stage = built(stage).$kind()?;
+                let $stage = crate::shims::built(stage).$kind()?;
+                $body;
+                Ok(())
+            })
+        }
+        shims! { $($rest)* }
+    };
+    (fn $name:ident(mut $stage:ident: $kind:ident $(, $arg:ident: $ty:ty)* $(; $error:ident)?) $body:block $($rest:tt)*) => {
+        unsafe extern "C" fn $name(
+            stage: *mut c_void
+            $(, $arg: $ty)*
+            $(, $error: *mut ConefieldText)?
+        ) -> ConefieldStatus {
+            let error = [$($error,)? std::ptr::null_mut()][0];
+            // SAFETY: see `shims/mod.rs`; nothing else uses the stage meanwhile.
+            guard(error, || unsafe {
+                let $stage = (*stage.cast::<crate::built::Built>()).$kind()?;
                 $body;
                 Ok(())
             })
@@ -51,8 +76,8 @@ macro_rules! shims {
         unsafe extern "C" fn $name(stage: *const c_void $(, $arg: $ty)*) -> $out {
             let mut out = $failed;
             // SAFETY: see `shims/mod.rs`.
-            guard(ptr::null_mut(), || unsafe {
-                let $stage = built(stage).$kind()?;
+            guard(std::ptr::null_mut(), || unsafe {
+                let $stage = crate::shims::built(stage).$kind()?;
                 out = $body;
                 Ok(())
             });
@@ -118,6 +143,30 @@ unsafe fn text<'a>(s: ConefieldStr) -> Result<&'a str> {
     // SAFETY: see the top of this file.
     let bytes = unsafe { many(s.data, s.length) };
     std::str::from_utf8(bytes).map_err(|e| Error::unsupported("a text from the host", e.to_string()))
+}
+
+unsafe fn grid(grid: *const ConefieldGrid) -> VoxelGrid {
+    // SAFETY: see `shims/mod.rs`.
+    let ConefieldGrid { shape, spacing, center } = unsafe { *grid };
+    VoxelGrid { shape, spacing, center }
+}
+
+/// The size of a scan of which only the volume or only the views are known.
+fn header(volume: [usize; 3], [views, rows, columns]: [usize; 3]) -> ScanHeader {
+    ScanHeader { views, detector: [rows, columns], volume }
+}
+
+/// `shape` numbers at `data`.
+unsafe fn array<'a, R: Real>(shape: [usize; 3], data: *const R) -> Result<ArrayView3<'a, R>> {
+    // SAFETY: see `shims/mod.rs`.
+    let data = unsafe { many(data, shape.iter().product()) };
+    ArrayView3::from_shape(shape, data).map_err(|e| Error::unsupported("an array from the host", e.to_string()))
+}
+
+unsafe fn array_mut<'a, R: Real>(shape: [usize; 3], data: *mut R) -> Result<ArrayViewMut3<'a, R>> {
+    // SAFETY: see `shims/mod.rs`.
+    let data = unsafe { many_mut(data, shape.iter().product()) };
+    ArrayViewMut3::from_shape(shape, data).map_err(|e| Error::unsupported("an array from the host", e.to_string()))
 }
 
 unsafe fn built<'a>(stage: *const c_void) -> &'a Built {
@@ -279,7 +328,7 @@ mod tests {
             |v: &mut [f32], channels| ConefieldTileMut { data: v.as_mut_ptr(), channels, rows: 3, stride: 5 };
         let (params, mut grads) = ([2.0f32], [10.0f32]);
         let none = ptr::null_mut();
-        let (forward, backward) = (MAP.forward.unwrap(), MAP.backward.unwrap());
+        let (forward, backward) = (map::TABLE.forward.unwrap(), map::TABLE.backward.unwrap());
         unsafe {
             let (out, left) = (tile_mut(&mut y, 3), tile_mut(&mut tape, 1));
             assert_eq!(forward(stage, params.as_ptr(), tile(&x, 3), out, left, none), CONEFIELD_OK);
@@ -303,7 +352,7 @@ mod tests {
         let mut error = room(&mut bytes);
         let (x, mut y, mut tape) = ([0.5f32; 3], [0.0f32; 3], [0.0f32; 1]);
         let status = unsafe {
-            MAP.forward.unwrap()(
+            map::TABLE.forward.unwrap()(
                 stage,
                 [1.0f32].as_ptr(),
                 ConefieldTile { data: x.as_ptr(), channels: 3, rows: 1, stride: 1 },

@@ -1,22 +1,13 @@
 //! Projectors.
 
-use super::{built, guard, hand_over, many, many_mut, shims, wgsl};
+use super::{guard, hand_over, many, many_mut, shims, table, wgsl};
 use conefield_core::error::Error;
 use conefield_core::stage::{Lengths, Samples, UnitRay};
 use conefield_plugin_abi::*;
 use std::cell::RefCell;
 use std::ffi::c_void;
-use std::ptr;
 
-pub static PROJECTOR: ConefieldProjector = ConefieldProjector {
-    size: size_of::<ConefieldProjector>(),
-    max_samples: Some(max_samples),
-    sample: Some(sample),
-    integrate: Some(integrate),
-    adjoint: Some(adjoint),
-    fitted: Some(fitted),
-    wgsl: Some(wgsl),
-};
+table! { ConefieldProjector: max_samples sample integrate adjoint fitted wgsl }
 
 /// A ray in the unit cube.
 pub(super) fn ray(ray: &ConefieldRay) -> UnitRay {
@@ -57,6 +48,10 @@ shims! {
         projector.integrate(many(weights, count), many(mu, count))
     }
 
+    fn adjoint(projector: projector, weights: *const f32, dline: f64, dmu: *mut f64, count: usize) -> (), or (), {
+        projector.adjoint(many(weights, count), dline, many_mut(dmu, count));
+    }
+
     fn fitted(projector: projector, lengths: *const ConefieldLengths, out: *mut *mut c_void; error) {
         let ConefieldLengths { voxel_mm, cell_mm } = *lengths;
         let lengths = Lengths { voxel_mm, cell_mm: (cell_mm > 0.0).then_some(cell_mm) };
@@ -64,12 +59,4 @@ shims! {
             *out = hand_over(fitted);
         }
     }
-}
-
-unsafe extern "C" fn adjoint(stage: *const c_void, weights: *const f32, dline: f64, dmu: *mut f64, count: usize) {
-    guard(ptr::null_mut(), || {
-        // SAFETY: see `shims/mod.rs`.
-        unsafe { built(stage).projector()?.adjoint(many(weights, count), dline, many_mut(dmu, count)) };
-        Ok(())
-    });
 }

@@ -1,22 +1,11 @@
-//! Losses and priors.
+//! Losses.
 
-use super::{built, guard, hand_over, many, many_mut, shims, wgsl};
+use super::{guard, hand_over, many, many_mut, shims, table, wgsl};
 use conefield_core::loss::NoiseModel;
-use conefield_core::prior::Blocks;
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
-use std::ptr;
 
-pub static LOSS: ConefieldLoss = ConefieldLoss {
-    size: size_of::<ConefieldLoss>(),
-    at: Some(at),
-    needs_scan: Some(needs_scan),
-    fitted: Some(fitted),
-    wgsl: Some(wgsl),
-};
-
-pub static PRIOR: ConefieldPrior =
-    ConefieldPrior { size: size_of::<ConefieldPrior>(), blocks: Some(blocks), block: Some(block), wgsl: Some(wgsl) };
+table! { ConefieldLoss: at needs_scan fitted wgsl }
 
 shims! {
     fn at(loss: loss, predicted: *const f64, measured: *const f64, count: usize, out: *mut f64, slope: *mut f64; error) {
@@ -36,17 +25,5 @@ shims! {
             *out = hand_over(fitted);
         }
         loss.fault()?;
-    }
-
-    fn blocks(prior: prior, out: *mut ConefieldBlocks) {
-        let Blocks { edge, count, spacing, weight } = prior.blocks();
-        *out = ConefieldBlocks { edge, count, spacing, weight };
-    }
-
-    fn block(
-        prior: prior, values: *const f64, count: usize, scale: f64, gradient: *mut f64, penalty: *mut f64; error
-    ) {
-        *penalty = prior.block(many(values, count), scale, many_mut(gradient, count));
-        prior.fault()?;
     }
 }

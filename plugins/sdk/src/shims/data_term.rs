@@ -1,0 +1,39 @@
+//! Data terms and their misfits for a scan.
+
+use super::{array, guard, hand_over, header, many, many_mut, shims, table};
+use conefield_plugin_abi::*;
+use std::ffi::c_void;
+
+table! { ConefieldDataTerm: bytes of noise differentiate curve spread }
+
+shims! {
+    fn bytes(term: data_term, shape: *const usize, held: *mut u64, brief: *mut u64) -> (), or (), {
+        let header = header([0; 3], *shape.cast());
+        (*held, *brief) = (term.held(&header), term.scratch(&header));
+    }
+
+    fn of(
+        term: data_term, measured: *const f32, shape: *const usize, misfit: *mut *mut c_void; error
+    ) {
+        *misfit = hand_over(term.of(array(*shape.cast(), measured)?)?);
+    }
+
+    fn noise(misfit: misfit) -> f64, or f64::NAN, { misfit.noise() }
+
+    fn differentiate(
+        misfit: misfit, view: usize, measured: *const f32, count: usize, residuals: *mut f32, sum: *mut f64; error
+    ) {
+        *sum = misfit.differentiate(view, many(measured, count), many_mut(residuals, count));
+        misfit.fault()?;
+    }
+
+    fn curve(misfit: misfit, view: usize, measured: *const f32, count: usize, values: *mut f32; error) {
+        misfit.curve(view, many(measured, count), many_mut(values, count));
+        misfit.fault()?;
+    }
+
+    fn spread(misfit: misfit, view: usize, measured: *const f32, count: usize, values: *mut f32; error) {
+        misfit.spread(view, many(measured, count), many_mut(values, count));
+        misfit.fault()?;
+    }
+}

@@ -1,0 +1,22 @@
+//! Priors.
+
+use super::{guard, many, many_mut, shims, table, wgsl};
+use conefield_core::prior::Blocks;
+use conefield_plugin_abi::*;
+use std::ffi::c_void;
+
+table! { ConefieldPrior: blocks block wgsl }
+
+shims! {
+    fn blocks(prior: prior, out: *mut ConefieldBlocks) {
+        let Blocks { edge, count, spacing, weight } = prior.blocks();
+        *out = ConefieldBlocks { edge, count, spacing, weight };
+    }
+
+    fn block(
+        prior: prior, values: *const f64, count: usize, scale: f64, gradient: *mut f64, penalty: *mut f64; error
+    ) {
+        *penalty = prior.block(many(values, count), scale, many_mut(gradient, count));
+        prior.fault()?;
+    }
+}

@@ -1,0 +1,158 @@
+//! The checks of each kind, for a stage that its settings build.
+
+use crate::{
+    Options, Outcome, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
+    check_loss_wgsl, check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl,
+    check_regularizer, check_voxel_projector, check_wgsl, ready,
+};
+use conefield_core::arena::Weights;
+use conefield_core::basis::BasisSpec;
+use conefield_core::data_term::DataTermSpec;
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::loss::Loss;
+use conefield_core::registry::{Kind, Origin, Settings, stage_types};
+use conefield_core::regularizer::RegularizerSpec;
+use conefield_core::settings::{
+    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+};
+use conefield_core::spec::stage::read;
+use conefield_core::stage::Stage;
+use conefield_core::voxel::VoxelProjectorSpec;
+use conefield_core::wgsl::Runner;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+/// How [`check_type`] checks a stage.
+pub struct With<'a> {
+    /// Input channels of normalizers and fields. WGSL is checked at the largest number only: it takes long to compile.
+    pub widths: &'a [usize],
+    /// Changes the default options of stages that map rows.
+    pub options: &'a dyn Fn(Options) -> Options,
+    /// The device for WGSL, or the reason why there is none. It is asked for only if a stage has WGSL.
+    pub device: &'a dyn Fn() -> std::result::Result<&'a dyn Runner, String>,
+}
+
+impl With<'_> {
+    /// Adds the check of a stage's WGSL to its report.
+    fn on_device(&self, mut report: Report, has_wgsl: bool, check: impl FnOnce(&dyn Runner) -> Report) -> Report {
+        let skipped = |why: String| vec![("WGSL parity", Outcome::Skipped(why))];
+        report.entries.extend(match has_wgsl.then(|| (self.device)()) {
+            None => skipped("the stage offers none".into()),
+            Some(Err(why)) => skipped(why),
+            Some(Ok(device)) => check(device).entries,
+        });
+        report
+    }
+
+    fn rows(&self, report: Report, stage: &dyn Stage, options: &Options) -> Report {
+        self.on_device(report, stage.wgsl().is_some(), |device| {
+            check_wgsl(stage, options, &|s, p, x, dy, rows| device.pass(s, p, x, dy, rows))
+        })
+    }
+
+    fn loss(&self, loss: &dyn Loss) -> Report {
+        self.on_device(check_loss(loss), loss.wgsl().is_some(), |device| {
+            check_loss_wgsl(loss, &|loss, pairs| device.losses(loss, pairs))
+        })
+    }
+
+    /// [`Self::rows`] at the largest width.
+    fn last(&self, width: usize, report: Report, stage: &dyn Stage, options: &Options) -> Report {
+        let is_last = self.widths.iter().all(|other| *other <= width);
+        if is_last { self.rows(report, stage, options) } else { report }
+    }
+
+    /// The report of each width. A field may accept only the channels of a point; it must accept one width.
+    fn wide(&self, check: impl Fn(usize, &Options) -> Result<Report>) -> Result<Vec<(Option<usize>, Report)>> {
+        let options = (self.options)(Options::features());
+        let (mut found, mut refused) = (vec![], None);
+        for width in self.widths {
+            match check(*width, &options) {
+                Ok(report) => found.push((Some(*width), report)),
+                Err(e) => refused = Some(e),
+            }
+        }
+        refused.filter(|_| found.is_empty()).map_or(Ok(found), Err)
+    }
+}
+
+/// Numbers of input channels at which normalizers and fields are checked by default.
+pub const WIDTHS: [usize; 4] = [1, 3, 8, 20];
+
+/// Checks every stage type that the crate `package` registers, with the settings of its registration, for the tests of
+/// a plugin.
+pub fn check_package(package: &str) -> Result<Vec<Report>> {
+    let device = || Err("this test opens none; `conefield plugins check` does".into());
+    let with = With { widths: &WIDTHS, options: &|options| options, device: &device };
+    let mut reports = vec![];
+    for t in stage_types() {
+        if matches!(t.origin, Origin::Linked { package: own, .. } if own == package) {
+            reports.extend(check_type(t.kind, &t.example(), &with)?.into_iter().map(|(_, report)| report));
+        }
+    }
+    ensure(!reports.is_empty(), package, "stages", "none", "at least one registered stage type")?;
+    Ok(reports)
+}
+
+/// Builds a stage of `kind` from `settings`, which include its type, and runs the checks of the kind. Gives each report
+/// with the number of input channels, where that is a choice.
+pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(Option<usize>, Report)>> {
+    fn of<T: Settings + ?Sized>(settings: &Value) -> Result<Box<T>>
+    where
+        Box<T>: DeserializeOwned,
+    {
+        read(settings.clone()).map_err(|e| Error::invalid("spec", "", e, "settings of this type"))
+    }
+    let one = |report| Ok(vec![(None, report)]);
+    match kind {
+        Kind::Encoder => {
+            let (stage, options) = (of::<dyn EncoderSpec>(settings)?.build()?, (with.options)(Options::encoder()));
+            one(with.rows(check_encoder(stage.as_ref(), &options), stage.as_ref(), &options))
+        }
+        Kind::Normalizer => {
+            let spec = of::<dyn NormalizerSpec>(settings)?;
+            with.wide(|width, options| {
+                let stage = spec.build(width)?;
+                let report = check_normalizer(stage.as_ref(), options);
+                Ok(with.last(width, report, stage.as_ref(), options))
+            })
+        }
+        Kind::Field => {
+            let spec = of::<dyn FieldSpec>(settings)?;
+            with.wide(|width, options| {
+                let stage = spec.build(width)?;
+                let report = check_field(stage.as_ref(), options);
+                Ok(with.last(width, report, stage.as_ref(), options))
+            })
+        }
+        Kind::Projector => {
+            let stage = of::<dyn ProjectorSpec>(settings)?.build()?;
+            let report = check_projector(stage.as_ref());
+            one(with.on_device(report, stage.wgsl().is_some(), |device| {
+                check_projector_wgsl(stage.as_ref(), &|p, rays| device.samples(p, rays))
+            }))
+        }
+        Kind::Initializer => {
+            let none = |path: &str| -> Result<Weights> { Err(Error::unsupported(path, "no weights are read here")) };
+            one(check_initializer(of::<dyn InitializerSpec>(settings)?.build(&none)?.as_ref()))
+        }
+        Kind::Loss => {
+            let loss = of::<dyn LossSpec>(settings)?.build()?;
+            let all = [Some(with.loss(loss.as_ref())), ready(loss.as_ref()).map(|fitted| with.loss(fitted.as_ref()))];
+            Ok(all.into_iter().flatten().map(|report| (None, report)).collect())
+        }
+        Kind::Prior => {
+            let stage = of::<dyn PriorSpec>(settings)?.build()?;
+            one(with.on_device(check_prior(stage.as_ref()), stage.wgsl().is_some(), |device| {
+                check_prior_wgsl(stage.as_ref(), &|prior, values| device.penalty(prior, values))
+            }))
+        }
+        Kind::Regularizer => one(check_regularizer(of::<dyn RegularizerSpec>(settings)?.build()?.as_ref())),
+        Kind::DataTerm => one(check_data_term(of::<dyn DataTermSpec>(settings)?.build()?.as_ref())),
+        Kind::Basis => one(check_basis(of::<dyn BasisSpec>(settings)?.build()?.as_ref())),
+        Kind::VoxelProjector => one(check_voxel_projector(of::<dyn VoxelProjectorSpec>(settings)?.build()?.as_ref())),
+        Kind::Method | Kind::Callback => {
+            Err(Error::unsupported("conformance kit", format!("it has no checks of a {kind}")))
+        }
+    }
+}
