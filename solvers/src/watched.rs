@@ -1,9 +1,15 @@
-//! The voxels for PSNR during a reconstruction.
+//! What is looked at during a reconstruction: the voxels for PSNR, and the middle slices.
 
+use conefield_core::parts::Part;
 use conefield_core::random::mix;
 
 /// Edge of a block with one such voxel.
 const EDGE: usize = 4;
+
+/// The middle slices perpendicular to x, y and z.
+pub fn middle(shape: [usize; 3]) -> [Part; 3] {
+    [0, 1, 2].map(|axis| std::array::from_fn(|k| if k == axis { shape[k] / 2..shape[k] / 2 + 1 } else { 0..shape[k] }))
+}
 
 /// One random voxel of each block of 4³: every voxel is equally likely, whereas every 4th one along an axis would give
 /// some slices four times their weight and others none. The same voxels are used in every run and by every method, so

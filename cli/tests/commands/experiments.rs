@@ -80,6 +80,23 @@ fn live_slices_are_drawn_and_change_nothing() {
     assert!(volume(&plain) == volume(&watched));
 }
 
+/// As of a field, of voxels in 1/mm or in the scan's own unit.
+#[test]
+fn live_slices_of_iterative_methods_change_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| text(&dir.path().join(name));
+    done(&["simulate", "phantom:head:24", "-o", &at("scan"), "--views", "8", "--detector", "24x24"]);
+    for method in ["sart", "cgls", "fista"] {
+        let small = ["--spec", method, "--steps", "4", "-o"];
+        done(&[&["reconstruct", &at("scan")][..], &small, &[&at("plain")], &["--force"]].concat());
+        done(&[&["reconstruct", &at("scan")][..], &small, &[&at("live")], &["--force", "--live", "0.001s"]].concat());
+        let picture = Pixels::open(dir.path().join("live/live.png")).unwrap();
+        assert!(picture.width > 300 && picture.height > 300);
+        let volume = |run: &str| fs::read(dir.path().join(run).join("volume.nii.gz")).unwrap();
+        assert!(volume("plain") == volume("live"), "{method}");
+    }
+}
+
 #[test]
 fn features_are_drawn_and_their_variance_reported() {
     let (dir, run) = run(&[]);

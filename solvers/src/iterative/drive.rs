@@ -4,15 +4,17 @@ use super::monitor::VolumeMonitor;
 use super::problem::{Problem, copy};
 use super::stop::Stop;
 use crate::schedule::{Clock, Ends};
+use crate::waiting::Waited;
+use crate::watched;
 use conefield_core::Error;
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::finite::stray;
-use conefield_core::method::{Best, Job, Observer, Reconstruction, Record, Solution};
+use conefield_core::method::{Job, Observer, Reconstruction, Record, Solution};
 use conefield_core::place::{Array, Place, StatePart, squares};
 use conefield_core::scan::Volume;
 use conefield_core::space::Space;
-use ndarray::Array3;
+use ndarray::{Array3, s};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -57,8 +59,7 @@ pub trait Iteration {
 #[serde(deny_unknown_fields)]
 struct Kept {
     numbers: Vec<f64>,
-    best: Option<f64>,
-    since_best: u64,
+    waited: Waited,
     /// Whether a stopping rule is met.
     settled: bool,
 }
@@ -87,6 +88,9 @@ pub(super) fn drive(
         if cancelled {
             return Err(Error::Interrupted { step: run.step });
         }
+        if run.step > run.started && observer.slices_due() {
+            run.slices(method.as_mut(), observer)?;
+        }
         if run.over {
             return run.finish(method);
         }
@@ -102,7 +106,7 @@ struct Run<'a> {
     monitor: VolumeMonitor<'a>,
     clock: Clock,
     kept: Kept,
-    /// The volume that predicted held-out views best, see [`Kept::best`].
+    /// The volume that predicted held-out views best, see [`Kept::waited`].
     best: Option<Array>,
     /// The step at which this process started.
     started: u64,
@@ -205,14 +209,12 @@ impl<'a> Run<'a> {
         if let (Some(patience), Some(error), Some(best), Some(volume)) =
             (self.stop.patience, held_out, &mut self.best, volume)
         {
-            if kept.best.is_none_or(|b| error < b) {
-                kept.best = Some(error);
-                kept.since_best = 0;
+            let better = kept.waited.is_better(error);
+            if better {
                 copy(self.problem.place, volume, best)?;
-            } else {
-                kept.since_best += 1;
-                kept.settled |= kept.since_best >= patience;
             }
+            kept.waited.count(self.step, error, better);
+            kept.settled |= kept.waited.since >= patience;
         }
         if let (Some(limit), Some(change)) = (self.stop.change, pass.change) {
             kept.settled |= change < limit;
@@ -223,6 +225,20 @@ impl<'a> Run<'a> {
         Ok(record)
     }
 
+    /// Sends the middle slices of the current volume.
+    fn slices(&mut self, method: &mut dyn Iteration, observer: &mut dyn Observer) -> Result<()> {
+        self.clock.pause();
+        let mm = self.job.scan.unit.mm as f32;
+        let volume = self.problem.place.read(method.volume(self.problem)?)?;
+        let slices = watched::middle(volume.dim().into()).map(|part| {
+            let [x, y, z] = part.clone();
+            (part, volume.slice(s![x, y, z]).mapv(|v| v * mm))
+        });
+        observer.slices(self.job.scan.geometry.volume, &slices)?;
+        self.clock.resume();
+        Ok(())
+    }
+
     fn checkpoint(&mut self, method: &mut dyn Iteration, observer: &mut dyn Observer) -> Result<()> {
         self.clock.pause();
         self.kept.numbers = method.numbers().iter().map(|x| **x).collect();
@@ -230,7 +246,7 @@ impl<'a> Run<'a> {
         let kept = serde_json::json!(self.kept);
         let standing = Standing { step, recorded: step, seconds, method: kept, ..Standing::default() };
         let mut state = method.state();
-        if let (Some(best), Some(_)) = (&mut self.best, self.kept.best) {
+        if let (Some(best), Some(_)) = (&mut self.best, self.kept.waited.best) {
             state.push((BEST.into(), StatePart::Placed(best)));
         }
         let read = state.iter().map(|(n, x)| Ok((n, [x.count()], x.read(self.problem.place)?)));
@@ -244,7 +260,7 @@ impl<'a> Run<'a> {
     fn finish(mut self, method: Box<dyn Iteration + '_>) -> Result<Solution> {
         self.clock.pause();
         let Self { kept, step, job, .. } = self;
-        let volume = match self.best.filter(|_| kept.best.is_some()) {
+        let volume = match self.best.filter(|_| kept.waited.best.is_some()) {
             Some(best) => best,
             None => method.take(self.problem)?,
         };
@@ -260,7 +276,7 @@ impl<'a> Run<'a> {
             samples: 0,
             sampling_s: 0.0,
             rollbacks: 0,
-            best: kept.best.map(|held_out| Best { step: step - kept.since_best, held_out }),
+            best: kept.waited.best,
         })
     }
 }
@@ -280,7 +296,7 @@ pub(crate) fn finite(volume: &Array3<f32>, step: u64) -> Result<()> {
 fn restore(resume: &Resume, place: &dyn Place, method: &mut dyn Iteration, best: Option<&mut Array>) -> Result<Kept> {
     let kept: std::result::Result<Kept, _> = serde_json::from_value(resume.standing.method.clone());
     let kept = kept.map_err(|e| Error::invalid(&resume.place, "method", e, "the state of this method"))?;
-    let best = best.filter(|_| kept.best.is_some()).map(|best| (BEST.to_owned(), StatePart::Placed(best)));
+    let best = best.filter(|_| kept.waited.best.is_some()).map(|best| (BEST.to_owned(), StatePart::Placed(best)));
     for (name, mut values) in method.state().into_iter().chain(best) {
         let found = resume.tensor(&name).map(|t| &t.1);
         let fits = found.filter(|t| t.len() == values.count());

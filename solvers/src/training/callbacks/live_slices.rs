@@ -2,8 +2,8 @@
 
 use crate::training::Callback;
 use crate::training::run::Run;
+use crate::watched::middle;
 use conefield_core::error::Result;
-use conefield_core::parts::Part;
 use conefield_core::trained::Sampler;
 use ndarray::Array3;
 
@@ -24,11 +24,7 @@ impl Callback for LiveSlices {
         let grid = run.scene.grid;
         let mut sampler = Sampler::new(run.scene, run.job.scan.unit.mm, grid);
         let mut slices = vec![];
-        for axis in 0..3 {
-            let part: Part = std::array::from_fn(|k| {
-                let n = grid.shape[k];
-                if k == axis { n / 2..n / 2 + 1 } else { 0..n }
-            });
+        for part in middle(grid.shape) {
             let mut values = Array3::zeros(part.each_ref().map(|r| r.len()));
             sampler.fill(&run.model, run.exe.as_mut(), &part, values.view_mut())?;
             slices.push((part, values));

@@ -2,10 +2,11 @@
 
 use crate::training::run::{Run, strayed};
 use crate::training::{Callback, CallbackSpec, Kept, State};
+use crate::waiting::Waited;
 use conefield_core::arena::Layout;
 use conefield_core::checkpoint::tensors_of;
 use conefield_core::error::{Result, ensure};
-use conefield_core::method::{Best, Record};
+use conefield_core::method::Record;
 use conefield_core::pages::{Pages, copy};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -43,19 +44,10 @@ impl CallbackSpec for Patience {
     }
 }
 
-/// The state besides the best parameters.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Waited {
-    /// The best record so far; reset when channels are removed.
-    best: Option<Best>,
-    /// Records since the best one.
-    since: u64,
-}
-
 /// The callback that [`Patience`] builds.
 struct Waiting {
     records: u64,
+    /// Reset when channels are removed.
     waited: Waited,
     /// The best parameters.
     copy: Option<Pages>,
@@ -82,12 +74,8 @@ impl Callback for Waiting {
         // Short runs have records in between; they do not count.
         let counts = run.step.is_multiple_of(run.report_every) || run.clock.done(run.step) >= 1.0;
         let Some(held_out) = record.held_out.filter(|_| counts) else { return Ok(()) };
-        let better = held_out.is_finite() && self.waited.best.is_none_or(|b| held_out < b.held_out);
-        if better && self.keep(run)? {
-            self.waited = Waited { best: Some(Best { step: record.step, held_out }), since: 0 };
-        } else if self.waited.best.is_some() {
-            self.waited.since += 1;
-        }
+        let kept = self.waited.is_better(held_out) && self.keep(run)?;
+        self.waited.count(record.step, held_out, kept);
         run.settled |= self.waited.since >= self.records;
         Ok(())
     }
