@@ -11,6 +11,7 @@ mod command;
 mod dicom;
 mod hdf5;
 mod levers;
+mod matlab;
 mod metaimage;
 mod naf;
 mod nifti;
@@ -34,6 +35,7 @@ fn every_bad_input_ends_as_the_table_says() {
         ("NIfTI", nifti::cases()),
         ("MetaImage", metaimage::cases()),
         ("NumPy: `.npy` and `.npz`", numpy::cases()),
+        ("MATLAB: `.mat`", matlab::cases()),
         ("DICOM series", dicom::cases()),
         ("TIFF stacks", tiff::cases()),
         ("HDF5 and Nikon's description", hdf5::cases()),

@@ -56,6 +56,8 @@ pub const PARSERS: &[Parser] = &[
     plain("astra_vectors", seeds::scanner_vectors, "scanner.toml", scanner),
     plain("rtk", seeds::scanner_rtk, "geometry.xml", scanner),
     plain("npz", seeds::scanner_npz, "counts.npz", scanner),
+    plain("mat", seeds::scanner_mat, "counts.mat", scanner),
+    plain("mat_packed", seeds::scanner_mat_packed, "counts.mat", scanner),
     plain("tiff", seeds::scanner_tiff, "counts.tif", scanner),
     plain("tiff_deflate", seeds::scanner_tiff_deflate, "counts.tif", scanner),
     plain("tiff_lzw", seeds::scanner_tiff_lzw, "counts.tif", scanner),

@@ -240,6 +240,18 @@ macro_rules! fixture {
 }
 pub(super) use fixture;
 
+/// `scanner.toml`, `counts.mat` with a variable.
+pub fn scanner_mat(dir: &Path) {
+    put(&dir.join("counts.mat"), fixture!("counts_plain.mat"));
+    put(&dir.join("scanner.toml"), scanner_toml("counts.mat:counts", CIRCLE).as_bytes());
+}
+
+/// `scanner.toml`, `counts.mat` with a field of a packed struct.
+pub fn scanner_mat_packed(dir: &Path) {
+    put(&dir.join("counts.mat"), fixture!("counts.mat"));
+    put(&dir.join("scanner.toml"), scanner_toml("counts.mat:scan.counts", CIRCLE).as_bytes());
+}
+
 /// `scanner.toml`, `counts.tif` packed by Zstandard.
 pub fn scanner_tiff_zstd(dir: &Path) {
     put(&dir.join("counts.tif"), fixture!("zstd.tif"));
