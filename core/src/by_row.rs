@@ -16,6 +16,10 @@ use std::sync::Arc;
 /// Up to this many parameters, each worker sums gradients in its own copy. Above it, one worker sums all.
 const FEW: usize = 1 << 20;
 
+/// Rows whose outputs are written together. Those of one row are all in different cache lines, and with many rows these
+/// displace each other before the next row is written.
+const BLOCK: usize = 16;
+
 /// A map of the channels of one row. One source serves `f32` and `f64`.
 pub trait RowMap: Send + Sync + 'static {
     /// Input and output channels. An encoder has 3 inputs, a field 1 output.
@@ -114,14 +118,19 @@ impl<T: RowMap> ByRow<T> {
 }
 
 impl<T: RowMap, R: Real> Kernel<R> for ByRow<T> {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        let [mut row, mut out] = self.map.widths().map(|n| vec![R::ZERO; n]);
-        for i in 0..x.rows {
-            Self::take(x, i, &self.inputs, &mut row);
+    fn forward(&self, params: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        let [input, output] = self.map.widths();
+        let (mut row, mut out) = (vec![R::ZERO; input], vec![R::ZERO; output * BLOCK.min(x.rows)]);
+        for at in (0..x.rows).step_by(BLOCK) {
+            let rows = at..x.rows.min(at + BLOCK);
             out.fill(R::ZERO);
-            self.map.forward(params, &row, &mut out);
+            for i in rows.clone() {
+                Self::take(x, i, &self.inputs, &mut row);
+                self.map.forward(params, &row, &mut out[(i - at) * output..][..output]);
+            }
             for (c, &place) in self.outputs.iter().enumerate() {
-                y.data[c * y.rows + i] = out[place];
+                let from = out.iter().skip(place).step_by(output);
+                y.channel(c)[rows.clone()].iter_mut().zip(from).for_each(|(to, from)| *to = *from);
             }
         }
     }

@@ -4,15 +4,14 @@
 //! point's cell, trilinearly interpolated. A level whose vertices fit into the table is indexed directly, a finer one
 //! by `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
 
-use crate::levels::{self, BLOCK, LevelCode, by_channel, functions, kernel_of_levels, prefetch};
-use conefield_core::error::{Result, ensure};
+use crate::levels::{self, BLOCK, Levels, Pyramid, finest, leaving, prefetch, primes, sizes, table_size};
+use conefield_core::error::Result;
 use conefield_core::settings::EncoderSpec;
-use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use conefield_core::wgsl::Fragment;
+use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
+use conefield_core::stage::{Encoder, Tile};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 /// Published hash function.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -76,14 +75,14 @@ conefield_core::stage_type!(
 #[typetag::serde(name = "hash-grid")]
 impl EncoderSpec for HashGrid {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(HashGridStage::new(self)?))
+        Ok(Box::new(Levels::<Level>::new(self)?))
     }
 }
 
 /// Positions are `f32`: a finer grid leaves no fraction of a cell for interpolation.
 const FINEST: f64 = 8_388_608.0;
 
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 struct Level {
     /// `pos = x·scale + 0.5`.
     scale: f64,
@@ -93,86 +92,7 @@ struct Level {
     entries: u32,
     /// Whether the level is indexed directly.
     dense: bool,
-    /// Index of the first entry among all levels.
-    start: usize,
-    /// Index of the level in the settings, which names its parameters.
-    number: usize,
-    /// Output channel of each feature; `None` if unused.
-    outputs: Vec<Option<usize>>,
-}
-
-/// The stage that [`HashGrid`] builds.
-#[derive(Debug, Clone)]
-pub struct HashGridStage {
-    settings: HashGrid,
     primes: [u32; 3],
-    levels: Vec<Level>,
-    entries: usize,
-    outputs: usize,
-}
-
-impl HashGridStage {
-    /// Builds the stage, or names the setting that is out of range.
-    pub fn new(settings: &HashGrid) -> Result<Self> {
-        let s = settings;
-        let bad = |field: &str, found: String, expected: &str| ensure(false, "spec", field, found, expected);
-        if !(1..=32).contains(&s.levels) {
-            bad("levels", s.levels.to_string(), "1 to 32")?;
-        }
-        if ![1, 2, 4, 8].contains(&s.features) {
-            bad("features", s.features.to_string(), "1, 2, 4 or 8")?;
-        }
-        if !(2..=1 << 20).contains(&s.base_resolution) {
-            bad("base_resolution", s.base_resolution.to_string(), "2 to 2^20")?;
-        }
-        if !(s.growth >= 1.0 && s.growth <= 16.0) {
-            bad("growth", s.growth.to_string(), "1 to 16")?;
-        }
-        if !(4..=28).contains(&s.log2_table_size) {
-            bad("log2_table_size", s.log2_table_size.to_string(), "4 to 28")?;
-        }
-        let table = 1u64 << s.log2_table_size;
-        let mut levels = Vec::with_capacity(s.levels);
-        let mut start = 0usize;
-        for l in 0..s.levels {
-            let resolution = f64::from(s.base_resolution) * s.growth.powi(l as i32);
-            if resolution > FINEST {
-                bad(
-                    "levels",
-                    format!("level {l} with {resolution:.0} cells per side"),
-                    "at most 2^23 cells per side (positions are single precision): fewer levels or less growth",
-                )?;
-            }
-            let scale = resolution - 1.0;
-            // Cells range from floor(0.5) to floor(scale + 0.5), and each has a corner one further.
-            let side = (scale + 0.5).floor() as u64 + 2;
-            let vertices = u128::from(side).pow(3);
-            let dense = vertices <= u128::from(table);
-            let entries = if dense { vertices as u64 } else { table };
-            levels.push(Level {
-                scale,
-                side: side as u32,
-                entries: entries as u32,
-                dense,
-                start,
-                number: l,
-                outputs: (0..s.features).map(|f| Some(l * s.features + f)).collect(),
-            });
-            start += entries as usize;
-        }
-        Ok(Self {
-            primes: s.convention.primes(),
-            outputs: s.levels * s.features,
-            entries: start,
-            levels,
-            settings: s.clone(),
-        })
-    }
-
-    fn params_of(&self, level: &Level) -> Range<usize> {
-        let f = self.settings.features;
-        level.start * f..(level.start + level.entries as usize) * f
-    }
 }
 
 /// Cells of a block's rows on one level. The corners of a cell are the ends of four edges along x; edge `e` has the
@@ -190,77 +110,14 @@ struct Located<R> {
     weight: [[R; BLOCK]; 4],
 }
 
-impl<R: Real> Located<R> {
-    fn new() -> Self {
+impl<R: Real> Default for Located<R> {
+    fn default() -> Self {
         let (entries, numbers) = ([0; BLOCK], [R::ZERO; BLOCK]);
         Self { cell: [entries; 3], fraction: [numbers; 3], near: [entries; 4], far: [entries; 4], weight: [numbers; 4] }
     }
+}
 
-    /// Locates rows `at..at + n` of `x`. Points outside the cube are clamped to its rim.
-    #[inline(always)]
-    fn locate<S: Simd>(&mut self, s: S, level: &Level, primes: [u32; 3], x: Tile<'_, R>, at: usize, n: usize) {
-        let number = |x: f64| V::<S, R>::splat(s, R::of(x));
-        let (zero, half, scale, top) = (number(0.0), number(0.5), number(level.scale), number(level.scale + 0.5));
-        // `top` may have been rounded up to the start of another cell.
-        let last = number(f64::from(level.side - 2));
-        for d in 0..3 {
-            let x = &x.channel(d)[at..at + n];
-            let mut i = 0;
-            while i < n {
-                // NaN becomes 0 here: the precise maximum returns its other operand.
-                let p = load(s, x, i).mul_add(scale, half).max_precise(zero).min(top);
-                let c = p.floor().min(last);
-                store::<S, R>(p - c, &mut self.fraction[d], i);
-                R::cells(s, c, &mut self.cell[d][i..]);
-                i += V::<S, R>::LEN;
-            }
-        }
-        // These loops process the whole block, even if it has fewer rows: a constant length makes them faster.
-        let [cx, cy, cz] = &self.cell;
-        if level.dense {
-            let (sy, sz) = (level.side, level.side * level.side);
-            for i in 0..BLOCK {
-                let base = cx[i] + cy[i] * sy + cz[i] * sz;
-                for e in 0..4u32 {
-                    self.near[e as usize][i] = base + (e & 1) * sy + (e >> 1) * sz;
-                }
-            }
-        } else {
-            let mask = level.entries - 1;
-            for i in 0..BLOCK {
-                let (y0, z0) = (cy[i].wrapping_mul(primes[1]), cz[i].wrapping_mul(primes[2]));
-                let (y1, z1) = (y0.wrapping_add(primes[1]), z0.wrapping_add(primes[2]));
-                let (x0, x1) = (cx[i].wrapping_mul(primes[0]), (cx[i] + 1).wrapping_mul(primes[0]));
-                for e in 0..4 {
-                    let (y, z) = (if e & 1 == 0 { y0 } else { y1 }, if e & 2 == 0 { z0 } else { z1 });
-                    self.near[e][i] = (x0 ^ y ^ z) & mask;
-                    self.far[e][i] = (x1 ^ y ^ z) & mask;
-                }
-            }
-        }
-        let [_, fy, fz] = &self.fraction;
-        for e in 0..4 {
-            for i in 0..BLOCK {
-                let y = if e & 1 == 0 { R::ONE - fy[i] } else { fy[i] };
-                let z = if e & 2 == 0 { R::ONE - fz[i] } else { fz[i] };
-                self.weight[e][i] = y * z;
-            }
-        }
-    }
-
-    /// For each of the first `n` rows, whether it is the last one before a row in another cell; and their number.
-    #[inline(always)]
-    fn leaving(&self, n: usize) -> ([bool; BLOCK], usize) {
-        let mut leaves = [true; BLOCK];
-        let [cx, cy, cz] = &self.cell;
-        for i in 0..BLOCK - 1 {
-            leaves[i] = (cx[i] != cx[i + 1]) | (cy[i] != cy[i + 1]) | (cz[i] != cz[i + 1]);
-        }
-        leaves[n - 1] = true;
-        let count = leaves[..n].iter().map(|&l| usize::from(l)).sum();
-        (leaves, count)
-    }
-
+impl<R: Real> Located<R> {
     /// Entries of the two ends of edge `e` of row `i`, on a dense or hashed level.
     #[inline(always)]
     fn ends(&self, dense: bool, e: usize, i: usize) -> [u32; 2] {
@@ -276,11 +133,11 @@ impl<R: Real> Located<R> {
     }
 }
 
-/// Entry `i` of a level's table, with `i` from [`Located::locate`] for the same level.
+/// Entry `i` of a level's table, with `i` from `locate` for the same level.
 #[inline(always)]
 #[allow(unsafe_code)]
 fn entry<T>(table: &[T], i: u32) -> &T {
-    // SAFETY: callers slice `table` to the level's `entries`. `locate` yields indices below that: a hash is masked
+    // SAFETY: callers check that `table` has the level's `entries`. `locate` yields indices below that: a hash is masked
     // by `entries - 1`, and direct indices come from cells clamped to `side - 2`, whose corners end at `side³ - 1`.
     unsafe { levels::entry(table, i) }
 }
@@ -363,57 +220,6 @@ fn interpolate<S: Simd, R: Real, const F: usize, const DENSE: bool>(
     }
 }
 
-struct Forward<'a, R> {
-    stage: &'a HashGridStage,
-    levels: Range<usize>,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-}
-
-impl<R: Real> Forward<'_, R> {
-    #[inline(always)]
-    fn features<S: Simd, const F: usize>(mut self, s: S) {
-        let mut located = Located::new();
-        let mut out = [[R::ZERO; F]; BLOCK];
-        for level in &self.stage.levels[self.levels.clone()] {
-            let (table, _) = self.params[self.stage.params_of(level)].as_chunks::<F>();
-            assert_eq!(table.len(), level.entries as usize);
-            for at in (0..self.x.rows).step_by(BLOCK) {
-                let n = BLOCK.min(self.x.rows - at);
-                located.locate(s, level, self.stage.primes, self.x, at, n);
-                if level.dense {
-                    interpolate::<S, R, F, true>(s, table, &located, n, &mut out);
-                } else {
-                    prefetch(table, located.near.iter().chain(&located.far), n);
-                    interpolate::<S, R, F, false>(s, table, &located, n, &mut out);
-                }
-                for (f, channel) in level.outputs.iter().enumerate() {
-                    if let Some(c) = *channel {
-                        for (y, out) in self.y.channel(c)[at..at + n].iter_mut().zip(&out) {
-                            *y = out[f];
-                        }
-                    }
-                }
-            }
-        }
-    }
-}
-
-impl<R: Real> Op for Forward<'_, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        match self.stage.settings.features {
-            1 => self.features::<S, 1>(s),
-            2 => self.features::<S, 2>(s),
-            4 => self.features::<S, 4>(s),
-            _ => self.features::<S, 8>(s),
-        }
-    }
-}
-
 /// Adds the contributions of the first `n` rows at `located` to a level's gradients. If many consecutive rows share a
 /// cell, they are summed first: the entries are then read and written once for all of them, and no row waits for the
 /// writes of the previous one.
@@ -425,7 +231,12 @@ fn scatter<S: Simd, R: Real, const F: usize, const DENSE: bool>(
     dy: &[[R; F]; BLOCK],
     n: usize,
 ) {
-    let (leaves, cells) = located.leaving(n);
+    let [cx, cy, cz] = &located.cell;
+    let (leaves, cells) = leaving(
+        n,
+        #[inline(always)]
+        |i| (cx[i] != cx[i + 1]) | (cy[i] != cy[i + 1]) | (cz[i] != cz[i + 1]),
+    );
     let together = 3 * cells <= n;
     let zero = R::Four::<S>::splat(s, R::ZERO);
     let mut sums = [[zero; 4]; 4];
@@ -460,222 +271,196 @@ fn scatter<S: Simd, R: Real, const F: usize, const DENSE: bool>(
     }
 }
 
-struct Backward<'a, R> {
-    stage: &'a HashGridStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
-}
+impl levels::Level for Level {
+    type Settings = HashGrid;
+    type Located<R: Real> = Located<R>;
 
-impl<R: Real> Backward<'_, R> {
+    const NAME: &'static str = "hash-grid";
+    const BASE: (RangeInclusive<u32>, &'static str) = (2..=1 << 20, "2 to 2^20");
+    const WGSL: &'static [&'static str] = &[include_str!("hash_grid.wgsl")];
+
+    fn pyramid(s: &HashGrid) -> Pyramid {
+        Pyramid { levels: s.levels, features: s.features, base_resolution: s.base_resolution, growth: s.growth }
+    }
+
+    fn parts(s: &HashGrid, number: usize, resolution: f64, _: usize) -> Result<Vec<Self>> {
+        let table = table_size(s.log2_table_size)?;
+        let expected = "at most 2^23 cells per side (positions are single precision): fewer levels or less growth";
+        finest(number, resolution, FINEST, expected)?;
+        let scale = resolution - 1.0;
+        // Cells range from floor(0.5) to floor(scale + 0.5), and each has a corner one further.
+        let side = (scale + 0.5).floor() as u32 + 2;
+        let vertices = u128::from(side).pow(3);
+        let dense = vertices <= u128::from(table);
+        let entries = if dense { vertices as u32 } else { table };
+        Ok(vec![Self { scale, side, entries, dense, primes: s.convention.primes() }])
+    }
+
+    fn resolution(&self) -> f64 {
+        self.scale + 1.0
+    }
+
+    fn blocks(&self, features: usize) -> Vec<(String, Vec<usize>)> {
+        vec![("table".into(), vec![self.entries as usize, features])]
+    }
+
+    fn macs(features: usize) -> usize {
+        8 * features + 16
+    }
+
+    /// Points outside the cube are clamped to its rim.
     #[inline(always)]
-    fn features<S: Simd, const F: usize>(mut self, s: S) {
-        let mut located = Located::new();
-        let (mut dy, zeros) = ([[R::ZERO; F]; BLOCK], [R::ZERO; BLOCK]);
-        if let Some(dx) = &mut self.dx {
-            dx.data.fill(R::ZERO);
+    fn locate<S: Simd, R: Real>(&self, s: S, to: &mut Located<R>, x: Tile<'_, R>, at: usize, n: usize) {
+        let number = |x: f64| V::<S, R>::splat(s, R::of(x));
+        let (zero, half, scale, top) = (number(0.0), number(0.5), number(self.scale), number(self.scale + 0.5));
+        // `top` may have been rounded up to the start of another cell.
+        let last = number(f64::from(self.side - 2));
+        for d in 0..3 {
+            let x = &x.channel(d)[at..at + n];
+            let mut i = 0;
+            while i < n {
+                // NaN becomes 0 here: the precise maximum returns its other operand.
+                let p = load(s, x, i).mul_add(scale, half).max_precise(zero).min(top);
+                let c = p.floor().min(last);
+                store::<S, R>(p - c, &mut to.fraction[d], i);
+                R::cells(s, c, &mut to.cell[d][i..]);
+                i += V::<S, R>::LEN;
+            }
         }
-        for level in &self.stage.levels {
-            let params = self.stage.params_of(level);
-            let range = self.grads.range.clone();
-            let (from, to) = (params.start.max(range.start), params.end.min(range.end));
-            if from >= to && self.dx.is_none() {
+        // These loops process the whole block, even if it has fewer rows: a constant length makes them faster.
+        let [cx, cy, cz] = &to.cell;
+        if self.dense {
+            let (sy, sz) = (self.side, self.side * self.side);
+            for i in 0..BLOCK {
+                let base = cx[i] + cy[i] * sy + cz[i] * sz;
+                for e in 0..4u32 {
+                    to.near[e as usize][i] = base + (e & 1) * sy + (e >> 1) * sz;
+                }
+            }
+        } else {
+            let mask = self.entries - 1;
+            for i in 0..BLOCK {
+                let (y0, z0) = (cy[i].wrapping_mul(self.primes[1]), cz[i].wrapping_mul(self.primes[2]));
+                let (y1, z1) = (y0.wrapping_add(self.primes[1]), z0.wrapping_add(self.primes[2]));
+                let (x0, x1) = (cx[i].wrapping_mul(self.primes[0]), (cx[i] + 1).wrapping_mul(self.primes[0]));
+                for e in 0..4 {
+                    let (y, z) = (if e & 1 == 0 { y0 } else { y1 }, if e & 2 == 0 { z0 } else { z1 });
+                    to.near[e][i] = (x0 ^ y ^ z) & mask;
+                    to.far[e][i] = (x1 ^ y ^ z) & mask;
+                }
+            }
+        }
+        let [_, fy, fz] = &to.fraction;
+        for e in 0..4 {
+            for i in 0..BLOCK {
+                let y = if e & 1 == 0 { R::ONE - fy[i] } else { fy[i] };
+                let z = if e & 2 == 0 { R::ONE - fz[i] } else { fz[i] };
+                to.weight[e][i] = y * z;
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn gather<S: Simd, R: Real, const F: usize>(
+        &self,
+        s: S,
+        located: &Located<R>,
+        table: &[[R; F]],
+        out: &mut [[R; F]; BLOCK],
+        n: usize,
+    ) {
+        assert_eq!(table.len(), self.entries as usize);
+        if self.dense {
+            interpolate::<S, R, F, true>(s, table, located, n, out);
+        } else {
+            prefetch(table, located.near.iter().chain(&located.far), n);
+            interpolate::<S, R, F, false>(s, table, located, n, out);
+        }
+    }
+
+    #[inline(always)]
+    fn scatter<S: Simd, R: Real, const F: usize>(
+        &self,
+        s: S,
+        located: &Located<R>,
+        _: &[[R; F]],
+        dy: &[[R; F]; BLOCK],
+        n: usize,
+        grads: &mut [R],
+        _: &Range<usize>,
+    ) {
+        let (grads, _) = grads.as_chunks_mut::<F>();
+        assert_eq!(grads.len(), self.entries as usize);
+        if self.dense {
+            scatter::<S, R, F, true>(s, grads, located, dy, n);
+        } else {
+            prefetch(grads, located.near.iter().chain(&located.far), n);
+            scatter::<S, R, F, false>(s, grads, located, dy, n);
+        }
+    }
+
+    #[inline(always)]
+    fn slope<R: Real, const F: usize>(
+        &self,
+        located: &Located<R>,
+        table: &[[R; F]],
+        dy: &[R; F],
+        x: [R; 3],
+        i: usize,
+    ) -> [R; 3] {
+        let mut v = [R::ZERO; 8];
+        for c in 0..8 {
+            let entry = &table[located.ends(self.dense, c >> 1, i)[c & 1] as usize];
+            v[c] = (0..F).map(|f| entry[f] * dy[f]).sum();
+        }
+        let mut slopes = [R::ZERO; 3];
+        for d in 0..3 {
+            // Beyond the rim a position is clamped, whatever its value.
+            if !(x[d] <= R::ONE && x[d] * R::of(self.scale) + R::of(0.5) >= R::ZERO) {
                 continue;
             }
-            // If only part of a level is requested, the rest is summed too, into a separate buffer: the order of
-            // summation stays the same.
-            let part = if from < to && to - from < params.len() { params.len() } else { 0 };
-            let mut beside = vec![R::ZERO; part];
-            let own = if from < to { from - range.start..to - range.start } else { 0..0 };
-            let place = if part > 0 { from - params.start..to - params.start } else { 0..0 };
-            if part > 0 {
-                beside[place.clone()].copy_from_slice(&self.grads.values[own.clone()]);
-            }
-            let grads = if part > 0 { &mut beside[..] } else { &mut self.grads.values[own.clone()] };
-            let (grads, _) = grads.as_chunks_mut::<F>();
-            assert!(grads.is_empty() || grads.len() == level.entries as usize);
-            for at in (0..self.x.rows).step_by(BLOCK) {
-                let n = BLOCK.min(self.x.rows - at);
-                let mut channels = [&zeros[..n]; F];
-                for (from, channel) in channels.iter_mut().zip(&level.outputs) {
-                    if let Some(c) = *channel {
-                        *from = &self.dy.channel(c)[at..at + n];
-                    }
+            for c in 0..8 {
+                let mut w = if c >> d & 1 == 1 { R::of(self.scale) } else { R::of(-self.scale) };
+                for e in (0..3).filter(|&e| e != d) {
+                    let fraction = located.fraction[e][i];
+                    w *= if c >> e & 1 == 1 { fraction } else { R::ONE - fraction };
                 }
-                for i in 0..n {
-                    for f in 0..F {
-                        dy[i][f] = channels[f][i];
-                    }
-                }
-                located.locate(s, level, self.stage.primes, self.x, at, n);
-                if !grads.is_empty() {
-                    if level.dense {
-                        scatter::<S, R, F, true>(s, grads, &located, &dy, n);
-                    } else {
-                        prefetch(grads, located.near.iter().chain(&located.far), n);
-                        scatter::<S, R, F, false>(s, grads, &located, &dy, n);
-                    }
-                }
-                if let Some(dx) = &mut self.dx {
-                    let (table, _) = self.params[params.clone()].as_chunks::<F>();
-                    for i in 0..n {
-                        let v: [R; 8] = std::array::from_fn(|c| {
-                            let entry = &table[located.ends(level.dense, c >> 1, i)[c & 1] as usize];
-                            (0..F).map(|f| entry[f] * dy[i][f]).sum()
-                        });
-                        for d in 0..3 {
-                            // Beyond the rim a position is clamped, whatever its value.
-                            let x = self.x.channel(d)[at + i];
-                            if !(x <= R::ONE && x * R::of(level.scale) + R::of(0.5) >= R::ZERO) {
-                                continue;
-                            }
-                            let mut slope = R::ZERO;
-                            for c in 0..8 {
-                                let mut w = if c >> d & 1 == 1 { R::of(level.scale) } else { R::of(-level.scale) };
-                                for e in (0..3).filter(|&e| e != d) {
-                                    let fraction = located.fraction[e][i];
-                                    w *= if c >> e & 1 == 1 { fraction } else { R::ONE - fraction };
-                                }
-                                slope += w * v[c];
-                            }
-                            dx.channel(d)[at + i] += slope;
-                        }
-                    }
-                }
-            }
-            if part > 0 {
-                self.grads.values[own].copy_from_slice(&beside[place]);
+                slopes[d] += w * v[c];
             }
         }
-    }
-}
-
-impl<R: Real> Op for Backward<'_, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        match self.stage.settings.features {
-            1 => self.features::<S, 1>(s),
-            2 => self.features::<S, 2>(s),
-            4 => self.features::<S, 4>(s),
-            _ => self.features::<S, 8>(s),
-        }
-    }
-}
-
-kernel_of_levels!(HashGridStage);
-
-impl Stage for HashGridStage {
-    fn info(&self) -> Info {
-        let f = self.settings.features;
-        Info {
-            input: 3,
-            output: self.outputs,
-            params: self.entries * f,
-            tape: 0,
-            scope: Scope::Row,
-            grads: GradKind::Scatter,
-            macs: self.levels.len() * (8 * f + 16),
-            identity: false,
-        }
+        slopes
     }
 
-    fn parameters(&self) -> Vec<Parameter> {
-        let f = self.settings.features;
-        self.levels
-            .iter()
-            .map(|l| Parameter {
-                name: format!("{}.table", l.number),
-                shape: vec![l.entries as usize, f],
-                start: l.start * f,
-            })
-            .collect()
+    fn code(&self) -> String {
+        let (scale, last) = (self.scale as f32, (self.side - 2) as f32);
+        format!("{scale:?}, {last:?}, {}u, {}u", if self.dense { self.side } else { 0 }, self.entries - 1)
     }
 
-    fn init(&self, seed: u64, params: &mut [f32]) {
-        levels::start(seed, params);
+    fn constants(s: &HashGrid) -> String {
+        primes(s.convention.primes())
     }
 
-    fn kernel(&self) -> &dyn Kernel<f32> {
-        self
-    }
-
-    fn reference(&self) -> Option<&dyn Kernel<f64>> {
-        Some(self)
-    }
-
-    fn partition(&self) -> Vec<Range<usize>> {
-        self.levels.iter().map(|l| self.params_of(l)).collect()
-    }
-
-    fn wgsl(&self) -> Option<Fragment> {
-        let f = self.settings.features;
-        let code = |l: &Level| {
-            let (side, start) = (if l.dense { l.side } else { 0 }, u32::try_from(l.start * f).ok()?);
-            let (scale, last) = (l.scale as f32, (l.side - 2) as f32);
-            let value = format!("stage_Level({scale:?}, {last:?}, {side}u, {}u, {start}u)", l.entries - 1);
-            Some(LevelCode { value, outputs: l.outputs.clone() })
-        };
-        let levels = self.levels.iter().map(code).collect::<Option<Vec<_>>>()?;
-        let [x, y, z] = self.primes;
-        let constants = format!("const stage_FEATURES = {f}u;\nconst stage_PRIMES = vec3<u32>({x}u, {y}u, {z}u);\n");
-        Some(Fragment::new(&[&constants, include_str!("hash_grid.wgsl"), &functions(&levels, self.outputs)]))
-    }
-
-    fn describe(&self) -> String {
-        let side = |l: Option<&Level>| l.map_or(0.0, |l| l.scale + 1.0);
-        format!(
-            "hash-grid: {} levels x {}, {:.0} to {:.0} cells per side, tables up to 2^{}, {} of them direct",
-            self.levels.len(),
-            self.settings.features,
-            side(self.levels.first()),
-            side(self.levels.last()),
-            self.settings.log2_table_size,
-            self.levels.iter().filter(|l| l.dense).count()
-        )
-    }
-}
-
-impl Encoder for HashGridStage {
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
-        let mut stage = Self { levels: vec![], entries: 0, outputs: keep.len(), ..self.clone() };
-        let mut params = vec![];
-        for level in &self.levels {
-            let outputs: Vec<_> =
-                level.outputs.iter().map(|c| c.and_then(|c| keep.iter().position(|&k| k == c))).collect();
-            if outputs.iter().all(Option::is_none) {
-                continue;
-            }
-            params.push(self.params_of(level));
-            stage.levels.push(Level { outputs, start: stage.entries, ..level.clone() });
-            stage.entries += level.entries as usize;
-        }
-        Ok(Reduced { stage: Box::new(stage), params, channels: (0..3).collect() })
-    }
-
-    fn coarse_to_fine(&self) -> bool {
-        true
-    }
-
-    fn resolutions(&self) -> Option<Vec<f64>> {
-        Some(by_channel(self.levels.iter().map(|l| (l.scale + 1.0, &l.outputs[..])), self.outputs))
+    fn size(stage: &Levels<Self>) -> String {
+        sizes(stage.settings.log2_table_size, stage.levels().filter(|l| l.dense).count())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::levels::Level as _;
+    use conefield_core::simd::{Op, run};
+    use conefield_core::stage::{Grads, Kernel, Stage, TileMut};
 
-    struct Locate<'a, R>(&'a mut Located<R>, &'a Level, [u32; 3], Tile<'a, R>);
+    type HashGridStage = Levels<Level>;
+
+    struct Locate<'a, R>(&'a mut Located<R>, &'a Level, Tile<'a, R>);
     impl<R: Real> Op for Locate<'_, R> {
         type Number = R;
         type Out = ();
         #[inline(always)]
         fn call<S: Simd>(self, s: S) {
-            self.0.locate(s, self.1, self.2, self.3, 0, 1);
+            self.1.locate(s, self.0, self.2, 0, 1);
         }
     }
 
@@ -695,11 +480,11 @@ mod tests {
         let settings = HashGrid { levels: 16, log2_table_size: 14, ..HashGrid::default() };
         let stage = HashGridStage::new(&settings).unwrap();
         let primes = settings.convention.primes().map(u64::from);
-        for level in &stage.levels {
+        for level in stage.levels() {
             for p in [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.3, 0.71, 0.999], [0.5, 0.25, 0.125f64]] {
-                let mut located = Located::<f64>::new();
+                let mut located = Located::<f64>::default();
                 let data: Vec<f64> = p.to_vec();
-                run(Locate(&mut located, level, stage.primes, Tile::new(&data, 1)));
+                run(Locate(&mut located, level, Tile::new(&data, 1)));
                 let cell = p.map(|x| (x * level.scale + 0.5).floor() as u64);
                 let mut total = 0.0;
                 for c in 0..8u64 {
@@ -715,7 +500,7 @@ mod tests {
         }
         // NAF's first three levels (17³, 33³, … vertices), and which of them are indexed directly with 2^19 entries.
         let naf = HashGridStage::new(&HashGrid::default()).unwrap();
-        let entries: Vec<_> = naf.levels.iter().take(4).map(|l| (l.entries, l.dense)).collect();
+        let entries: Vec<_> = naf.levels().take(4).map(|l| (l.entries, l.dense)).collect();
         assert_eq!(entries, [(4913, true), (35937, true), (274_625, true), (524_288, false)]);
     }
 
@@ -725,12 +510,12 @@ mod tests {
         for (base_resolution, growth) in [(25, 1.14), (50, 1.13), (50, 1.15), (50, 2.01), (30, 2.05)] {
             let stage =
                 HashGridStage::new(&HashGrid { levels: 2, base_resolution, growth, ..HashGrid::default() }).unwrap();
-            let level = &stage.levels[1];
+            let level = stage.levels().nth(1).unwrap();
             let up = (level.scale + 0.5) as f32;
             assert!(f64::from(up) > level.scale + 0.5 && up.fract() == 0.0, "{base_resolution} x {growth}");
             for x in [1.0f32, 2.0, f32::INFINITY] {
-                let mut located = Located::<f32>::new();
-                run(Locate(&mut located, level, stage.primes, Tile::new(&[x; 3], 1)));
+                let mut located = Located::<f32>::default();
+                run(Locate(&mut located, level, Tile::new(&[x; 3], 1)));
                 let mut ends = located.near.iter().chain(&located.far);
                 assert!(ends.all(|i| i[0] < level.entries), "{base_resolution} x {growth} at {x}");
                 let total: f32 = located.weight.iter().map(|w| w[0]).sum();

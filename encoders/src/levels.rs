@@ -1,13 +1,17 @@
-//! Common code of encoders with several levels of features: initialization, the level of each channel, the parameters
-//! of a level and the requested part of their gradients, and WGSL: calls of `stage_level_forward` and
-//! `stage_level_backward`, level by level, with the levels' settings as constants.
+//! Encoders with several levels of features: what they share.
+//!
+//! A [`Level`] says where a point lies on it, and which features enter there with which weights. [`Levels`] is the
+//! encoder of such levels: it checks the settings, passes blocks of rows to one level after another, selects the
+//! requested part of the gradients, names the parameters, removes channels, and calls `stage_level_forward` and
+//! `stage_level_backward` in WGSL, with the levels' settings as constants.
 
+use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
-use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
-use conefield_core::stage::{Grads, Parameter, Tile, TileMut};
-use conefield_core::wgsl;
+use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::wgsl::{self, Fragment};
 use std::fmt::Write;
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 /// Features are initialized uniformly in ± this (Müller et al. 2022, section 4).
 const START: f32 = 1e-4;
@@ -15,17 +19,313 @@ const START: f32 = 1e-4;
 /// Rows processed together: their entries and weights stay in the L1 cache.
 pub const BLOCK: usize = conefield_core::trilinear::BLOCK;
 
-/// Initializes features.
-pub fn start(seed: u64, params: &mut [f32]) {
-    for (i, p) in params.iter_mut().enumerate() {
-        *p = (2.0 * unit(mix(seed, i as u64)) - 1.0) * START;
+/// Minimum length of a parameter range that one worker sums.
+const SLAB: usize = 1 << 19;
+
+/// More parameters are refused: with gradients and moments they would take 32 GiB.
+const MOST: u64 = 1 << 31;
+
+/// The settings that all these encoders have.
+pub struct Pyramid {
+    /// Number of levels, coarse to fine.
+    pub levels: usize,
+    /// Features per level: 1, 2, 4 or 8.
+    pub features: usize,
+    /// Cells along the cube's side on the coarsest level.
+    pub base_resolution: u32,
+    /// Ratio of consecutive levels' resolutions.
+    pub growth: f64,
+}
+
+/// A level, or a part of one: some levels have several tables, one per part. What works on rows must be
+/// `#[inline(always)]`: only then is it compiled with the instructions of `s`.
+pub trait Level: Clone + Send + Sync + 'static {
+    /// The encoder's settings.
+    type Settings: Clone + Send + Sync;
+    /// Where the rows of a block lie on a level.
+    type Located<R: Real>: Default;
+
+    /// The encoder's name.
+    const NAME: &'static str;
+    /// Base resolutions that are allowed, and the same in words.
+    const BASE: (RangeInclusive<u32>, &'static str);
+    /// WGSL of `stage_Level`, `stage_level_forward` and `stage_level_backward`.
+    const WGSL: &'static [&'static str];
+
+    /// The settings that all these encoders have.
+    fn pyramid(settings: &Self::Settings) -> Pyramid;
+
+    /// The parts of level `number`, with `resolution` cells along the cube's side. The levels before it have `before`
+    /// parameters.
+    fn parts(settings: &Self::Settings, number: usize, resolution: f64, before: usize) -> Result<Vec<Self>>;
+
+    /// Whether its features are added to those of the part before it, in the same channels.
+    fn adds(&self) -> bool {
+        false
+    }
+
+    /// Cells along the cube's side.
+    fn resolution(&self) -> f64;
+
+    /// Name and shape of each block of parameters, in order.
+    fn blocks(&self, features: usize) -> Vec<(String, Vec<usize>)>;
+
+    /// Number of slices of the table, all of one length, among which it may be cut for several workers. Each worker
+    /// visits every row. With a single slice, [`Level::scatter`] always gets the whole table.
+    fn slices(&self) -> usize {
+        1
+    }
+
+    /// Initializes what does not start like features. `params` are those of the level.
+    fn init(&self, features: usize, params: &mut [f32]) {
+        let _ = (features, params);
+    }
+
+    /// Multiply-adds per row.
+    fn macs(features: usize) -> usize;
+
+    /// Locates rows `at..at + n` of `x`, `n` at most [`BLOCK`], on this level and thus on all its parts.
+    fn locate<S: Simd, R: Real>(&self, s: S, to: &mut Self::Located<R>, x: Tile<'_, R>, at: usize, n: usize);
+
+    /// The features of the first `n` rows at `located`. If it adds, `out` holds those of the part before it.
+    fn gather<S: Simd, R: Real, const F: usize>(
+        &self,
+        s: S,
+        located: &Self::Located<R>,
+        table: &[[R; F]],
+        out: &mut [[R; F]; BLOCK],
+        n: usize,
+    );
+
+    /// Given the derivatives `dy` by the features of the first `n` rows at `located`, adds those by the numbers `own` of
+    /// the table to `grads`.
+    fn scatter<S: Simd, R: Real, const F: usize>(
+        &self,
+        s: S,
+        located: &Self::Located<R>,
+        table: &[[R; F]],
+        dy: &[[R; F]; BLOCK],
+        n: usize,
+        grads: &mut [R],
+        own: &Range<usize>,
+    );
+
+    /// Given the derivatives `dy` by the features of row `i` at `located`, those by its point `x`.
+    fn slope<R: Real, const F: usize>(
+        &self,
+        located: &Self::Located<R>,
+        table: &[[R; F]],
+        dy: &[R; F],
+        x: [R; 3],
+        i: usize,
+    ) -> [R; 3];
+
+    /// The fields of its `stage_Level` in WGSL but the last one, the first parameter.
+    fn code(&self) -> String;
+
+    /// Constants in WGSL besides `stage_FEATURES`.
+    fn constants(settings: &Self::Settings) -> String {
+        let _ = settings;
+        String::new()
+    }
+
+    /// For [`Stage::describe`]: what has the features of a level, unless it is the level itself.
+    fn of(settings: &Self::Settings) -> &'static str {
+        let _ = settings;
+        ""
+    }
+
+    /// For [`Stage::describe`]: the size of the tables.
+    fn size(stage: &Levels<Self>) -> String {
+        format!("{} parameters", stage.params)
     }
 }
 
-/// Runs `features` of an operation with the stage's number of features as a constant.
+/// A part, its parameters, and the channels of its features.
+#[derive(Debug, Clone)]
+struct Part<L> {
+    level: L,
+    /// Index of the level in the settings, which names its parameters.
+    number: usize,
+    /// Index of the first parameter.
+    start: usize,
+    /// Number of parameters.
+    len: usize,
+    /// Output channel of each feature; `None` if unused.
+    outputs: Vec<Option<usize>>,
+}
+
+impl<L: Level> Part<L> {
+    /// The range of its parameters.
+    fn range(&self) -> Range<usize> {
+        self.start..self.start + self.len
+    }
+
+    /// The same part with only the channels `keep` in use and its parameters at `start`; `None` if no channel is in
+    /// use.
+    fn kept(&self, keep: &[usize], start: usize) -> Option<Self> {
+        let place = |c: &Option<usize>| c.and_then(|c| keep.iter().position(|&k| k == c));
+        let outputs: Vec<_> = self.outputs.iter().map(place).collect();
+        outputs.iter().any(Option::is_some).then(|| Self { start, outputs, ..self.clone() })
+    }
+
+    /// Writes the features of rows `at..at + n` to their channels.
+    #[inline(always)]
+    fn put<R: Real, const F: usize>(&self, out: &[[R; F]; BLOCK], y: &mut TileMut<'_, R>, at: usize, n: usize) {
+        for (f, channel) in self.outputs.iter().enumerate() {
+            if let Some(c) = *channel {
+                for (y, out) in y.channel(c)[at..at + n].iter_mut().zip(out) {
+                    *y = out[f];
+                }
+            }
+        }
+    }
+
+    /// Reads the gradients of the features of rows `at..at + n`.
+    #[inline(always)]
+    fn take<R: Real, const F: usize>(&self, dy: Tile<'_, R>, into: &mut [[R; F]; BLOCK], at: usize, n: usize) {
+        let zeros = [R::ZERO; BLOCK];
+        let mut channels = [&zeros[..n]; F];
+        for (from, channel) in channels.iter_mut().zip(&self.outputs) {
+            if let Some(c) = *channel {
+                *from = &dy.channel(c)[at..at + n];
+            }
+        }
+        for i in 0..n {
+            for f in 0..F {
+                into[i][f] = channels[f][i];
+            }
+        }
+    }
+}
+
+/// The encoder of several levels.
+#[derive(Debug, Clone)]
+pub struct Levels<L: Level> {
+    /// The settings that it was built from.
+    pub settings: L::Settings,
+    features: usize,
+    /// Parts of one level are next to each other.
+    parts: Vec<Part<L>>,
+    params: usize,
+    outputs: usize,
+}
+
+impl<L: Level> Levels<L> {
+    /// Builds the stage, or names the setting that is out of range.
+    pub fn new(settings: &L::Settings) -> Result<Self> {
+        let Pyramid { levels, features, base_resolution: base, growth } = L::pyramid(settings);
+        ensure((1..=32).contains(&levels), "spec", "levels", levels, "1 to 32")?;
+        ensure([1, 2, 4, 8].contains(&features), "spec", "features", features, "1, 2, 4 or 8")?;
+        let (bases, words) = L::BASE;
+        ensure(bases.contains(&base), "spec", "base_resolution", base, words)?;
+        ensure((1.0..=16.0).contains(&growth), "spec", "growth", growth, "1 to 16")?;
+        let mut stage = Self { settings: settings.clone(), features, parts: vec![], params: 0, outputs: 0 };
+        for number in 0..levels {
+            let resolution = f64::from(base) * growth.powi(number as i32);
+            for level in L::parts(settings, number, resolution, stage.params)? {
+                let (start, blocks) = (stage.params, level.blocks(features));
+                let len = blocks.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum();
+                stage.params += len;
+                stage.outputs += if level.adds() { 0 } else { features };
+                let outputs = (stage.outputs - features..stage.outputs).map(Some).collect();
+                stage.parts.push(Part { level, number, start, len, outputs });
+            }
+        }
+        Ok(stage)
+    }
+
+    /// Its levels, part by part.
+    pub fn levels(&self) -> impl Iterator<Item = &L> {
+        self.parts.iter().map(|p| &p.level)
+    }
+}
+
+/// The parts of each level.
+fn by_level<L>(parts: &[Part<L>]) -> impl Iterator<Item = &[Part<L>]> {
+    parts.chunk_by(|a, b| a.number == b.number)
+}
+
+struct Forward<'a, L: Level, R> {
+    stage: &'a Levels<L>,
+    parts: &'a [Part<L>],
+    params: &'a [R],
+    x: Tile<'a, R>,
+    y: TileMut<'a, R>,
+}
+
+impl<L: Level, R: Real> Forward<'_, L, R> {
+    #[inline(always)]
+    fn features<S: Simd, const F: usize>(mut self, s: S) {
+        let mut located = L::Located::default();
+        let mut out = [[R::ZERO; F]; BLOCK];
+        for parts in by_level(self.parts) {
+            for at in (0..self.x.rows).step_by(BLOCK) {
+                let n = BLOCK.min(self.x.rows - at);
+                parts[0].level.locate(s, &mut located, self.x, at, n);
+                for part in parts {
+                    let (table, _) = self.params[part.range()].as_chunks::<F>();
+                    part.level.gather(s, &located, table, &mut out, n);
+                    // Of parts that are added, the last one writes the result.
+                    part.put(&out, &mut self.y, at, n);
+                }
+            }
+        }
+    }
+}
+
+struct Backward<'a, L: Level, R> {
+    stage: &'a Levels<L>,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    dy: Tile<'a, R>,
+    grads: Grads<'a, R>,
+    dx: Option<TileMut<'a, R>>,
+}
+
+impl<L: Level, R: Real> Backward<'_, L, R> {
+    #[inline(always)]
+    fn features<S: Simd, const F: usize>(mut self, s: S) {
+        let mut located = L::Located::default();
+        let (mut dy, mut slopes) = ([[R::ZERO; F]; BLOCK], [[R::ZERO; 3]; BLOCK]);
+        if let Some(dx) = &mut self.dx {
+            dx.data.fill(R::ZERO);
+        }
+        for part in &self.stage.parts {
+            let level = &part.level;
+            let mut asked = Asked::of(&self.grads, &part.range(), level.slices() == 1);
+            if asked.is_empty() && self.dx.is_none() {
+                continue;
+            }
+            let (table, _) = self.params[part.range()].as_chunks::<F>();
+            let (grads, own) = asked.values(&mut self.grads);
+            for at in (0..self.x.rows).step_by(BLOCK) {
+                let n = BLOCK.min(self.x.rows - at);
+                part.take(self.dy, &mut dy, at, n);
+                level.locate(s, &mut located, self.x, at, n);
+                if !own.is_empty() {
+                    level.scatter(s, &located, table, &dy, n, grads, &own);
+                }
+                let Some(dx) = &mut self.dx else { continue };
+                let x = [0, 1, 2].map(|d| &self.x.channel(d)[at..at + n]);
+                for i in 0..n {
+                    slopes[i] = level.slope(&located, table, &dy[i], x.map(|x| x[i]), i);
+                }
+                for d in 0..3 {
+                    for (dx, slope) in dx.channel(d)[at..at + n].iter_mut().zip(&slopes) {
+                        *dx += slope[d];
+                    }
+                }
+            }
+            asked.finish(&mut self.grads);
+        }
+    }
+}
+
+/// Runs `features` of an operation with the number of features as a constant.
 macro_rules! by_features {
     ($op:ident) => {
-        impl<R: Real> Op for $op<'_, R> {
+        impl<L: Level, R: Real> Op for $op<'_, L, R> {
             type Number = R;
             type Out = ();
             #[inline(always)]
@@ -40,39 +340,266 @@ macro_rules! by_features {
         }
     };
 }
-pub(crate) use by_features;
+by_features!(Forward);
+by_features!(Backward);
 
-/// The kernel of a stage with `levels`: its `Forward` over a range of levels, one pass each, and its `Backward`.
-macro_rules! kernel_of_levels {
-    ($stage:ident) => {
-        impl<R: Real> Kernel<R> for $stage {
-            fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-                run(Forward { stage: self, levels: 0..self.levels.len(), params, x, y });
-            }
+impl<L: Level, R: Real> Kernel<R> for Levels<L> {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        run(Forward { stage: self, parts: &self.parts, params, x, y });
+    }
 
-            fn passes(&self) -> usize {
-                self.levels.len()
-            }
+    fn passes(&self) -> usize {
+        by_level(&self.parts).count()
+    }
 
-            fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-                run(Forward { stage: self, levels: pass..pass + 1, params, x, y });
-            }
+    fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        let parts = by_level(&self.parts).nth(pass).unwrap_or_default();
+        run(Forward { stage: self, parts, params, x, y });
+    }
 
-            fn backward(
-                &self,
-                params: &[R],
-                x: Tile<'_, R>,
-                _: TileMut<'_, R>,
-                dy: Tile<'_, R>,
-                grads: Grads<'_, R>,
-                dx: Option<TileMut<'_, R>>,
-            ) {
-                run(Backward { stage: self, params, x, dy, grads, dx });
+    fn backward(
+        &self,
+        params: &[R],
+        x: Tile<'_, R>,
+        _: TileMut<'_, R>,
+        dy: Tile<'_, R>,
+        grads: Grads<'_, R>,
+        dx: Option<TileMut<'_, R>>,
+    ) {
+        run(Backward { stage: self, params, x, dy, grads, dx });
+    }
+}
+
+impl<L: Level> Stage for Levels<L> {
+    fn info(&self) -> Info {
+        Info {
+            input: 3,
+            output: self.outputs,
+            params: self.params,
+            tape: 0,
+            scope: Scope::Row,
+            grads: GradKind::Scatter,
+            macs: self.parts.len() * L::macs(self.features),
+            identity: false,
+        }
+    }
+
+    fn parameters(&self) -> Vec<Parameter> {
+        let mut all: Vec<Parameter> = vec![];
+        for part in &self.parts {
+            for (name, shape) in part.level.blocks(self.features) {
+                let start = all.last().map_or(0, |p| p.range().end);
+                all.push(Parameter { name: format!("{}.{name}", part.number), shape, start });
             }
         }
-    };
+        all
+    }
+
+    fn init(&self, seed: u64, params: &mut [f32]) {
+        for (i, p) in params.iter_mut().enumerate() {
+            *p = (2.0 * unit(mix(seed, i as u64)) - 1.0) * START;
+        }
+        for part in &self.parts {
+            part.level.init(self.features, &mut params[part.range()]);
+        }
+    }
+
+    fn kernel(&self) -> &dyn Kernel<f32> {
+        self
+    }
+
+    fn reference(&self) -> Option<&dyn Kernel<f64>> {
+        Some(self)
+    }
+
+    /// A worker owns a part, or some slices of a large one: at most 16 pieces, because each visits every row again.
+    fn partition(&self) -> Vec<Range<usize>> {
+        let pieces = |p: &Part<L>| {
+            let (start, slices) = (p.start, p.level.slices());
+            let (slice, pieces) = (p.len / slices, p.len.div_ceil(SLAB).clamp(1, 16).min(slices));
+            (0..pieces).map(move |i| start + i * slices / pieces * slice..start + (i + 1) * slices / pieces * slice)
+        };
+        self.parts.iter().flat_map(pieces).collect()
+    }
+
+    fn wgsl(&self) -> Option<Fragment> {
+        let mut levels = vec![];
+        // A part that adds belongs to the level in front of it there.
+        for part in self.parts.iter().filter(|p| !p.level.adds()) {
+            let first = u32::try_from(part.start).ok()?;
+            levels.push((format!("stage_Level({}, {first}u)", part.level.code()), &part.outputs[..]));
+        }
+        let constants = format!("const stage_FEATURES = {}u;\n{}", self.features, L::constants(&self.settings));
+        let functions = functions(self.features, &levels, self.outputs);
+        let sources = L::WGSL.iter().copied();
+        let all: Vec<_> = [&constants[..]].into_iter().chain(sources).chain([&functions[..]]).collect();
+        Some(Fragment::new(&all))
+    }
+
+    fn describe(&self) -> String {
+        let cells = |part: Option<&Part<L>>| part.map_or(0.0, |p| p.level.resolution());
+        format!(
+            "{}: {} levels x {}{}, {:.0} to {:.0} cells per side, {}",
+            L::NAME,
+            by_level(&self.parts).count(),
+            self.features,
+            L::of(&self.settings),
+            cells(self.parts.first()),
+            cells(self.parts.last()),
+            L::size(self)
+        )
+    }
 }
-pub(crate) use kernel_of_levels;
+
+impl<L: Level> Encoder for Levels<L> {
+    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
+        ensure(!keep.is_empty(), L::NAME, "channels", "none kept", "at least one")?;
+        let settings = self.settings.clone();
+        let mut stage = Self { settings, features: self.features, parts: vec![], params: 0, outputs: keep.len() };
+        let mut params = vec![];
+        for part in &self.parts {
+            if let Some(kept) = part.kept(keep, stage.params) {
+                params.push(part.range());
+                stage.params += kept.len;
+                stage.parts.push(kept);
+            }
+        }
+        Ok(Reduced { stage: Box::new(stage), params, channels: vec![0, 1, 2] })
+    }
+
+    fn coarse_to_fine(&self) -> bool {
+        true
+    }
+
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        let mut cells = vec![0.0; self.outputs];
+        for part in &self.parts {
+            part.outputs.iter().flatten().for_each(|&c| cells[c] = part.level.resolution());
+        }
+        Some(cells)
+    }
+}
+
+/// The requested part of a level's gradients in a call of `backward`: all, none, or a part. If it must be all but only
+/// a part is requested, the rest is summed too, into a separate buffer: the order of summation stays the same.
+struct Asked<R> {
+    /// The requested range among the values of the call.
+    from: Range<usize>,
+    /// The same range among those of the level.
+    own: Range<usize>,
+    beside: Vec<R>,
+}
+
+impl<R: Real> Asked<R> {
+    /// The part of `level` that `grads` requests; `whole` if gradients can be summed of the whole level only.
+    fn of(grads: &Grads<'_, R>, level: &Range<usize>, whole: bool) -> Self {
+        let range = &grads.range;
+        let (from, to) = (level.start.max(range.start), level.end.min(range.end));
+        if from >= to {
+            return Self { from: 0..0, own: 0..0, beside: vec![] };
+        }
+        let own = from - level.start..to - level.start;
+        let from = from - range.start..to - range.start;
+        let mut beside = vec![];
+        if whole && own.len() < level.len() {
+            beside.resize(level.len(), R::ZERO);
+            beside[own.clone()].copy_from_slice(&grads.values[from.clone()]);
+        }
+        Self { from, own, beside }
+    }
+
+    /// Whether nothing is requested.
+    fn is_empty(&self) -> bool {
+        self.own.is_empty()
+    }
+
+    /// Where to add gradients, and the range of the level that they are of.
+    fn values<'a>(&'a mut self, grads: &'a mut Grads<'_, R>) -> (&'a mut [R], Range<usize>) {
+        if self.beside.is_empty() {
+            (&mut grads.values[self.from.clone()], self.own.clone())
+        } else {
+            let whole = 0..self.beside.len();
+            (&mut self.beside, whole)
+        }
+    }
+
+    /// Copies the requested part to its place.
+    fn finish(self, grads: &mut Grads<'_, R>) {
+        if !self.beside.is_empty() {
+            grads.values[self.from].copy_from_slice(&self.beside[self.own]);
+        }
+    }
+}
+
+/// `stage_forward` and `stage_backward` of an encoder with `width` output channels, and `stage_features_grad` for its
+/// levels, which adds `w` times `dy` to the gradients of the entry that begins at parameter `entry`. A level is a value
+/// of type `stage_Level` and the output channels of its features.
+fn functions(features: usize, levels: &[(String, &[Option<usize>])], width: usize) -> String {
+    let mut grad =
+        String::from("fn stage_features_grad(entry: u32, w: f32, dy: ptr<function, array<f32, stage_FEATURES>>) {\n");
+    if features.is_multiple_of(2) {
+        for f in (0..features).step_by(2) {
+            let _ = writeln!(grad, "    stage_grad_pair(entry + {f}u, w * vec2<f32>((*dy)[{f}], (*dy)[{}]));", f + 1);
+        }
+    } else {
+        for f in 0..features {
+            let _ = writeln!(grad, "    stage_grad(entry + {f}u, w * (*dy)[{f}]);");
+        }
+    }
+    grad += "}\n";
+    let (mut forward, mut backward) = (String::new(), String::new());
+    for (l, (value, outputs)) in levels.iter().enumerate() {
+        let _ = writeln!(forward, "    let v{l} = stage_level_forward(p, {value});");
+        let _ = writeln!(backward, "    var d{l}: array<f32, stage_FEATURES>;");
+        for (f, c) in outputs.iter().enumerate().filter_map(|(f, c)| Some((f, (*c)?))) {
+            let _ = writeln!(forward, "    (*y)[{c}] = v{l}[{f}];");
+            let _ = writeln!(backward, "    d{l}[{f}] = (*dy)[{c}];");
+        }
+        let _ = writeln!(backward, "    slope += stage_level_backward(p, {value}, &d{l});");
+    }
+    let p = "    let p = vec3<f32>((*x)[0], (*x)[1], (*x)[2]);\n";
+    let slope = "    (*dx)[0] = slope.x;\n    (*dx)[1] = slope.y;\n    (*dx)[2] = slope.z;\n";
+    let backward = format!("{p}    var slope = vec3<f32>(0.0);\n{backward}{slope}");
+    grad + &wgsl::functions(3, width, &format!("{p}{forward}"), &backward)
+}
+
+/// Refuses level `number` if it has more than `most` cells per side.
+pub fn finest(number: usize, resolution: f64, most: f64, expected: &str) -> Result<()> {
+    let found = format!("level {number} with {resolution:.0} cells per side");
+    ensure(resolution <= most, "spec", "levels", found, expected)
+}
+
+/// Refuses level `number` if its `resolution + more` entries per side, which are `what`, bring the parameters above
+/// [`MOST`].
+pub fn cube(number: usize, resolution: f64, more: u64, what: &str, features: usize, before: usize) -> Result<()> {
+    // The cast saturates, and what exceeds 64 bits is refused like everything above the limit.
+    let all = (resolution as u64)
+        .checked_add(more)
+        .and_then(|side| side.checked_pow(3))
+        .and_then(|entries| entries.checked_mul(features as u64))
+        .and_then(|params| params.checked_add(before as u64));
+    let found = format!(
+        "more than 2^31 parameters with level {number}: ({resolution:.0} + {more})^3 {what} of {features} features"
+    );
+    let expected = "at most 2^31 parameters: fewer levels, less growth, or a hash-grid, which bounds its tables";
+    ensure(all.is_some_and(|all| all <= MOST), "spec", "levels", found, expected)
+}
+
+/// Most entries of a table with this setting.
+pub fn table_size(log2: u32) -> Result<u32> {
+    ensure((4..=28).contains(&log2), "spec", "log2_table_size", log2, "4 to 28")?;
+    Ok(1 << log2)
+}
+
+/// For [`Level::size`], of tables with a largest size.
+pub fn sizes(log2: u32, direct: usize) -> String {
+    format!("tables up to 2^{log2}, {direct} of them direct")
+}
+
+/// For [`Level::constants`]: the primes of a hash.
+pub fn primes([x, y, z]: [u32; 3]) -> String {
+    format!("const stage_PRIMES = vec3<u32>({x}u, {y}u, {z}u);\n")
+}
 
 /// Cells of a block's rows along each axis of the cube, which is divided into equal cells.
 pub struct Cells<R> {
@@ -82,12 +609,13 @@ pub struct Cells<R> {
     pub fraction: [[R; BLOCK]; 3],
 }
 
-impl<R: Real> Cells<R> {
-    /// A buffer for a block.
-    pub fn new() -> Self {
+impl<R: Real> Default for Cells<R> {
+    fn default() -> Self {
         Self { cell: [[0; BLOCK]; 3], fraction: [[R::ZERO; BLOCK]; 3] }
     }
+}
 
+impl<R: Real> Cells<R> {
     /// Locates rows `at..at + n` of `x` among `cells` cells. Points outside the cube are clamped to its rim, a NaN
     /// coordinate to 0.
     #[inline(always)]
@@ -115,106 +643,46 @@ pub fn stretch<R: Real>(x: R, cells: u32) -> R {
     if x >= R::ZERO && x <= R::ONE { R::of(f64::from(cells)) } else { R::ZERO }
 }
 
-/// The parameters of a level, and the channels of its features.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Table {
-    /// Index of the first parameter.
-    pub start: usize,
-    /// Number of parameters.
-    pub len: usize,
-    /// Index of the level in the settings, which names its parameters.
-    pub number: usize,
-    /// Output channel of each feature; `None` if unused.
-    pub outputs: Vec<Option<usize>>,
+/// For each of the first `n` rows, whether it is the last one before a row elsewhere, which `differ` tells for a row and
+/// the next; and the number of such rows.
+#[inline(always)]
+pub fn leaving(n: usize, differ: impl Fn(usize) -> bool) -> ([bool; BLOCK], usize) {
+    let mut leaves = [true; BLOCK];
+    for i in 0..BLOCK - 1 {
+        leaves[i] = differ(i);
+    }
+    leaves[n - 1] = true;
+    let count = leaves[..n].iter().map(|&l| usize::from(l)).sum();
+    (leaves, count)
 }
 
-impl Table {
-    /// The range of its parameters.
-    pub fn range(&self) -> Range<usize> {
-        self.start..self.start + self.len
-    }
-
-    /// The block of its parameters, with this shape.
-    pub fn parameter(&self, shape: Vec<usize>) -> Parameter {
-        Parameter { name: format!("{}.table", self.number), shape, start: self.start }
-    }
-
-    /// The same level with only the channels `keep` in use and its parameters at `start`; `None` if no channel is in
-    /// use.
-    pub fn kept(&self, keep: &[usize], start: usize) -> Option<Self> {
-        let place = |c: &Option<usize>| c.and_then(|c| keep.iter().position(|&k| k == c));
-        let outputs: Vec<_> = self.outputs.iter().map(place).collect();
-        outputs.iter().any(Option::is_some).then(|| Self { start, outputs, ..self.clone() })
-    }
-
-    /// Writes the features of rows `at..at + n` to their channels.
-    #[inline(always)]
-    pub fn put<R: Real, const F: usize>(&self, out: &[[R; F]; BLOCK], y: &mut TileMut<'_, R>, at: usize, n: usize) {
-        for (f, channel) in self.outputs.iter().enumerate() {
-            if let Some(c) = *channel {
-                for (y, out) in y.channel(c)[at..at + n].iter_mut().zip(out) {
-                    *y = out[f];
-                }
-            }
+/// The features of four entries, one after the other, in registers of four, of which `F` are used.
+#[inline(always)]
+pub fn fours<S: Simd, R: Real, const F: usize>(s: S, entries: &[[R; F]; 4]) -> [R::Four<S>; 8] {
+    let mut lanes = [[R::ZERO; 4]; 8];
+    for c in 0..4 {
+        for f in 0..F {
+            lanes[(c * F + f) / 4][(c * F + f) % 4] = entries[c][f];
         }
     }
-
-    /// Reads the gradients of the features of rows `at..at + n`.
-    #[inline(always)]
-    pub fn take<R: Real, const F: usize>(&self, dy: Tile<'_, R>, into: &mut [[R; F]; BLOCK], at: usize, n: usize) {
-        for (f, channel) in self.outputs.iter().enumerate() {
-            match *channel {
-                Some(c) => into.iter_mut().zip(&dy.channel(c)[at..at + n]).for_each(|(to, &v)| to[f] = v),
-                None => into[..n].iter_mut().for_each(|to| to[f] = R::ZERO),
-            }
-        }
+    let mut all = [R::Four::<S>::splat(s, R::ZERO); 8];
+    for q in 0..F {
+        all[q] = R::Four::<S>::from_slice(s, &lanes[q]);
     }
+    all
 }
 
-/// The requested part of a level's gradients in a call of `backward`: all, none, or a part. If only part of a level is
-/// requested, the rest is summed too, into a separate buffer: the order of summation stays the same.
-pub struct Asked<R> {
-    /// The requested range among the values of the call.
-    own: Range<usize>,
-    /// The same range among those of the level.
-    place: Range<usize>,
-    beside: Vec<R>,
-}
-
-impl<R: Real> Asked<R> {
-    /// The part of `level` that `grads` requests.
-    pub fn of(grads: &Grads<'_, R>, level: &Range<usize>) -> Self {
-        let range = &grads.range;
-        let (from, to) = (level.start.max(range.start), level.end.min(range.end));
-        if from >= to {
-            return Self { own: 0..0, place: 0..0, beside: vec![] };
-        }
-        let own = from - range.start..to - range.start;
-        let place = from - level.start..to - level.start;
-        let part = if to - from < level.len() { level.len() } else { 0 };
-        let mut beside = vec![R::ZERO; part];
-        if part > 0 {
-            beside[place.clone()].copy_from_slice(&grads.values[own.clone()]);
-        }
-        Self { own, place, beside }
+/// The sum of registers in the layout of [`fours`] over the entries. Register `q` has been added to `sum[q % 2]` if `F`
+/// is 8, else to `sum[0]`.
+#[inline(always)]
+pub fn fold<S: Simd, R: Real, const F: usize>(mut sum: [R::Four<S>; 2]) -> [R; F] {
+    if F < 4 {
+        sum[0] += sum[0].rotate_elements_left::<2>();
     }
-
-    /// Whether nothing is requested.
-    pub fn is_empty(&self) -> bool {
-        self.own.is_empty()
+    if F < 2 {
+        sum[0] += sum[0].rotate_elements_left::<1>();
     }
-
-    /// Where to add the level's gradients: all of them, or none.
-    pub fn values<'a>(&'a mut self, grads: &'a mut Grads<'_, R>) -> &'a mut [R] {
-        if self.beside.is_empty() { &mut grads.values[self.own.clone()] } else { &mut self.beside }
-    }
-
-    /// Copies the requested part to its place.
-    pub fn finish(self, grads: &mut Grads<'_, R>) {
-        if !self.beside.is_empty() {
-            grads.values[self.own].copy_from_slice(&self.beside[self.place]);
-        }
-    }
+    std::array::from_fn(|f| sum[f / 4].as_slice()[f % 4])
 }
 
 /// Entry `i` of a level's table. A bounds check per entry doubles the time of the backward pass.
@@ -263,53 +731,4 @@ pub fn prefetch<'a, T>(table: &[T], indices: impl Iterator<Item = &'a [u32; BLOC
     }
     #[cfg(not(target_arch = "x86_64"))]
     let _ = (table, indices, n);
-}
-
-/// For each of `width` channels, the cells per side of its level; levels are given with their output channels.
-pub fn by_channel<'a>(levels: impl Iterator<Item = (f64, &'a [Option<usize>])>, width: usize) -> Vec<f64> {
-    let mut cells = vec![0.0; width];
-    for (resolution, outputs) in levels {
-        outputs.iter().flatten().for_each(|&c| cells[c] = resolution);
-    }
-    cells
-}
-
-/// A level in WGSL.
-pub struct LevelCode {
-    /// A value of type `stage_Level`.
-    pub value: String,
-    /// Output channel of each feature; `None` if unused.
-    pub outputs: Vec<Option<usize>>,
-}
-
-/// `stage_forward` and `stage_backward` of an encoder with `width` output channels, and `stage_features_grad` for its
-/// levels, which adds `w` times `dy` to the gradients of the entry that begins at parameter `entry`.
-pub fn functions(levels: &[LevelCode], width: usize) -> String {
-    let mut grad =
-        String::from("fn stage_features_grad(entry: u32, w: f32, dy: ptr<function, array<f32, stage_FEATURES>>) {\n");
-    let features = levels.first().map_or(0, |l| l.outputs.len());
-    if features.is_multiple_of(2) {
-        for f in (0..features).step_by(2) {
-            let _ = writeln!(grad, "    stage_grad_pair(entry + {f}u, w * vec2<f32>((*dy)[{f}], (*dy)[{}]));", f + 1);
-        }
-    } else {
-        for f in 0..features {
-            let _ = writeln!(grad, "    stage_grad(entry + {f}u, w * (*dy)[{f}]);");
-        }
-    }
-    grad += "}\n";
-    let (mut forward, mut backward) = (String::new(), String::new());
-    for (l, LevelCode { value, outputs }) in levels.iter().enumerate() {
-        let _ = writeln!(forward, "    let v{l} = stage_level_forward(p, {value});");
-        let _ = writeln!(backward, "    var d{l}: array<f32, stage_FEATURES>;");
-        for (f, c) in outputs.iter().enumerate().filter_map(|(f, c)| Some((f, (*c)?))) {
-            let _ = writeln!(forward, "    (*y)[{c}] = v{l}[{f}];");
-            let _ = writeln!(backward, "    d{l}[{f}] = (*dy)[{c}];");
-        }
-        let _ = writeln!(backward, "    slope += stage_level_backward(p, {value}, &d{l});");
-    }
-    let p = "    let p = vec3<f32>((*x)[0], (*x)[1], (*x)[2]);\n";
-    let slope = "    (*dx)[0] = slope.x;\n    (*dx)[1] = slope.y;\n    (*dx)[2] = slope.z;\n";
-    let backward = format!("{p}    var slope = vec3<f32>(0.0);\n{backward}{slope}");
-    grad + &wgsl::functions(3, width, &format!("{p}{forward}"), &backward)
 }

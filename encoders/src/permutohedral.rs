@@ -15,17 +15,15 @@
 //! 4, of `k`.
 
 use crate::levels::{
-    Asked, BLOCK, LevelCode, Table, by_channel, by_features, entry, entry_mut, functions, kernel_of_levels, prefetch,
-    start,
+    self, BLOCK, Levels, Pyramid, entry, entry_mut, finest, fold, fours, leaving, prefetch, primes, sizes, table_size,
 };
-use conefield_core::error::{Result, ensure};
+use conefield_core::error::Result;
 use conefield_core::settings::EncoderSpec;
-use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use conefield_core::wgsl::Fragment;
+use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
+use conefield_core::stage::{Encoder, Tile};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 /// Settings of `permutohedral`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -61,7 +59,7 @@ conefield_core::stage_type!(
 #[typetag::serde(name = "permutohedral")]
 impl EncoderSpec for Permutohedral {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(PermutohedralStage::new(self)?))
+        Ok(Box::new(Levels::<Level>::new(self)?))
     }
 }
 
@@ -71,9 +69,8 @@ const FINEST: f64 = 4_194_304.0;
 /// Primes of the hash, as in the paper of Müller et al.
 const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861];
 
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 struct Level {
-    table: Table,
     /// Cells along the cube's side, for a cubic grid with the same number of vertices.
     resolution: f64,
     /// `s` in the formula.
@@ -82,67 +79,6 @@ struct Level {
     side: u32,
     /// Number of entries minus one.
     last: u32,
-}
-
-impl Level {
-    fn new(s: &Permutohedral, number: usize, resolution: f64, first: usize) -> Self {
-        let scale = resolution * 0.5f64.cbrt();
-        // A vertex has integer coordinates X, Y, Z in units of 1/(2s), all even or all odd. Those of a point's simplex
-        // lie in [−2, 2s + 2], because rounding may move the point slightly; a pair is an even vertex and the odd one
-        // after it.
-        let side = (((2.0 * scale + 1e-2).ceil() as u64 + 3) >> 1) + 1;
-        let (vertices, table) = (2 * u128::from(side).pow(3), 1u64 << s.log2_table_size);
-        let direct = vertices <= u128::from(table);
-        let entries = if direct { vertices as u64 } else { table };
-        Self {
-            table: Table {
-                start: first,
-                len: entries as usize * s.features,
-                number,
-                outputs: (0..s.features).map(|f| Some(number * s.features + f)).collect(),
-            },
-            resolution,
-            scale,
-            side: if direct { side as u32 } else { 0 },
-            last: (entries - 1) as u32,
-        }
-    }
-}
-
-/// The stage that [`Permutohedral`] builds.
-#[derive(Debug, Clone, PartialEq)]
-pub struct PermutohedralStage {
-    features: usize,
-    log2_table_size: u32,
-    levels: Vec<Level>,
-    params: usize,
-    outputs: usize,
-}
-
-impl PermutohedralStage {
-    /// Builds the stage, or names the setting that is out of range.
-    pub fn new(settings: &Permutohedral) -> Result<Self> {
-        let s = settings;
-        ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
-        ensure([1, 2, 4, 8].contains(&s.features), "spec", "features", s.features, "1, 2, 4 or 8")?;
-        let base = s.base_resolution;
-        ensure((2..=1 << 20).contains(&base), "spec", "base_resolution", base, "2 to 2^20")?;
-        ensure((1.0..=16.0).contains(&s.growth), "spec", "growth", s.growth, "1 to 16")?;
-        let log2 = s.log2_table_size;
-        ensure((4..=28).contains(&log2), "spec", "log2_table_size", log2, "4 to 28")?;
-        let mut levels: Vec<Level> = vec![];
-        let mut params = 0;
-        for l in 0..s.levels {
-            let resolution = f64::from(base) * s.growth.powi(l as i32);
-            let found = format!("level {l} with {resolution:.0} cells per side");
-            let expected = "at most 2^22 cells per side (positions are single precision): fewer levels or less growth";
-            ensure(resolution <= FINEST, "spec", "levels", found, expected)?;
-            levels.push(Level::new(s, l, resolution, params));
-            params += levels[l].table.len;
-        }
-        let outputs = s.levels * s.features;
-        Ok(Self { features: s.features, log2_table_size: log2, levels, params, outputs })
-    }
 }
 
 /// Simplices of a block's rows on one level.
@@ -157,89 +93,14 @@ struct Located<R> {
     weight: [[R; BLOCK]; 4],
 }
 
-impl<R: Real> Located<R> {
-    fn new() -> Self {
+impl<R: Real> Default for Located<R> {
+    fn default() -> Self {
         let (whole, numbers) = ([0; BLOCK], [R::ZERO; BLOCK]);
         Self { cell: [whole; 3], fraction: [numbers; 3], rank: [whole; 3], entry: [whole; 4], weight: [numbers; 4] }
     }
+}
 
-    /// Locates rows `at..at + n` of `x`. Points outside the cube are clamped to its rim, a NaN coordinate to 0.
-    #[inline(always)]
-    fn locate<S: Simd>(&mut self, s: S, level: &Level, x: Tile<'_, R>, at: usize, n: usize) {
-        let number = |v: f64| V::<S, R>::splat(s, R::of(v));
-        let (zero, one, scale) = (number(0.0), number(1.0), number(level.scale));
-        let [x, y, z] = [0, 1, 2].map(|d| &x.channel(d)[at..at + n]);
-        for (d, [a, b]) in [[y, z], [x, z], [x, y]].into_iter().enumerate() {
-            let mut i = 0;
-            while i < n {
-                // The precise maximum returns the number if the other operand is NaN.
-                let a = load(s, a, i).max_precise(zero).min(one);
-                let b = load(s, b, i).max_precise(zero).min(one);
-                let u = (a + b) * scale;
-                let k = u.floor();
-                store::<S, R>(u - k, &mut self.fraction[d], i);
-                R::cells(s, k, &mut self.cell[d][i..]);
-                i += V::<S, R>::LEN;
-            }
-        }
-        // These loops process the whole block, even if it has fewer rows: a constant length makes them faster.
-        let [f, g, h] = &self.fraction;
-        for i in 0..BLOCK {
-            let (fg, fh, gh) = (u32::from(f[i] >= g[i]), u32::from(f[i] >= h[i]), u32::from(g[i] >= h[i]));
-            self.rank[0][i] = 2 - fg - fh;
-            self.rank[1][i] = 1 + fg - gh;
-            self.rank[2][i] = fh + gh;
-        }
-        for i in 0..BLOCK {
-            let (more, less) = if f[i] >= g[i] { (f[i], g[i]) } else { (g[i], f[i]) };
-            let (top, rest) = if more >= h[i] { (more, h[i]) } else { (h[i], more) };
-            let (middle, bottom) = if rest >= less { (rest, less) } else { (less, rest) };
-            self.weight[0][i] = R::ONE - top;
-            self.weight[1][i] = top - middle;
-            self.weight[2][i] = middle - bottom;
-            self.weight[3][i] = bottom;
-        }
-        let ([a, b, c], [p, q, r]) = (&self.cell, &self.rank);
-        for (corner, entry) in self.entry.iter_mut().enumerate() {
-            let corner = corner as u32;
-            if level.side == 0 {
-                for i in 0..BLOCK {
-                    let k = (a[i] + u32::from(p[i] < corner)).wrapping_mul(PRIMES[0]);
-                    let l = (b[i] + u32::from(q[i] < corner)).wrapping_mul(PRIMES[1]);
-                    let m = (c[i] + u32::from(r[i] < corner)).wrapping_mul(PRIMES[2]);
-                    entry[i] = (k ^ l ^ m) & level.last;
-                }
-            } else {
-                for i in 0..BLOCK {
-                    let k = a[i] + u32::from(p[i] < corner);
-                    let l = b[i] + u32::from(q[i] < corner);
-                    let m = c[i] + u32::from(r[i] < corner);
-                    // X, Y, Z plus 2, so that none is negative.
-                    let two = 2 + k + l + m;
-                    let (x, y, z) = (two - 2 * k, two - 2 * l, two - 2 * m);
-                    let pair = ((x >> 1) * level.side + (y >> 1)) * level.side + (z >> 1);
-                    entry[i] = (2 * pair + (x & 1)).min(level.last);
-                }
-            }
-        }
-    }
-
-    /// For each of the first `n` rows, whether it is the last one before a row in another simplex; and their number.
-    #[inline(always)]
-    fn leaving(&self, n: usize) -> ([bool; BLOCK], usize) {
-        let mut leaves = [true; BLOCK];
-        for i in 0..BLOCK - 1 {
-            let mut other = 0;
-            for entry in &self.entry {
-                other |= entry[i] ^ entry[i + 1];
-            }
-            leaves[i] = other != 0;
-        }
-        leaves[n - 1] = true;
-        let count = leaves[..n].iter().map(|&l| usize::from(l)).sum();
-        (leaves, count)
-    }
-
+impl<R: Real> Located<R> {
     /// Entries of the corners of row `i`.
     #[inline(always)]
     fn corners(&self, i: usize) -> [u32; 4] {
@@ -253,27 +114,11 @@ impl<R: Real> Located<R> {
     }
 }
 
-/// The features of four corners, one after the other, in registers of four, of which `F` are used.
-#[inline(always)]
-fn fours<S: Simd, R: Real, const F: usize>(s: S, corners: &[[R; F]; 4]) -> [R::Four<S>; 8] {
-    let mut lanes = [[R::ZERO; 4]; 8];
-    for c in 0..4 {
-        for f in 0..F {
-            lanes[(c * F + f) / 4][(c * F + f) % 4] = corners[c][f];
-        }
-    }
-    let mut all = [R::Four::<S>::splat(s, R::ZERO); 8];
-    for q in 0..F {
-        all[q] = R::Four::<S>::from_slice(s, &lanes[q]);
-    }
-    all
-}
-
-/// Entry `i` of a level's table, with `i` from [`Located::locate`] for the same level.
+/// Entry `i` of a level's table, with `i` from `locate` for the same level.
 #[inline(always)]
 #[allow(unsafe_code)]
 fn at<T>(table: &[T], i: u32) -> &T {
-    // SAFETY: callers slice `table` to the level's entries. `locate` masks a hash by their number less one, and lowers
+    // SAFETY: callers check that `table` has the level's entries. `locate` masks a hash by their number less one, and lowers
     // a direct index to it.
     unsafe { entry(table, i) }
 }
@@ -291,52 +136,6 @@ fn add<R: Real, const F: usize>(grads: &mut [[R; F]], corners: [u32; 4], sums: &
     }
 }
 
-struct Forward<'a, R> {
-    stage: &'a PermutohedralStage,
-    levels: Range<usize>,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-}
-
-impl<R: Real> Forward<'_, R> {
-    #[inline(always)]
-    fn features<S: Simd, const F: usize>(mut self, s: S) {
-        let mut located = Located::new();
-        let mut out = [[R::ZERO; F]; BLOCK];
-        for level in &self.stage.levels[self.levels.clone()] {
-            let (table, _) = self.params[level.table.range()].as_chunks::<F>();
-            assert_eq!(table.len(), level.last as usize + 1);
-            for first in (0..self.x.rows).step_by(BLOCK) {
-                let n = BLOCK.min(self.x.rows - first);
-                located.locate(s, level, self.x, first, n);
-                if level.side == 0 {
-                    prefetch(table, located.entry.iter(), n);
-                }
-                for i in 0..n {
-                    let corners = located.corners(i).map(|c| *at(table, c));
-                    let (corners, weights) = (fours(s, &corners), located.weights::<S, F>(s, i));
-                    let mut sum = [corners[0] * weights[0], R::Four::<S>::splat(s, R::ZERO)];
-                    for q in 1..F {
-                        let to = if F == 8 { q % 2 } else { 0 };
-                        sum[to] = corners[q].mul_add(weights[q], sum[to]);
-                    }
-                    if F < 4 {
-                        sum[0] += sum[0].rotate_elements_left::<2>();
-                    }
-                    if F < 2 {
-                        sum[0] += sum[0].rotate_elements_left::<1>();
-                    }
-                    for f in 0..F {
-                        out[i][f] = sum[f / 4].as_slice()[f % 4];
-                    }
-                }
-                level.table.put(&out, &mut self.y, first, n);
-            }
-        }
-    }
-}
-
 /// Adds the contributions of the first `n` rows at `located` to a level's gradients. If many consecutive rows share a
 /// simplex, they are summed first: the entries are then read and written once for all of them, and no row waits for the
 /// writes of the previous one.
@@ -348,7 +147,12 @@ fn scatter<S: Simd, R: Real, const F: usize>(
     dy: &[[R; F]; BLOCK],
     n: usize,
 ) {
-    let (leaves, simplices) = located.leaving(n);
+    let [a, b, c, d] = &located.entry;
+    let (leaves, simplices) = leaving(
+        n,
+        #[inline(always)]
+        |i| (a[i] ^ a[i + 1]) | (b[i] ^ b[i + 1]) | (c[i] ^ c[i + 1]) | (d[i] ^ d[i + 1]) != 0,
+    );
     let together = 3 * simplices <= n;
     let zero = R::Four::<S>::splat(s, R::ZERO);
     let mut sums = [zero; 8];
@@ -368,160 +172,192 @@ fn scatter<S: Simd, R: Real, const F: usize>(
     }
 }
 
-struct Backward<'a, R> {
-    stage: &'a PermutohedralStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
-}
+impl levels::Level for Level {
+    type Settings = Permutohedral;
+    type Located<R: Real> = Located<R>;
 
-impl<R: Real> Backward<'_, R> {
+    const NAME: &'static str = "permutohedral";
+    const BASE: (RangeInclusive<u32>, &'static str) = (2..=1 << 20, "2 to 2^20");
+    const WGSL: &'static [&'static str] = &[include_str!("permutohedral.wgsl")];
+
+    fn pyramid(s: &Permutohedral) -> Pyramid {
+        Pyramid { levels: s.levels, features: s.features, base_resolution: s.base_resolution, growth: s.growth }
+    }
+
+    fn parts(s: &Permutohedral, number: usize, resolution: f64, _: usize) -> Result<Vec<Self>> {
+        let table = table_size(s.log2_table_size)?;
+        let expected = "at most 2^22 cells per side (positions are single precision): fewer levels or less growth";
+        finest(number, resolution, FINEST, expected)?;
+        let scale = resolution * 0.5f64.cbrt();
+        // A vertex has integer coordinates X, Y, Z in units of 1/(2s), all even or all odd. Those of a point's simplex
+        // lie in [−2, 2s + 2], because rounding may move the point slightly; a pair is an even vertex and the odd one
+        // after it.
+        let side = (((2.0 * scale + 1e-2).ceil() as u32 + 3) >> 1) + 1;
+        let vertices = 2 * u128::from(side).pow(3);
+        let direct = vertices <= u128::from(table);
+        let (side, entries) = if direct { (side, vertices as u32) } else { (0, table) };
+        Ok(vec![Self { resolution, scale, side, last: entries - 1 }])
+    }
+
+    fn resolution(&self) -> f64 {
+        self.resolution
+    }
+
+    fn blocks(&self, features: usize) -> Vec<(String, Vec<usize>)> {
+        vec![("table".into(), vec![self.last as usize + 1, features])]
+    }
+
+    fn macs(features: usize) -> usize {
+        4 * features + 9
+    }
+
+    /// Points outside the cube are clamped to its rim, a NaN coordinate to 0.
     #[inline(always)]
-    fn features<S: Simd, const F: usize>(mut self, s: S) {
-        let mut located = Located::new();
-        let mut dy = [[R::ZERO; F]; BLOCK];
-        if let Some(dx) = &mut self.dx {
-            dx.data.fill(R::ZERO);
-        }
-        for level in &self.stage.levels {
-            let mut asked = Asked::of(&self.grads, &level.table.range());
-            if asked.is_empty() && self.dx.is_none() {
-                continue;
+    fn locate<S: Simd, R: Real>(&self, s: S, to: &mut Located<R>, x: Tile<'_, R>, at: usize, n: usize) {
+        let number = |v: f64| V::<S, R>::splat(s, R::of(v));
+        let (zero, one, scale) = (number(0.0), number(1.0), number(self.scale));
+        let [x, y, z] = [0, 1, 2].map(|d| &x.channel(d)[at..at + n]);
+        for (d, [a, b]) in [[y, z], [x, z], [x, y]].into_iter().enumerate() {
+            let mut i = 0;
+            while i < n {
+                // The precise maximum returns the number if the other operand is NaN.
+                let a = load(s, a, i).max_precise(zero).min(one);
+                let b = load(s, b, i).max_precise(zero).min(one);
+                let u = (a + b) * scale;
+                let k = u.floor();
+                store::<S, R>(u - k, &mut to.fraction[d], i);
+                R::cells(s, k, &mut to.cell[d][i..]);
+                i += V::<S, R>::LEN;
             }
-            let (grads, _) = asked.values(&mut self.grads).as_chunks_mut::<F>();
-            assert!(grads.is_empty() || grads.len() == level.last as usize + 1);
-            let (table, _) = self.params[level.table.range()].as_chunks::<F>();
-            for first in (0..self.x.rows).step_by(BLOCK) {
-                let n = BLOCK.min(self.x.rows - first);
-                level.table.take(self.dy, &mut dy, first, n);
-                located.locate(s, level, self.x, first, n);
-                if !grads.is_empty() {
-                    if level.side == 0 {
-                        prefetch(grads, located.entry.iter(), n);
-                    }
-                    scatter::<S, R, F>(s, grads, &located, &dy, n);
+        }
+        // These loops process the whole block, even if it has fewer rows: a constant length makes them faster.
+        let [f, g, h] = &to.fraction;
+        for i in 0..BLOCK {
+            let (fg, fh, gh) = (u32::from(f[i] >= g[i]), u32::from(f[i] >= h[i]), u32::from(g[i] >= h[i]));
+            to.rank[0][i] = 2 - fg - fh;
+            to.rank[1][i] = 1 + fg - gh;
+            to.rank[2][i] = fh + gh;
+        }
+        for i in 0..BLOCK {
+            let (more, less) = if f[i] >= g[i] { (f[i], g[i]) } else { (g[i], f[i]) };
+            let (top, rest) = if more >= h[i] { (more, h[i]) } else { (h[i], more) };
+            let (middle, bottom) = if rest >= less { (rest, less) } else { (less, rest) };
+            to.weight[0][i] = R::ONE - top;
+            to.weight[1][i] = top - middle;
+            to.weight[2][i] = middle - bottom;
+            to.weight[3][i] = bottom;
+        }
+        let ([a, b, c], [p, q, r]) = (&to.cell, &to.rank);
+        for (corner, entry) in to.entry.iter_mut().enumerate() {
+            let corner = corner as u32;
+            if self.side == 0 {
+                for i in 0..BLOCK {
+                    let k = (a[i] + u32::from(p[i] < corner)).wrapping_mul(PRIMES[0]);
+                    let l = (b[i] + u32::from(q[i] < corner)).wrapping_mul(PRIMES[1]);
+                    let m = (c[i] + u32::from(r[i] < corner)).wrapping_mul(PRIMES[2]);
+                    entry[i] = (k ^ l ^ m) & self.last;
                 }
-                let Some(dx) = &mut self.dx else { continue };
-                for i in 0..n {
-                    let v: [R; 4] = located.corners(i).map(|c| {
-                        let entry = &table[c as usize];
-                        (0..F).map(|f| entry[f] * dy[i][f]).sum()
-                    });
-                    // With respect to a fraction: the corner that it adds to, minus the one before.
-                    let by = [0, 1, 2].map(|d| {
-                        let rank = located.rank[d][i] as usize;
-                        v[rank + 1] - v[rank]
-                    });
-                    for d in 0..3 {
-                        // Beyond the rim a position is clamped, whatever its value.
-                        let x = self.x.channel(d)[first + i];
-                        if x >= R::ZERO && x <= R::ONE {
-                            dx.channel(d)[first + i] += R::of(level.scale) * (by[(d + 1) % 3] + by[(d + 2) % 3]);
-                        }
-                    }
+            } else {
+                for i in 0..BLOCK {
+                    let k = a[i] + u32::from(p[i] < corner);
+                    let l = b[i] + u32::from(q[i] < corner);
+                    let m = c[i] + u32::from(r[i] < corner);
+                    // X, Y, Z plus 2, so that none is negative.
+                    let two = 2 + k + l + m;
+                    let (x, y, z) = (two - 2 * k, two - 2 * l, two - 2 * m);
+                    let pair = ((x >> 1) * self.side + (y >> 1)) * self.side + (z >> 1);
+                    entry[i] = (2 * pair + (x & 1)).min(self.last);
                 }
             }
-            asked.finish(&mut self.grads);
-        }
-    }
-}
-
-by_features!(Forward);
-by_features!(Backward);
-
-kernel_of_levels!(PermutohedralStage);
-
-impl Stage for PermutohedralStage {
-    fn info(&self) -> Info {
-        Info {
-            input: 3,
-            output: self.outputs,
-            params: self.params,
-            tape: 0,
-            scope: Scope::Row,
-            grads: GradKind::Scatter,
-            macs: self.levels.len() * (4 * self.features + 9),
-            identity: false,
         }
     }
 
-    fn parameters(&self) -> Vec<Parameter> {
-        let f = self.features;
-        self.levels.iter().map(|l| l.table.parameter(vec![l.last as usize + 1, f])).collect()
-    }
-
-    fn init(&self, seed: u64, params: &mut [f32]) {
-        start(seed, params);
-    }
-
-    fn kernel(&self) -> &dyn Kernel<f32> {
-        self
-    }
-
-    fn reference(&self) -> Option<&dyn Kernel<f64>> {
-        Some(self)
-    }
-
-    fn partition(&self) -> Vec<Range<usize>> {
-        self.levels.iter().map(|l| l.table.range()).collect()
-    }
-
-    fn wgsl(&self) -> Option<Fragment> {
-        let code = |l: &Level| {
-            let first = u32::try_from(l.table.start).ok()?;
-            let value = format!("stage_Level({:?}, {}u, {}u, {first}u)", l.scale as f32, l.side, l.last);
-            Some(LevelCode { value, outputs: l.table.outputs.clone() })
-        };
-        let levels = self.levels.iter().map(code).collect::<Option<Vec<_>>>()?;
-        let [x, y, z] = PRIMES;
-        let f = self.features;
-        let constants = format!("const stage_FEATURES = {f}u;\nconst stage_PRIMES = vec3<u32>({x}u, {y}u, {z}u);\n");
-        Some(Fragment::new(&[&constants, include_str!("permutohedral.wgsl"), &functions(&levels, self.outputs)]))
-    }
-
-    fn describe(&self) -> String {
-        let cells = |l: Option<&Level>| l.map_or(0.0, |l| l.resolution);
-        format!(
-            "permutohedral: {} levels x {}, {:.0} to {:.0} cells per side, tables up to 2^{}, {} of them direct",
-            self.levels.len(),
-            self.features,
-            cells(self.levels.first()),
-            cells(self.levels.last()),
-            self.log2_table_size,
-            self.levels.iter().filter(|l| l.side > 0).count()
-        )
-    }
-}
-
-impl Encoder for PermutohedralStage {
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
-        ensure(!keep.is_empty(), "permutohedral", "channels", "none kept", "at least one")?;
-        let mut stage = Self { levels: vec![], params: 0, outputs: keep.len(), ..self.clone() };
-        let mut params = vec![];
-        for level in &self.levels {
-            if let Some(table) = level.table.kept(keep, stage.params) {
-                stage.params += table.len;
-                params.push(level.table.range());
-                stage.levels.push(Level { table, ..level.clone() });
+    #[inline(always)]
+    fn gather<S: Simd, R: Real, const F: usize>(
+        &self,
+        s: S,
+        located: &Located<R>,
+        table: &[[R; F]],
+        out: &mut [[R; F]; BLOCK],
+        n: usize,
+    ) {
+        assert_eq!(table.len(), self.last as usize + 1);
+        if self.side == 0 {
+            prefetch(table, located.entry.iter(), n);
+        }
+        for i in 0..n {
+            let corners = fours(s, &located.corners(i).map(|c| *at(table, c)));
+            let weights = located.weights::<S, F>(s, i);
+            let mut sum = [corners[0] * weights[0], R::Four::<S>::splat(s, R::ZERO)];
+            for q in 1..F {
+                let to = if F == 8 { q % 2 } else { 0 };
+                sum[to] = corners[q].mul_add(weights[q], sum[to]);
             }
+            out[i] = fold::<S, R, F>(sum);
         }
-        Ok(Reduced { stage: Box::new(stage), params, channels: vec![0, 1, 2] })
     }
 
-    fn coarse_to_fine(&self) -> bool {
-        true
+    #[inline(always)]
+    fn scatter<S: Simd, R: Real, const F: usize>(
+        &self,
+        s: S,
+        located: &Located<R>,
+        _: &[[R; F]],
+        dy: &[[R; F]; BLOCK],
+        n: usize,
+        grads: &mut [R],
+        _: &Range<usize>,
+    ) {
+        let (grads, _) = grads.as_chunks_mut::<F>();
+        assert_eq!(grads.len(), self.last as usize + 1);
+        if self.side == 0 {
+            prefetch(grads, located.entry.iter(), n);
+        }
+        scatter(s, grads, located, dy, n);
     }
 
-    fn resolutions(&self) -> Option<Vec<f64>> {
-        Some(by_channel(self.levels.iter().map(|l| (l.resolution, &l.table.outputs[..])), self.outputs))
+    #[inline(always)]
+    fn slope<R: Real, const F: usize>(
+        &self,
+        located: &Located<R>,
+        table: &[[R; F]],
+        dy: &[R; F],
+        x: [R; 3],
+        i: usize,
+    ) -> [R; 3] {
+        let v: [R; 4] = located.corners(i).map(|c| (0..F).map(|f| table[c as usize][f] * dy[f]).sum());
+        // With respect to a fraction: the corner that it adds to, minus the one before.
+        let by = located.rank.each_ref().map(|rank| {
+            let rank = rank[i] as usize;
+            v[rank + 1] - v[rank]
+        });
+        std::array::from_fn(|d| {
+            // Beyond the rim a position is clamped, whatever its value.
+            let inside = x[d] >= R::ZERO && x[d] <= R::ONE;
+            if inside { R::of(self.scale) * (by[(d + 1) % 3] + by[(d + 2) % 3]) } else { R::ZERO }
+        })
+    }
+
+    fn code(&self) -> String {
+        format!("{:?}, {}u, {}u", self.scale as f32, self.side, self.last)
+    }
+
+    fn constants(_: &Permutohedral) -> String {
+        primes(PRIMES)
+    }
+
+    fn size(stage: &Levels<Self>) -> String {
+        sizes(stage.settings.log2_table_size, stage.levels().filter(|l| l.side > 0).count())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::levels::Level as _;
+    use conefield_core::simd::{Op, run};
+
+    type PermutohedralStage = Levels<Level>;
 
     struct Locate<'a, R>(&'a mut Located<R>, &'a Level, Tile<'a, R>);
     impl<R: Real> Op for Locate<'_, R> {
@@ -529,7 +365,7 @@ mod tests {
         type Out = ();
         #[inline(always)]
         fn call<S: Simd>(self, s: S) {
-            self.0.locate(s, self.1, self.2, 0, 1);
+            self.1.locate(s, self.0, self.2, 0, 1);
         }
     }
 
@@ -552,12 +388,12 @@ mod tests {
     #[test]
     fn simplices_are_those_of_the_body_centred_lattice() {
         let stage = stage(5, 1.7, 12);
-        for level in &stage.levels {
+        for level in stage.levels() {
             assert!(level.side > 0);
             let mut owner = std::collections::BTreeMap::new();
             for n in 0..4000u64 {
                 let p = [0, 1, 2].map(|d| f64::from(conefield_core::random::unit(conefield_core::random::mix(d, n))));
-                let mut located = Located::<f64>::new();
+                let mut located = Located::<f64>::default();
                 run(Locate(&mut located, level, Tile::new(&p, 1)));
                 let corners: Vec<[i64; 3]> = (0..4).map(|c| vertex(&located, c)).collect();
                 for (c, v) in corners.iter().enumerate() {
@@ -583,7 +419,7 @@ mod tests {
     #[test]
     fn a_level_has_as_many_vertices_as_a_cubic_grid() {
         let stage = stage(64, 2.0, 24);
-        let entries = f64::from(stage.levels[1].last + 1);
+        let entries = f64::from(stage.levels().nth(1).unwrap().last + 1);
         assert!((1.0..1.08).contains(&(entries / 128f64.powi(3))), "{entries}");
     }
 
@@ -592,10 +428,10 @@ mod tests {
     #[test]
     fn the_rim_stays_inside_the_table() {
         for (base, growth) in [(2, 1.26), (25, 1.14), (63, 1.25), (50, 1.15), (30, 2.05)] {
-            for level in &stage(base, growth, 22).levels {
+            for level in stage(base, growth, 22).levels() {
                 for bits in 0..27 {
                     let x = [0, 1, 2].map(|d| [0.0f32, 1.0, f32::INFINITY][bits / 3usize.pow(d) % 3]);
-                    let mut located = Located::<f32>::new();
+                    let mut located = Located::<f32>::default();
                     run(Locate(&mut located, level, Tile::new(&x, 1)));
                     let k = located.cell.map(|c| i64::from(c[0]));
                     let total: f32 = located.weight.iter().map(|w| w[0]).sum();

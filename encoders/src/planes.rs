@@ -10,17 +10,14 @@
 //! A level with `r` cells per side has `r + 1` nodes along each axis, at the corners of its cells, which fill the cube
 //! exactly.
 
-use crate::levels::{
-    Asked, BLOCK, Cells, LevelCode, Table, by_channel, by_features, functions, kernel_of_levels, start, stretch,
-};
-use conefield_core::error::{Result, ensure};
+use crate::levels::{self, BLOCK, Cells, Levels, Pyramid, finest, stretch};
+use conefield_core::error::Result;
 use conefield_core::settings::EncoderSpec;
-use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use conefield_core::wgsl::Fragment;
+use conefield_core::simd::{Real, Simd};
+use conefield_core::stage::{Encoder, Tile};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 /// How the planes of a level are combined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -65,7 +62,7 @@ conefield_core::stage_type!(
 #[typetag::serde(name = "planes")]
 impl EncoderSpec for Planes {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(PlanesStage::new(self)?))
+        Ok(Box::new(Levels::<Factor>::new(self)?))
     }
 }
 
@@ -76,76 +73,39 @@ const FINEST: f64 = 8192.0;
 const AXES: [[usize; 3]; 3] = [[0, 1, 2], [0, 2, 1], [1, 2, 0]];
 
 /// A plane, and its line if it has one: one orientation of one level.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 struct Factor {
-    table: Table,
-    orientation: usize,
-}
-
-#[derive(Debug, Clone, PartialEq)]
-struct Level {
     cells: u32,
-    factors: Vec<Factor>,
+    orientation: usize,
+    form: Form,
 }
 
-impl Level {
+impl Factor {
     /// Nodes along an axis.
     fn nodes(&self) -> usize {
         self.cells as usize + 1
     }
-}
 
-/// The stage that [`Planes`] builds.
-#[derive(Debug, Clone, PartialEq)]
-pub struct PlanesStage {
-    form: Form,
-    features: usize,
-    levels: Vec<Level>,
-    params: usize,
-    outputs: usize,
-}
+    /// Numbers in the plane.
+    fn plane(&self, features: usize) -> usize {
+        self.nodes() * self.nodes() * features
+    }
 
-impl PlanesStage {
-    /// Builds the stage, or names the setting that is out of range.
-    pub fn new(settings: &Planes) -> Result<Self> {
-        let s = settings;
-        ensure((1..=32).contains(&s.levels), "spec", "levels", s.levels, "1 to 32")?;
-        ensure([1, 2, 4, 8].contains(&s.features), "spec", "features", s.features, "1, 2, 4 or 8")?;
-        let base = s.base_resolution;
-        ensure((1..=8192).contains(&base), "spec", "base_resolution", base, "1 to 8192 cells per side")?;
-        ensure((1.0..=16.0).contains(&s.growth), "spec", "growth", s.growth, "1 to 16")?;
-        let mut stage = Self { form: s.form, features: s.features, levels: vec![], params: 0, outputs: 0 };
-        for number in 0..s.levels {
-            let cells = (f64::from(base) * s.growth.powi(number as i32)).round();
-            let found = format!("level {number} with {cells:.0} cells per side");
-            ensure(cells <= FINEST, "spec", "levels", found, "at most 8192 cells per side: fewer levels, less growth")?;
-            let mut level = Level { cells: cells as u32, factors: vec![] };
-            for orientation in 0..3 {
-                let first = stage.outputs + if s.form == Form::VectorMatrix { orientation * s.features } else { 0 };
-                let outputs = (first..first + s.features).map(Some).collect();
-                let len = stage.factor(level.nodes());
-                level.factors.push(Factor { table: Table { start: stage.params, len, number, outputs }, orientation });
-                stage.params += len;
+    fn has_line(&self) -> bool {
+        self.form == Form::VectorMatrix
+    }
+
+    /// The gradient with respect to the plane's value.
+    #[inline(always)]
+    fn worth<R: Real, const F: usize>(&self, line: &[[R; F]], at: &Place<R>, dy: &[R; F]) -> [R; F] {
+        let mut worth = *dy;
+        if self.has_line() {
+            let along = on_line(line, at, at.line);
+            for f in 0..F {
+                worth[f] *= along[f];
             }
-            stage.outputs += s.features * if s.form == Form::VectorMatrix { 3 } else { 1 };
-            stage.levels.push(level);
         }
-        Ok(stage)
-    }
-
-    /// Numbers in a plane with `nodes` nodes per axis.
-    fn plane(&self, nodes: usize) -> usize {
-        nodes * nodes * self.features
-    }
-
-    /// Numbers in a plane and its line, if it has one.
-    fn factor(&self, nodes: usize) -> usize {
-        let line = if self.form == Form::VectorMatrix { nodes * self.features } else { 0 };
-        self.plane(nodes) + line
-    }
-
-    fn factors(&self) -> impl Iterator<Item = (&Level, &Factor)> {
-        self.levels.iter().flat_map(|l| l.factors.iter().map(move |f| (l, f)))
+        worth
     }
 }
 
@@ -208,249 +168,163 @@ fn on_line<R: Real, const F: usize>(line: &[[R; F]], at: &Place<R>, weights: [R;
     sum
 }
 
-struct Forward<'a, R> {
-    stage: &'a PlanesStage,
-    levels: Range<usize>,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-}
+impl levels::Level for Factor {
+    type Settings = Planes;
+    type Located<R: Real> = Cells<R>;
 
-impl<R: Real> Forward<'_, R> {
-    #[inline(always)]
-    fn features<S: Simd, const F: usize>(mut self, s: S) {
-        let mut cells = Cells::new();
-        for level in &self.stage.levels[self.levels.clone()] {
-            let nodes = level.nodes();
-            for at in (0..self.x.rows).step_by(BLOCK) {
-                let n = BLOCK.min(self.x.rows - at);
-                cells.locate(s, level.cells, self.x, at, n);
-                let mut out = [[R::ZERO; F]; BLOCK];
-                for factor in &level.factors {
-                    let (table, _) = self.params[factor.table.range()].as_chunks::<F>();
-                    let (plane, line) = table.split_at(nodes * nodes);
-                    for i in 0..n {
-                        let place = Place::of(&cells, factor.orientation, nodes, i);
-                        let mut value = on_plane(plane, &place, place.weights);
-                        if self.stage.form == Form::VectorMatrix {
-                            let along = on_line(line, &place, place.line);
-                            for f in 0..F {
-                                out[i][f] = value[f] * along[f];
-                            }
-                        } else {
-                            for f in 0..F {
-                                value[f] += out[i][f];
-                            }
-                            out[i] = value;
-                        }
-                    }
-                    // The last plane of a sum writes the result.
-                    factor.table.put(&out, &mut self.y, at, n);
-                }
-            }
-        }
-    }
-}
+    const NAME: &'static str = "planes";
+    const BASE: (RangeInclusive<u32>, &'static str) = (1..=8192, "1 to 8192 cells per side");
+    const WGSL: &'static [&'static str] = &[include_str!("planes.wgsl")];
 
-struct Backward<'a, R> {
-    stage: &'a PlanesStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
-}
-
-impl<R: Real> Backward<'_, R> {
-    #[inline(always)]
-    fn features<S: Simd, const F: usize>(mut self, s: S) {
-        let mut cells = Cells::new();
-        let mut dy = [[R::ZERO; F]; BLOCK];
-        if let Some(dx) = &mut self.dx {
-            dx.data.fill(R::ZERO);
-        }
-        let lines = self.stage.form == Form::VectorMatrix;
-        for (level, factor) in self.stage.factors() {
-            let mut asked = Asked::of(&self.grads, &factor.table.range());
-            if asked.is_empty() && self.dx.is_none() {
-                continue;
-            }
-            let nodes = level.nodes();
-            let [a, b, c] = AXES[factor.orientation];
-            let (table, _) = self.params[factor.table.range()].as_chunks::<F>();
-            let (plane, line) = table.split_at(nodes * nodes);
-            let (grads, _) = asked.values(&mut self.grads).as_chunks_mut::<F>();
-            let (plane_grads, line_grads) = grads.split_at_mut(grads.len().min(nodes * nodes));
-            for at in (0..self.x.rows).step_by(BLOCK) {
-                let n = BLOCK.min(self.x.rows - at);
-                factor.table.take(self.dy, &mut dy, at, n);
-                cells.locate(s, level.cells, self.x, at, n);
-                for i in 0..n {
-                    let place = Place::of(&cells, factor.orientation, nodes, i);
-                    // The gradient with respect to the plane's value.
-                    let mut worth = dy[i];
-                    if lines {
-                        let along = on_line(line, &place, place.line);
-                        for f in 0..F {
-                            worth[f] *= along[f];
-                        }
-                    }
-                    if !plane_grads.is_empty() {
-                        for c in 0..4 {
-                            let to = &mut plane_grads[place.corners[c]];
-                            for f in 0..F {
-                                to[f] += place.weights[c] * worth[f];
-                            }
-                        }
-                    }
-                    if !line_grads.is_empty() {
-                        let value = on_plane(plane, &place, place.weights);
-                        for k in 0..2 {
-                            let to = &mut line_grads[place.node + k];
-                            for f in 0..F {
-                                to[f] += place.line[k] * (dy[i][f] * value[f]);
-                            }
-                        }
-                    }
-                    let Some(dx) = &mut self.dx else { continue };
-                    let ends = [R::ZERO - R::ONE, R::ONE];
-                    let along_a = on_plane(plane, &place, products(ends, place.plane[1]));
-                    let along_b = on_plane(plane, &place, products(place.plane[0], ends));
-                    let dot = |v: [R; F], w: [R; F]| (0..F).map(|f| v[f] * w[f]).sum::<R>();
-                    let mut slopes = vec![(a, dot(along_a, worth)), (b, dot(along_b, worth))];
-                    if lines {
-                        let value = on_plane(plane, &place, place.weights);
-                        let along = on_line(line, &place, ends);
-                        slopes.push((c, (0..F).map(|f| dy[i][f] * value[f] * along[f]).sum()));
-                    }
-                    for (d, slope) in slopes {
-                        dx.channel(d)[at + i] += slope * stretch(self.x.channel(d)[at + i], level.cells);
-                    }
-                }
-            }
-            asked.finish(&mut self.grads);
-        }
-    }
-}
-
-by_features!(Forward);
-by_features!(Backward);
-
-kernel_of_levels!(PlanesStage);
-
-impl Stage for PlanesStage {
-    fn info(&self) -> Info {
-        Info {
-            input: 3,
-            output: self.outputs,
-            params: self.params,
-            tape: 0,
-            scope: Scope::Row,
-            grads: GradKind::Scatter,
-            macs: self.factors().count() * (7 * self.features + 8),
-            identity: false,
-        }
+    fn pyramid(s: &Planes) -> Pyramid {
+        Pyramid { levels: s.levels, features: s.features, base_resolution: s.base_resolution, growth: s.growth }
     }
 
-    fn parameters(&self) -> Vec<Parameter> {
-        let mut all = vec![];
-        for (level, factor) in self.factors() {
-            let (n, f, table) = (level.nodes(), self.features, &factor.table);
-            let name = format!("{}.{}", table.number, factor.orientation);
-            all.push(Parameter { name: format!("{name}.plane"), shape: vec![n, n, f], start: table.start });
-            if self.form == Form::VectorMatrix {
-                let start = table.start + self.plane(n);
-                all.push(Parameter { name: format!("{name}.line"), shape: vec![n, f], start });
-            }
+    fn parts(s: &Planes, number: usize, resolution: f64, _: usize) -> Result<Vec<Self>> {
+        let cells = resolution.round();
+        finest(number, cells, FINEST, "at most 8192 cells per side: fewer levels, less growth")?;
+        Ok((0..3).map(|orientation| Self { cells: cells as u32, orientation, form: s.form }).collect())
+    }
+
+    fn adds(&self) -> bool {
+        self.form == Form::TriPlane && self.orientation > 0
+    }
+
+    fn resolution(&self) -> f64 {
+        f64::from(self.cells)
+    }
+
+    fn blocks(&self, features: usize) -> Vec<(String, Vec<usize>)> {
+        let (n, name) = (self.nodes(), self.orientation);
+        let mut all = vec![(format!("{name}.plane"), vec![n, n, features])];
+        if self.has_line() {
+            all.push((format!("{name}.line"), vec![n, features]));
         }
         all
     }
 
     /// Planes are initialized near 0, like the features of other grids; lines start at 1, so that planes learn.
-    fn init(&self, seed: u64, params: &mut [f32]) {
-        start(seed, params);
-        for (level, factor) in self.factors() {
-            params[factor.table.start + self.plane(level.nodes())..factor.table.range().end].fill(1.0);
-        }
+    fn init(&self, features: usize, params: &mut [f32]) {
+        params[self.plane(features)..].fill(1.0);
     }
 
-    fn kernel(&self) -> &dyn Kernel<f32> {
-        self
+    fn macs(features: usize) -> usize {
+        7 * features + 8
     }
 
-    fn reference(&self) -> Option<&dyn Kernel<f64>> {
-        Some(self)
+    #[inline(always)]
+    fn locate<S: Simd, R: Real>(&self, s: S, to: &mut Cells<R>, x: Tile<'_, R>, at: usize, n: usize) {
+        to.locate(s, self.cells, x, at, n);
     }
 
-    /// A plane and its line per worker.
-    fn partition(&self) -> Vec<Range<usize>> {
-        self.factors().map(|(_, f)| f.table.range()).collect()
-    }
-
-    fn wgsl(&self) -> Option<Fragment> {
-        let mut levels = vec![];
-        for level in &self.levels {
-            // Planes that are summed count as one level there.
-            let each = if self.form == Form::VectorMatrix { 1 } else { 3 };
-            for factor in level.factors.iter().step_by(each) {
-                let first = u32::try_from(factor.table.start).ok()?;
-                let value = format!("stage_Level({}u, {}u, {first}u)", level.cells, factor.orientation);
-                levels.push(LevelCode { value, outputs: factor.table.outputs.clone() });
-            }
-        }
-        let (f, lines) = (self.features, self.form == Form::VectorMatrix);
-        let constants = format!("const stage_FEATURES = {f}u;\nconst stage_LINES = {lines};\n");
-        Some(Fragment::new(&[&constants, include_str!("planes.wgsl"), &functions(&levels, self.outputs)]))
-    }
-
-    fn describe(&self) -> String {
-        let cells = |l: Option<&Level>| l.map_or(0, |l| l.cells);
-        format!(
-            "planes: {} levels x {} of {}, {} to {} cells per side, {} parameters",
-            self.levels.len(),
-            self.features,
-            if self.form == Form::VectorMatrix { "planes and lines" } else { "three planes" },
-            cells(self.levels.first()),
-            cells(self.levels.last()),
-            self.params
-        )
-    }
-}
-
-impl Encoder for PlanesStage {
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
-        ensure(!keep.is_empty(), "planes", "channels", "none kept", "at least one")?;
-        let mut stage = Self { levels: vec![], params: 0, outputs: keep.len(), ..self.clone() };
-        let mut params = vec![];
-        for level in &self.levels {
-            let mut factors = vec![];
-            for factor in &level.factors {
-                if let Some(table) = factor.table.kept(keep, stage.params) {
-                    stage.params += table.len;
-                    params.push(factor.table.range());
-                    factors.push(Factor { table, ..factor.clone() });
+    #[inline(always)]
+    fn gather<S: Simd, R: Real, const F: usize>(
+        &self,
+        _: S,
+        located: &Cells<R>,
+        table: &[[R; F]],
+        out: &mut [[R; F]; BLOCK],
+        n: usize,
+    ) {
+        let (plane, line) = table.split_at(self.plane(1));
+        for i in 0..n {
+            let place = Place::of(located, self.orientation, self.nodes(), i);
+            let mut value = on_plane(plane, &place, place.weights);
+            if self.has_line() {
+                let along = on_line(line, &place, place.line);
+                for f in 0..F {
+                    value[f] *= along[f];
+                }
+            } else if self.adds() {
+                for f in 0..F {
+                    value[f] += out[i][f];
                 }
             }
-            if !factors.is_empty() {
-                stage.levels.push(Level { factors, ..level.clone() });
+            out[i] = value;
+        }
+    }
+
+    #[inline(always)]
+    fn scatter<S: Simd, R: Real, const F: usize>(
+        &self,
+        _: S,
+        located: &Cells<R>,
+        table: &[[R; F]],
+        dy: &[[R; F]; BLOCK],
+        n: usize,
+        grads: &mut [R],
+        _: &Range<usize>,
+    ) {
+        let (plane, line) = table.split_at(self.plane(1));
+        let (plane_grads, line_grads) = grads.as_chunks_mut::<F>().0.split_at_mut(self.plane(1));
+        for i in 0..n {
+            let place = Place::of(located, self.orientation, self.nodes(), i);
+            let worth = self.worth(line, &place, &dy[i]);
+            for c in 0..4 {
+                let to = &mut plane_grads[place.corners[c]];
+                for f in 0..F {
+                    to[f] += place.weights[c] * worth[f];
+                }
+            }
+            if self.has_line() {
+                let value = on_plane(plane, &place, place.weights);
+                for k in 0..2 {
+                    let to = &mut line_grads[place.node + k];
+                    for f in 0..F {
+                        to[f] += place.line[k] * (dy[i][f] * value[f]);
+                    }
+                }
             }
         }
-        Ok(Reduced { stage: Box::new(stage), params, channels: vec![0, 1, 2] })
     }
 
-    fn coarse_to_fine(&self) -> bool {
-        true
+    #[inline(always)]
+    fn slope<R: Real, const F: usize>(
+        &self,
+        located: &Cells<R>,
+        table: &[[R; F]],
+        dy: &[R; F],
+        x: [R; 3],
+        i: usize,
+    ) -> [R; 3] {
+        let (plane, line) = table.split_at(self.plane(1));
+        let [a, b, c] = AXES[self.orientation];
+        let place = Place::of(located, self.orientation, self.nodes(), i);
+        let worth = self.worth(line, &place, dy);
+        let ends = [R::ZERO - R::ONE, R::ONE];
+        let along_a = on_plane(plane, &place, products(ends, place.plane[1]));
+        let along_b = on_plane(plane, &place, products(place.plane[0], ends));
+        let dot = |v: [R; F], w: [R; F]| (0..F).map(|f| v[f] * w[f]).sum::<R>();
+        let mut slopes = [R::ZERO; 3];
+        slopes[a] = dot(along_a, worth);
+        slopes[b] = dot(along_b, worth);
+        if self.has_line() {
+            let value = on_plane(plane, &place, place.weights);
+            let along = on_line(line, &place, ends);
+            slopes[c] = (0..F).map(|f| dy[f] * value[f] * along[f]).sum();
+        }
+        std::array::from_fn(|d| slopes[d] * stretch(x[d], self.cells))
     }
 
-    fn resolutions(&self) -> Option<Vec<f64>> {
-        let factors = self.factors().map(|(l, f)| (f64::from(l.cells), &f.table.outputs[..]));
-        Some(by_channel(factors, self.outputs))
+    fn code(&self) -> String {
+        format!("{}u, {}u", self.cells, self.orientation)
+    }
+
+    fn constants(s: &Planes) -> String {
+        format!("const stage_LINES = {};\n", s.form == Form::VectorMatrix)
+    }
+
+    fn of(s: &Planes) -> &'static str {
+        if s.form == Form::VectorMatrix { " of planes and lines" } else { " of three planes" }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::stage::{Kernel, Stage, TileMut};
+
+    type PlanesStage = Levels<Factor>;
 
     /// Nodes are at the positions that the shape implies, and planes use the axes in the formula.
     #[test]
