@@ -3,7 +3,7 @@
 //! Every stage is a table with a `type` and the settings of that type. A stage with default settings may be written as
 //! its type name. [`crate::registry`] lists the types; [`load`] reads files and locates mistakes.
 
-mod check;
+pub mod check;
 pub mod load;
 pub mod marks;
 mod one_of;

@@ -4,7 +4,7 @@
 use super::LABEL;
 use super::one_of;
 use super::schema::{NESTED, label, of_type};
-use super::tree::{At, Is, Node};
+use super::tree::{At, Is, Node, parse_json};
 use crate::error::{Error, Result};
 use crate::registry::{Kind, find, names};
 use serde_json::Value;
@@ -18,6 +18,17 @@ pub(super) fn spec(root: &Node) -> Result<()> {
         }
     }
     stage(root, Kind::Method, "")
+}
+
+/// Checks the settings of one stage, with their type, as those in a spec are checked; `source` names them in errors.
+pub fn settings(kind: Kind, table: &Value, source: &str) -> Result<()> {
+    stage(&parse_json(source, &table.to_string(), 0)?, kind, "").map_err(|e| match e {
+        // They are one line: its columns say nothing.
+        Error::Invalid { field, found, expected, .. } => {
+            Error::Invalid { place: source.into(), field, found, expected }
+        }
+        other => other,
+    })
 }
 
 /// Checks a stage: its type, then its settings. At the top of a spec (empty `path`) the spec's own keys are allowed

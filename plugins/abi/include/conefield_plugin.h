@@ -187,7 +187,8 @@ typedef struct ConefieldInfo {
    */
   uint32_t coarse_to_fine;
   /*
-   1 if it has double-precision kernels.
+   1 if it has double-precision kernels; 0 leaves `forward_f64` and `backward_f64` unused. Without them gradients are
+   checked in single precision, which is coarse near kinks and at high frequencies.
    */
   uint32_t double_precision;
 } ConefieldInfo;

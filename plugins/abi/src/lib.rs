@@ -225,7 +225,8 @@ pub struct ConefieldInfo {
     pub identity: u32,
     /// 1 if an encoder's channels are ordered from coarse to fine.
     pub coarse_to_fine: u32,
-    /// 1 if it has double-precision kernels.
+    /// 1 if it has double-precision kernels; 0 leaves `forward_f64` and `backward_f64` unused. Without them gradients are
+    /// checked in single precision, which is coarse near kinks and at high frequencies.
     pub double_precision: u32,
 }
 

@@ -88,7 +88,7 @@ fn each(n: usize, mut one: impl FnMut(&[usize]) -> Result<Option<String>>) -> Ou
             Ok(None) => {}
             Ok(Some(complaint)) => return Outcome::Failed(format!("keeping {keep:?}: {complaint}")),
             Err(e) if e.to_string().is_empty() => return Outcome::Failed("refused with an empty message".into()),
-            Err(e @ Error::Unsupported { .. }) => return Outcome::Skipped(format!("keeping {keep:?}: {e}")),
+            Err(e @ Error::Unsupported { .. }) => return Outcome::Skipped(e.to_string()),
             Err(e) => return Outcome::Failed(format!("keeping {keep:?}: {e}")),
         }
     }

@@ -101,7 +101,7 @@ pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(
     where
         Box<T>: DeserializeOwned,
     {
-        read(settings.clone()).map_err(|e| Error::invalid("spec", "", e, "settings of this type"))
+        read(settings.clone()).map_err(|e| Error::unsupported(format!("settings of a {}", T::KIND), e))
     }
     let one = |report| Ok(vec![(None, report)]);
     match kind {
