@@ -42,7 +42,7 @@ const FAULTS: &[Fault] = faults! {
     fault "nothing", "NONE", ["", "", ""];
     refused "no plugin: the function is missing", "ENTRY=another_name",
         "a library without the function conefield_plugin";
-    refused "another version of the contract", "WRONG_ABI", "ABI version: found 4.0, expected 3.x";
+    refused "another version of the contract", "WRONG_ABI", "ABI version: found 5.0, expected 4.x";
     refused "a table that is too short", "SHORT_TABLE", "the table is too short";
     refused "functions that are too few", "SHORT_FUNCTIONS", "the table is too short";
     refused "a function that must be there is NULL", "NO_FORWARD", "no function forward";
