@@ -46,16 +46,16 @@
 //! ```
 //!
 //! This is sample `i` of `ray.count` on a ray: its position in the unit cube and its weight. `ray.count` equals
-//! [`Projector::max_samples`](crate::stage::Projector::max_samples); samples beyond the actual number have weight 0.
+//! [`Projector::max_samples`]; samples beyond the actual number have weight 0.
 //! The line integral is the sum of weight times attenuation. [`RAY`] defines `Ray`, [`RANDOM`] random numbers.
 //!
-//! A loss ([`Loss`](crate::loss::Loss)) defines
+//! A loss ([`Loss`]) defines
 //!
 //! ```wgsl
 //! fn stage_at(predicted: f32, measured: f32) -> vec2<f32>                // the loss and its derivative by `predicted`
 //! ```
 //!
-//! A prior ([`Prior`](crate::prior::Prior)) defines
+//! A prior ([`Prior`]) defines
 //!
 //! ```wgsl
 //! fn stage_at(p: u32) -> vec2<f32>
@@ -125,7 +125,7 @@ pub const PREFIX: &str = "stage_";
 /// lane.
 pub const FOREIGN: &str = "// from a plugin\n";
 
-/// `struct Ray`: [`UnitRay`](crate::stage::UnitRay) with its seed and number of samples.
+/// `struct Ray`: [`UnitRay`] with its seed and number of samples.
 pub const RAY: &str = include_str!("wgsl/ray.wgsl");
 /// `random_mix` and `random_unit`: equivalents of [`mix`](crate::random::mix) and [`unit`](crate::random::unit).
 pub const RANDOM: &str = include_str!("wgsl/random.wgsl");
