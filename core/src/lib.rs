@@ -48,6 +48,7 @@ pub mod prior;
 pub mod random;
 pub mod registry;
 pub mod regularizer;
+pub mod runner;
 pub mod scan;
 pub mod scene;
 pub mod settings;

@@ -46,16 +46,16 @@
 //! ```
 //!
 //! This is sample `i` of `ray.count` on a ray: its position in the unit cube and its weight. `ray.count` equals
-//! [`Projector::max_samples`]; samples beyond the actual number have weight 0.
+//! [`Projector::max_samples`](crate::stage::Projector::max_samples); samples beyond the actual number have weight 0.
 //! The line integral is the sum of weight times attenuation. [`RAY`] defines `Ray`, [`RANDOM`] random numbers.
 //!
-//! A loss ([`Loss`]) defines
+//! A loss ([`Loss`](crate::loss::Loss)) defines
 //!
 //! ```wgsl
 //! fn stage_at(predicted: f32, measured: f32) -> vec2<f32>                // the loss and its derivative by `predicted`
 //! ```
 //!
-//! A prior ([`Prior`]) defines
+//! A prior ([`Prior`](crate::prior::Prior)) defines
 //!
 //! ```wgsl
 //! fn stage_at(p: u32) -> vec2<f32>
@@ -96,27 +96,7 @@
 //! `stage_spacing() -> vec3<f32>` are the volume's; a `VoxelRay` has `source` and `ahead`, the vector to the pixel, in
 //! voxels (whole numbers are voxel centres), and `length`, that vector's length in mm.
 
-use crate::error::Result;
-use crate::loss::Loss;
-use crate::prior::Prior;
-use crate::stage::{Projector, Samples, Stage, UnitRay};
 use std::ops::Range;
-
-/// Runs single stages on a device, to compare their WGSL with their Rust.
-pub trait Runner {
-    /// Runs a stage forward and backward on `x` and `dy`, channel-major with `rows` rows. Returns its outputs, the
-    /// gradients of its parameters and those of its inputs.
-    fn pass(&self, stage: &dyn Stage, params: &[f32], x: &[f32], dy: &[f32], rows: usize) -> Result<[Vec<f32>; 3]>;
-
-    /// The samples of `rays`, each with its seed where positions are random.
-    fn samples(&self, projector: &dyn Projector, rays: &[(UnitRay, Option<u64>)]) -> Result<Vec<Samples>>;
-
-    /// A loss and its derivative at pairs of a predicted and a measured value.
-    fn losses(&self, loss: &dyn Loss, pairs: &[[f32; 2]]) -> Result<Vec<[f32; 2]>>;
-
-    /// A prior's penalty of one block with these values, and its derivative by each of them.
-    fn penalty(&self, prior: &dyn Prior, values: &[f32]) -> Result<(f32, Vec<f32>)>;
-}
 
 /// Prefix of every name that a fragment declares or uses from its host.
 pub const PREFIX: &str = "stage_";
@@ -125,7 +105,7 @@ pub const PREFIX: &str = "stage_";
 /// lane.
 pub const FOREIGN: &str = "// from a plugin\n";
 
-/// `struct Ray`: [`UnitRay`] with its seed and number of samples.
+/// `struct Ray`: [`UnitRay`](crate::stage::UnitRay) with its seed and number of samples.
 pub const RAY: &str = include_str!("wgsl/ray.wgsl");
 /// `random_mix` and `random_unit`: equivalents of [`mix`](crate::random::mix) and [`unit`](crate::random::unit).
 pub const RANDOM: &str = include_str!("wgsl/random.wgsl");

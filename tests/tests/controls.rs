@@ -16,6 +16,7 @@ use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::place::StatePart;
 use conefield_core::prior::{Blocks, Prior};
 use conefield_core::regularizer::{Bounds, Penalty, Regularizer};
+use conefield_core::runner::Runner;
 use conefield_core::settings::{Initializer, LossSpec};
 use conefield_core::simd::Real;
 use conefield_core::space::Space;
@@ -24,7 +25,7 @@ use conefield_core::stage::{
     TileMut, UnitRay,
 };
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
-use conefield_core::wgsl::{Fragment, Runner};
+use conefield_core::wgsl::Fragment;
 use conefield_core::{Error, Result};
 use conefield_projectors::voxel::{Joseph, Siddon};
 use ndarray::{ArrayView3, ArrayViewMut3};

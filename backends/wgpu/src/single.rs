@@ -11,8 +11,8 @@ use conefield_core::arena::Arena;
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;
 use conefield_core::prior::Prior;
+use conefield_core::runner::Runner;
 use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
-use conefield_core::wgsl::Runner;
 use wgpu::BufferUsages as U;
 
 impl Runner for Shared {

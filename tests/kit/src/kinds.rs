@@ -12,13 +12,13 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::loss::Loss;
 use conefield_core::registry::{Kind, Origin, Settings, stage_types};
 use conefield_core::regularizer::RegularizerSpec;
+use conefield_core::runner::Runner;
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 use conefield_core::spec::stage::read;
 use conefield_core::stage::Stage;
 use conefield_core::voxel::VoxelProjectorSpec;
-use conefield_core::wgsl::Runner;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
