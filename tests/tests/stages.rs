@@ -374,7 +374,7 @@ fn losses_and_priors() {
         (Kind::Prior, "smoothing"),
     ] {
         let name = if kind == Kind::Loss { "huber" } else { "total-variation" };
-        let refused = try_check(kind, &json!({"type": name, wrong: 0.0}), 0, &|o| o).unwrap_err();
+        let refused = try_check(kind, &json!({"type": name, wrong: 0}), 0, &|o| o).unwrap_err();
         assert!(refused.to_string().contains(wrong), "{refused}");
     }
 }
