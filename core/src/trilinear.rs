@@ -56,14 +56,17 @@ impl Grid {
         std::array::from_fn(|c| (0..3).map(|d| (c >> d & 1) * s[d]).sum())
     }
 
-    /// Disjoint ranges of entries that cover the grid, of whole planes of equal x: enough to keep each below `most`
-    /// entries, but at most 16, because each range reads every row again.
+    /// [`slabs`] of whole planes of equal x.
     pub fn slabs(&self, most: usize) -> Vec<Range<usize>> {
-        let [n, y, z] = self.side;
-        let plane = y * z;
-        let pieces = self.entries().div_ceil(most.max(1)).clamp(1, 16).min(n);
-        (0..pieces).map(|i| i * n / pieces * plane..(i + 1) * n / pieces * plane).collect()
+        slabs(self.side[0], self.side[1] * self.side[2], most).collect()
     }
+}
+
+/// Disjoint ranges that cover `planes` planes of `plane` entries each: enough to keep each below `most` entries, but at
+/// most 16, because each range reads every row again.
+pub fn slabs(planes: usize, plane: usize, most: usize) -> impl Iterator<Item = Range<usize>> {
+    let pieces = (planes * plane).div_ceil(most.max(1)).clamp(1, 16).min(planes);
+    (0..pieces).map(move |i| i * planes / pieces * plane..(i + 1) * planes / pieces * plane)
 }
 
 /// Locations of up to [`BLOCK`] rows on a grid.

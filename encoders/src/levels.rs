@@ -9,6 +9,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::trilinear::slabs;
 use conefield_core::wgsl::{self, Fragment};
 use std::fmt::Write;
 use std::ops::{Range, RangeInclusive};
@@ -416,8 +417,7 @@ impl<L: Level> Stage for Levels<L> {
     fn partition(&self) -> Vec<Range<usize>> {
         let pieces = |p: &Part<L>| {
             let (start, slices) = (p.start, p.level.slices());
-            let (slice, pieces) = (p.len / slices, p.len.div_ceil(SLAB).clamp(1, 16).min(slices));
-            (0..pieces).map(move |i| start + i * slices / pieces * slice..start + (i + 1) * slices / pieces * slice)
+            slabs(slices, p.len / slices, SLAB).map(move |r| start + r.start..start + r.end)
         };
         self.parts.iter().flat_map(pieces).collect()
     }

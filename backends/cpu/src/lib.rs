@@ -5,8 +5,8 @@
 //! processes its share in groups: normalize, evaluate the field, integrate, compute the loss and run backward, tile by
 //! tile, while a tile is in the cache ([`rows`]). Dense stages sum their gradients in one copy per slot, merged in
 //! order. Stages with scattered parameters process the rows of the wave a second time, each worker with its own range
-//! of parameters ([`step`]). The number of slots
-//! and the order of every sum depend on the plan only, so that results are bit-identical on any number of threads.
+//! of parameters ([`step`]). The number of slots and the order of every sum depend on the plan only, so that results
+//! are bit-identical on any number of threads.
 
 pub mod adam;
 pub mod rows;

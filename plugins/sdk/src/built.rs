@@ -33,17 +33,16 @@ pub struct Built {
 }
 
 /// Defines the kinds of stages with their settings, which may need the number of input channels, and the parts that
-/// stages make for a grid or a scan.
+/// stages make for a grid or a scan, each with its description.
 macro_rules! any_stage {
     (
-        stages { $($kind:ident $name:ident: $stage:ident from $spec:ident($($width:ident)?),)* }
-        parts { $($part:ident $part_name:ident,)* }
+        stages { $($kind:ident $($name:ident)?: $stage:ident from $spec:ident($($width:ident)?),)* }
+        parts { $($part:ident $part_name:ident: $described:pat => $description:expr,)* }
     ) => {
         /// A stage of any kind, or a part.
         pub enum AnyStage {
             $($kind(Box<dyn $stage>),)*
             $($part(Box<dyn $part>),)*
-            Initializer(Box<dyn Initializer>),
             /// An initializer whose weights are not read yet.
             Waiting(Waiting),
         }
@@ -77,21 +76,19 @@ macro_rules! any_stage {
             pub fn describe(&self) -> String {
                 match self {
                     $(Self::$kind(stage) => stage.describe(),)*
-                    $(Self::$part(_) => String::new(),)*
-                    Self::Initializer(stage) => stage.describe(),
+                    $(Self::$part($described) => $description,)*
                     Self::Waiting(w) => format!("waits for {}", w.path),
                 }
             }
         }
 
         impl Built {
-            $(#[allow(dead_code)]
-            pub fn $name(&self) -> Result<&dyn $stage> {
+            $($(pub fn $name(&self) -> Result<&dyn $stage> {
                 match &self.stage {
                     AnyStage::$kind(stage) => Ok(stage.as_ref()),
                     other => Err(other.is_no(stringify!($name))),
                 }
-            })*
+            })?)*
 
             $(pub fn $part_name(&self) -> Result<&dyn $part> {
                 match &self.stage {
@@ -106,8 +103,8 @@ macro_rules! any_stage {
 any_stage! {
     stages {
         Encoder encoder: Encoder from EncoderSpec(),
-        Normalizer normalizer: Normalizer from NormalizerSpec(width),
-        Field field: Field from FieldSpec(width),
+        Normalizer: Normalizer from NormalizerSpec(width),
+        Field: Field from FieldSpec(width),
         Projector projector: Projector from ProjectorSpec(),
         Loss loss: Loss from LossSpec(),
         Prior prior: Prior from PriorSpec(),
@@ -116,9 +113,10 @@ any_stage! {
         Basis basis: Basis from BasisSpec(),
     }
     parts {
-        Penalty penalty,
-        Misfit misfit,
-        Expansion expansion,
+        Initializer initializer: stage => stage.describe(),
+        Penalty penalty: _ => String::new(),
+        Misfit misfit: stage => stage.describe(),
+        Expansion expansion: _ => String::new(),
     }
 }
 
@@ -193,13 +191,6 @@ impl Built {
     /// As [`Self::any`], mutable.
     pub fn any_mut(&mut self) -> Result<&mut Self> {
         Ok(self)
-    }
-
-    pub fn initializer(&self) -> Result<&dyn Initializer> {
-        match &self.stage {
-            AnyStage::Initializer(stage) => Ok(stage.as_ref()),
-            other => Err(other.is_no("initializer")),
-        }
     }
 
     /// As a map of rows, with its properties.

@@ -203,7 +203,7 @@ fn along(shape: &Shape, ray: &UnitRay) -> Option<f64> {
 
 impl Mixture {
     /// The line integrals of `rays`, in cube sides.
-    pub(super) fn along<R: Real>(&self, params: &[R], rays: &[UnitRay], out: &mut [R]) {
+    pub(super) fn line_integrals<R: Real>(&self, params: &[R], rays: &[UnitRay], out: &mut [R]) {
         let mut sums = vec![0.0; rays.len()];
         if let Some(bundle) = Bundle::of(rays) {
             for (_, p) in present(params, 0..self.most).filter(|(_, p)| bundle.near(p)) {
@@ -219,7 +219,7 @@ impl Mixture {
 
 impl Lines for Mixture {
     fn project(&self, params: &[f32], rays: &[UnitRay], out: &mut [f32]) {
-        self.along(params, rays, out);
+        self.line_integrals(params, rays, out);
     }
 }
 

@@ -165,7 +165,7 @@ fn a_view_is_its_rays_in_both_precisions() {
                 per_mm: 1.0,
             };
             let mut line = [f64::NAN];
-            mixture.along(&p, &[ray], &mut line);
+            mixture.line_integrals(&p, &[ray], &mut line);
             let at = row * stride + column;
             let differences = [line[0] - image[at], f64::from(narrow[at]) - image[at]].map(f64::abs);
             unlike += usize::from(differences.iter().any(|d| *d > 2e-5 * most));

@@ -62,14 +62,20 @@ impl With<'_> {
         if is_last { self.rows(report, stage, options) } else { report }
     }
 
-    /// The report of each width. A field may accept only the channels of a point; it must accept one width.
-    fn wide(&self, check: impl Fn(usize, &Options) -> Result<Report>) -> Result<Vec<(Option<usize>, Report)>> {
+    /// The report of each width. With `some`, the stage may refuse all widths but one: a field may accept only the
+    /// channels of a point.
+    fn wide(
+        &self,
+        some: bool,
+        check: impl Fn(usize, &Options) -> Result<Report>,
+    ) -> Result<Vec<(Option<usize>, Report)>> {
         let options = (self.options)(Options::features());
         let (mut found, mut refused) = (vec![], None);
         for width in self.widths {
             match check(*width, &options) {
                 Ok(report) => found.push((Some(*width), report)),
-                Err(e) => refused = Some(e),
+                Err(e) if some => refused = Some(e),
+                Err(e) => return Err(e),
             }
         }
         refused.filter(|_| found.is_empty()).map_or(Ok(found), Err)
@@ -101,7 +107,7 @@ pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(
     where
         Box<T>: DeserializeOwned,
     {
-        read(settings.clone()).map_err(|e| Error::unsupported(format!("settings of a {}", T::KIND), e))
+        read(settings.clone()).map_err(|e| Error::invalid("stage", "type", e, "a registered type with its settings"))
     }
     let one = |report| Ok(vec![(None, report)]);
     match kind {
@@ -111,7 +117,7 @@ pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(
         }
         Kind::Normalizer => {
             let spec = of::<dyn NormalizerSpec>(settings)?;
-            with.wide(|width, options| {
+            with.wide(false, |width, options| {
                 let stage = spec.build(width)?;
                 let report = check_normalizer(stage.as_ref(), options);
                 Ok(with.last(width, report, stage.as_ref(), options))
@@ -119,7 +125,7 @@ pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(
         }
         Kind::Field => {
             let spec = of::<dyn FieldSpec>(settings)?;
-            with.wide(|width, options| {
+            with.wide(true, |width, options| {
                 let stage = spec.build(width)?;
                 let report = check_field(stage.as_ref(), options);
                 Ok(with.last(width, report, stage.as_ref(), options))
