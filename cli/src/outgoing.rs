@@ -5,7 +5,7 @@ use crate::progress::Progress;
 use crate::signals;
 use conefield::hounsfield::{Calibration, Levels};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::parts::{Part, Voxels};
+use conefield_core::parts::{Part, Voxels, copy};
 use conefield_core::scan::{Affine, Volume};
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::MiddleSlices;
@@ -95,7 +95,7 @@ impl Voxels for Outgoing<'_> {
             kept.slices.gather(part, out.view());
             if let Some(whole) = &mut kept.whole {
                 let [x, y, z] = part.clone();
-                whole.data.slice_mut(ndarray::s![x, y, z]).assign(&out);
+                copy(whole.data.slice_mut(ndarray::s![x, y, z]), out.view());
             }
         }
         self.done += out.len();

@@ -117,7 +117,7 @@ pub fn begin(folder: &Path, limit: u64, bytes: u64) -> Result<()> {
     }
     files::begin(folder, limit, bytes)?;
     STAYS.store(limit / 3, Relaxed);
-    allowance::set_room(limit / 16 * 5);
+    allowance::set_room(limit / 16 * 5, files::trim);
     Ok(())
 }
 
@@ -128,7 +128,7 @@ mod files {
     use rustix::io::Errno;
     use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
     use std::fs::File;
-    use std::io::{Read, Seek};
+    use std::io::Read;
     use std::path::PathBuf;
     use std::ptr;
     use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -136,6 +136,9 @@ mod files {
 
     /// Seconds between two looks at the resident memory.
     const PAUSE: Duration = Duration::from_millis(2);
+
+    /// Resident bytes beyond which mapped pages are taken out of the process.
+    static MOST: AtomicU64 = AtomicU64::new(u64::MAX);
 
     /// The files in use.
     static SCRATCH: Mutex<Option<Scratch>> = Mutex::new(None);
@@ -164,9 +167,12 @@ mod files {
         if scratch.is_none() {
             let folder = folder.canonicalize().map_err(failed)?;
             let reserve = tempfile::tempfile_in(&folder).map_err(failed)?;
-            let resident = File::open("/proc/self/statm").map_err(|e| Error::io("/proc/self/statm", e))?;
             // The rest is for what comes in until the thread has its turn.
-            let watch = move || trim(resident, limit / 4 * 3);
+            MOST.store(limit / 4 * 3, Relaxed);
+            let watch = || loop {
+                std::thread::sleep(PAUSE);
+                trim();
+            };
             std::thread::Builder::new().name("scratch".into()).spawn(watch).map_err(failed)?;
             *scratch = Some(Scratch { folder, reserve, reserved: 0, maps: vec![] });
         }
@@ -229,27 +235,25 @@ mod files {
         true
     }
 
-    /// Takes mapped pages out of the process whenever it holds more than `most` bytes, unless they are the smaller part.
-    fn trim(mut statm: File, most: u64) {
-        let page = rustix::param::page_size() as u64;
+    /// Resident bytes of the process, and those of them that are in files.
+    fn resident() -> Option<(u64, u64)> {
         let mut text = [0; 128];
-        loop {
-            std::thread::sleep(PAUSE);
-            if statm.rewind().is_err() {
-                return;
-            }
-            let read = statm.read(&mut text).unwrap_or(0);
-            let mut pages = text[..read]
-                .split(|c| *c == b' ')
-                .map(|word| word.iter().filter(|c| c.is_ascii_digit()).fold(0u64, |n, c| 10 * n + u64::from(c - b'0')));
-            let (resident, shared) = (page * pages.nth(1).unwrap_or(0), page * pages.next().unwrap_or(0));
-            if resident <= most || shared < most / 8 {
-                continue;
-            }
-            for &(at, bytes) in scratch().iter().flat_map(|s| &s.maps) {
-                // SAFETY: the mapping is in use while the lock is held. It is shared, so its numbers stay in the file.
-                let _ = unsafe { madvise(at as *mut _, bytes, Advice::LinuxDontNeed) };
-            }
+        let read = File::open("/proc/self/statm").and_then(|mut statm| statm.read(&mut text)).ok()?;
+        let word =
+            |word: &[u8]| word.iter().filter(|c| c.is_ascii_digit()).fold(0u64, |n, c| 10 * n + u64::from(c - b'0'));
+        let mut bytes = text[..read].split(|c| *c == b' ').map(|pages| word(pages) * rustix::param::page_size() as u64);
+        Some((bytes.nth(1)?, bytes.next()?))
+    }
+
+    /// Takes mapped pages out of the process if it holds more than [`MOST`] bytes, unless they are the smaller part.
+    pub fn trim() {
+        let most = MOST.load(Relaxed);
+        if resident().is_none_or(|(all, mapped)| all <= most || mapped < most / 8) {
+            return;
+        }
+        for &(at, bytes) in scratch().iter().flat_map(|s| &s.maps) {
+            // SAFETY: the mapping is in use while the lock is held. It is shared, so its numbers stay in the file.
+            let _ = unsafe { madvise(at as *mut _, bytes, Advice::LinuxDontNeed) };
         }
     }
 }
@@ -274,4 +278,6 @@ mod files {
     pub fn release(_: *mut u8) -> bool {
         false
     }
+
+    pub fn trim() {}
 }

@@ -16,15 +16,27 @@ static HELD: OnceLock<fn() -> u64> = OnceLock::new();
 /// Bytes that may be at work at once.
 static ROOM: AtomicU64 = AtomicU64::new(u64::MAX);
 
+/// Gives pages of arrays on the disk back, if the process holds too many.
+static TRIM: OnceLock<fn()> = OnceLock::new();
+
 /// Limits the process to `most` bytes; `held` returns its current allocation. Without it there is no limit.
 pub fn set_memory(most: u64, held: fn() -> u64) {
     MOST.store(most, Ordering::Relaxed);
     let _ = HELD.set(held);
 }
 
-/// Says that memory holds only `bytes` of the arrays at once; the others are on the disk meanwhile.
-pub fn set_room(bytes: u64) {
+/// Says that memory holds only `bytes` of the arrays at once; the others are on the disk meanwhile, and `trim` gives
+/// their pages back if the process holds too many.
+pub fn set_room(bytes: u64, trim: fn()) {
     ROOM.store(bytes, Ordering::Relaxed);
+    let _ = TRIM.set(trim);
+}
+
+/// For loops that touch many pages in a short time: gives some back if the process holds too many.
+pub fn trim() {
+    if let Some(trim) = TRIM.get() {
+        trim();
+    }
 }
 
 /// Bytes of an array that may be at work at once. A method that passes through a larger one many times does so part by

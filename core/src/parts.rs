@@ -1,9 +1,10 @@
 //! Volumes available part by part, so that they need not be in memory as a whole.
 
+use crate::allowance;
 use crate::error::Result;
 use crate::geometry::VoxelGrid;
 use crate::scan::{Affine, Volume};
-use ndarray::{Array3, ArrayViewMut3};
+use ndarray::{Array3, ArrayView3, ArrayViewMut3};
 use std::ops::Range;
 
 /// A box of voxels: a range along each of x, y and z.
@@ -35,10 +36,19 @@ impl Voxels for &Volume {
         self.affine
     }
 
-    fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
+    fn fill(&mut self, part: &Part, out: ArrayViewMut3<'_, f32>) -> Result<()> {
         let [x, y, z] = part.clone();
-        out.assign(&self.data.slice(ndarray::s![x, y, z]));
+        copy(out, self.data.slice(ndarray::s![x, y, z]));
         Ok(())
+    }
+}
+
+/// Copies `from` to `to`, of the same shape, plane by plane along x. A part of an array on the disk may touch all of
+/// its pages, faster than they are given back in the background.
+pub fn copy(mut to: ArrayViewMut3<'_, f32>, from: ArrayView3<'_, f32>) {
+    for (mut to, from) in to.outer_iter_mut().zip(from.outer_iter()) {
+        to.assign(&from);
+        allowance::trim();
     }
 }
 

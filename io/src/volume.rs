@@ -3,12 +3,13 @@
 use crate::dicom::DicomTemplate;
 use crate::input::Input;
 use crate::{dicom, foreign, metaimage, nifti, npy, nrrd, pickle, scan, tiff, write_atomic, zarr};
+use conefield_core::allowance;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::parts::Voxels;
-use conefield_core::scan::Volume;
+use conefield_core::parts::{Part, Voxels};
+use conefield_core::scan::{Affine, Volume};
 use conefield_core::{Error, Result};
 use flate2::{Compression, GzBuilder};
-use ndarray::{Array3, Ix3};
+use ndarray::{Array3, ArrayViewMut3, Ix3, s};
 use std::io::Write;
 use std::path::Path;
 
@@ -185,6 +186,7 @@ pub fn write_voxels_of(
         return Err(Error::invalid(path.display().to_string(), "file name", file_name(path), expected));
     }
     voxels.grid().validate(&path.display().to_string())?;
+    let voxels = &mut Layers::new(voxels, allowance::room());
     match format {
         VolumeFormat::Zarr => return zarr::write(path, voxels),
         VolumeFormat::Dicom => return dicom::write(path, voxels, template),
@@ -207,6 +209,56 @@ pub fn write_voxels_of(
             unreachable!("these are written above")
         }
     })
+}
+
+/// Voxels that are read layer by layer along z. Lines of a volume run along z, so that one layer of a volume on the
+/// disk touches every page of it: many layers are read at once there, and held.
+struct Layers<'a> {
+    voxels: &'a mut dyn Voxels,
+    /// The number of layers that are read at once.
+    many: usize,
+    /// The first layer held.
+    first: usize,
+    held: Array3<f32>,
+}
+
+impl<'a> Layers<'a> {
+    /// For `room` bytes that may be at work at once: layers take a half, the pages that are read meanwhile the rest.
+    fn new(voxels: &'a mut dyn Voxels, room: u64) -> Self {
+        let [nx, ny, _] = voxels.grid().shape;
+        let many = (room / 8) as usize / (nx * ny);
+        Self { voxels, many, first: 0, held: Array3::zeros([0; 3]) }
+    }
+}
+
+impl Voxels for Layers<'_> {
+    fn grid(&self) -> VoxelGrid {
+        self.voxels.grid()
+    }
+
+    fn affine(&self) -> Option<Affine> {
+        self.voxels.affine()
+    }
+
+    fn hounsfield(&self) -> Option<&str> {
+        self.voxels.hounsfield()
+    }
+
+    fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
+        let [nx, ny, nz] = self.grid().shape;
+        let [x, y, z] = part.clone();
+        if self.many >= nz || z.len() == nz {
+            return self.voxels.fill(part, out);
+        }
+        if z.start < self.first || self.first + self.held.dim().2 < z.end {
+            self.first = z.start;
+            let last = (z.start + self.many.max(z.len())).min(nz);
+            self.held = Array3::zeros([nx, ny, last - z.start]);
+            self.voxels.fill(&[0..nx, 0..ny, z.start..last], self.held.view_mut())?;
+        }
+        out.assign(&self.held.slice(s![x, y, z.start - self.first..z.end - self.first]));
+        Ok(())
+    }
 }
 
 /// Size of `voxels` as `.nii.gz` in bytes: does all the work of [`write_voxels`] except disk access, to measure it.
@@ -347,6 +399,21 @@ mod tests {
             assert!(read_volume(&streamed).unwrap().data == whole.data, "{end}");
             write_volume(&at_once, &whole).unwrap();
             assert!(std::fs::read(&streamed).unwrap() == std::fs::read(&at_once).unwrap(), "{end}");
+        }
+    }
+
+    /// The rooms hold less than a layer, 7 layers and all of them.
+    #[test]
+    fn layers_are_read_once_and_many_at_a_time() {
+        for (room, parts) in [(8, 180), (7 * 8 * 200 * 190, 26), (u64::MAX, 180)] {
+            let mut voxels = RampVoxels { largest: 0, parts: 0 };
+            let mut layers = Layers::new(&mut voxels, room);
+            for z in 0..180 {
+                let mut out = Array3::zeros([100, 190, 1]);
+                layers.fill(&[100..200, 0..190, z..z + 1], out.view_mut()).unwrap();
+                assert!(out.indexed_iter().all(|((x, y, _), v)| *v == ramp([100 + x, y, z])), "{room}, layer {z}");
+            }
+            assert_eq!(voxels.parts, parts, "{room}");
         }
     }
 

@@ -1,7 +1,7 @@
 //! The middle slices of a volume.
 
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::parts::Part;
+use conefield_core::parts::{Part, copy};
 use conefield_core::scan::Volume;
 use ndarray::{Array2, ArrayView3, Axis, s};
 
@@ -33,7 +33,8 @@ impl MiddleSlices {
             let middle = self.grid.shape[k] / 2;
             if part[k].contains(&middle) {
                 let [a, b] = [[1, 2], [0, 2], [0, 1]][k].map(|axis: usize| part[axis].clone());
-                slice.slice_mut(s![a, b]).assign(&values.index_axis(Axis(k), middle - part[k].start));
+                let at = middle - part[k].start;
+                copy(slice.slice_mut(s![a, b]).insert_axis(Axis(k)), values.slice_axis(Axis(k), (at..at + 1).into()));
             }
         }
     }
