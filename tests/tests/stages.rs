@@ -7,7 +7,7 @@ use conefield_conformance::{Options, Outcome, Report, With, check_encoder, check
 use conefield_core::opened::Opened;
 use conefield_core::registry::{Kind, stage_types};
 use conefield_core::runner::Runner;
-use conefield_core::settings::{EncoderSpec, InitializerSpec, LossSpec, PriorSpec, ProjectorSpec};
+use conefield_core::settings::{EncoderSpec, InitializerSpec, LossSpec, PriorSpec};
 use conefield_core::spec::stage::read;
 use conefield_core::spec::{load, schema};
 use conefield_core::{Result, arena::Weights};

@@ -4,10 +4,12 @@
 //!
 //! With [`Edges`] it is directional: `Σ_j |D_j·∇x_j|` with `D = I − n·nᵀ`, in which slopes across edges cost less than
 //! slopes along them (Ehrhardt and Betcke, SIAM J. Imaging Sci. 9(3), 2016, whose edges come from another image).
+//!
+//! [`Limited`] arcs put `A = I − (1 − f)·m·mᵀ` in front, with the same direction m for all voxels: `Σ_j |A·D_j·∇x_j|`.
 
 use super::edges::Edges;
 use conefield_core::error::Result;
-use conefield_core::geometry::VoxelGrid;
+use conefield_core::geometry::{Vec3, VoxelGrid};
 use conefield_core::place::{ADD, Array, Place, VariationSlope};
 use conefield_core::regularizer::{Bounds, Dual, Update};
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
@@ -30,10 +32,11 @@ fn along([_, ny, nz]: [usize; 3]) -> [usize; 3] {
 }
 
 /// The total variation of `x`, which must be contiguous in standard order.
-pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3], edges: Option<&Edges>) -> f64 {
+pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3], edges: Option<&Edges>, limited: Option<Limited>) -> f64 {
     let plane = x.dim().1 * x.dim().2;
     let [nz, y, z] = along(x.dim().into());
     let g = [g[0], g[y], g[z]];
+    let limited = limited.map(|limited| limited.turned([0, y, z]));
     let x = x.as_standard_layout();
     let Some(all) = x.as_slice() else { return 0.0 };
     let planes: Vec<f64> = all
@@ -44,7 +47,7 @@ pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3], edges: Option<&Edges
                 let n = edges.vectors();
                 [n[0], n[y], n[z]].map(|n| &n[i * plane..(i + 1) * plane])
             });
-            run(Variation { x, after: all.get((i + 1) * plane..(i + 2) * plane), n, g, nz })
+            run(Variation { x, after: all.get((i + 1) * plane..(i + 2) * plane), n, g, limited, nz })
         })
         .collect();
     planes.iter().sum()
@@ -58,6 +61,7 @@ struct Variation<'a> {
     /// The plane's edges.
     n: Option<[&'a [f32]; 3]>,
     g: [f32; 3],
+    limited: Option<Limited>,
     nz: usize,
 }
 
@@ -69,6 +73,7 @@ impl Op for Variation<'_> {
         let (len, nz) = (S::f32s::LEN, self.nz);
         let g = self.g.map(|g| S::f32s::splat(s, g));
         let zero = S::f32s::splat(s, 0.0);
+        let limited = self.limited.map(|limited| limited.splat(s));
         let mut line = vec![0.0; nz + 1];
         let mut sum = 0.0;
         for (j, x) in self.x.chunks(nz).enumerate() {
@@ -83,19 +88,56 @@ impl Op for Variation<'_> {
                 let here = load(s, x, k);
                 let (a, b) = ((load(s, after, k) - here) * g[0], (load(s, next, k) - here) * g[1]);
                 let c = (load(s, &line, k + 1) - here) * g[2];
-                let mut square = a * a + b * b + c * c;
-                if let Some(n) = self.n {
+                let n = self.n.map(|n| n.map(|n| load(s, &n[j * nz..(j + 1) * nz], k)));
+                let square = if let Some((m, f)) = limited {
+                    let n = n.unwrap_or([zero; 3]);
+                    let d = less(m, S::f32s::splat(s, 1.0) - f, less(n, S::f32s::splat(s, 1.0), [a, b, c]));
+                    dot(d, d)
+                } else if let Some(n) = n {
                     // |D·d|² = |d|² − (2 − |n|²)·(n·d)²
-                    let n = n.map(|n| load(s, &n[j * nz..(j + 1) * nz], k));
                     let inner = dot(n, [a, b, c]);
-                    square = (square - (S::f32s::splat(s, 2.0) - dot(n, n)) * inner * inner).max(zero);
-                }
+                    let square = a * a + b * b + c * c;
+                    (square - (S::f32s::splat(s, 2.0) - dot(n, n)) * inner * inner).max(zero)
+                } else {
+                    a * a + b * b + c * c
+                };
                 part += square.sqrt();
             }
             sum += part.as_slice().iter().map(|x| f64::from(*x)).sum::<f64>();
         }
         sum
     }
+}
+
+/// A direction in which slopes cost less: the unit vector m along the middle of an arc, and the factor f of slopes
+/// along it, above 0 and at most 1.
+#[derive(Debug, Clone, Copy)]
+pub struct Limited {
+    middle: [f32; 3],
+    factor: f32,
+}
+
+impl Limited {
+    /// With m `middle` and f `factor`.
+    pub fn new(middle: Vec3, factor: f64) -> Self {
+        Self { middle: middle.map(|m| m as f32), factor: factor as f32 }
+    }
+
+    /// With the axes in another order.
+    fn turned(self, axes: [usize; 3]) -> Self {
+        Self { middle: axes.map(|k| self.middle[k]), ..self }
+    }
+
+    fn splat<S: Simd>(self, s: S) -> ([S::f32s; 3], S::f32s) {
+        (self.middle.map(|m| S::f32s::splat(s, m)), S::f32s::splat(s, self.factor))
+    }
+}
+
+/// `v − share·m·(m·v)`
+#[inline(always)]
+fn less<V: SimdFloat<S>, S: Simd>(m: [V; 3], share: V, v: [V; 3]) -> [V; 3] {
+    let inner = dot(m, v) * share;
+    std::array::from_fn(|k| v[k] - m[k] * inner)
 }
 
 /// The proximal map of total variation within bounds l and h, by default 0 and ∞, by gradient steps on its dual, warm-started from the previous
@@ -110,10 +152,11 @@ pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
     bounds: Bounds,
-    /// The dual variable along x, y and z; with edges it is `D·p`.
+    /// The dual variable along x, y and z; with edges or a limited arc it is `D·A·p`.
     dual: [Array; 3],
     /// Edges across which slopes cost less.
     edges: Option<Edges>,
+    limited: Option<Limited>,
 }
 
 impl TvProx {
@@ -125,7 +168,7 @@ impl TvProx {
             space.hold((planes * (shape[1] + 1) * (shape[2] + 1) * size_of::<f32>()) as u64);
         });
         let dual = || space.array(shape);
-        Ok(Self { shape, g, bounds: Bounds::default(), dual: [dual()?, dual()?, dual()?], edges: None })
+        Ok(Self { shape, g, bounds: Bounds::default(), dual: [dual()?, dual()?, dual()?], edges: None, limited: None })
     }
 
     /// Reduces the cost of slopes across `edges`, which are initially 0.
@@ -138,9 +181,9 @@ impl TvProx {
         self.bounds = bounds;
     }
 
-    /// Multiplies the weights of differences along x, y, z by `factors`.
-    pub fn weigh(&mut self, factors: [f32; 3]) {
-        self.g = std::array::from_fn(|k| self.g[k] * factors[k]);
+    /// Reduces the cost of slopes along a direction.
+    pub fn limit(&mut self, limited: Limited) {
+        self.limited = Some(limited);
     }
 
     /// Updates the edges from `x`, if they are in use. Returns the total variation of `x` if that changes it.
@@ -151,7 +194,7 @@ impl TvProx {
 
     /// The total variation of `x`.
     pub fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
-        total_variation(x, self.g, self.edges.as_ref())
+        total_variation(x, self.g, self.edges.as_ref(), self.limited)
     }
 
     /// Whether there are edges to update.
@@ -161,7 +204,14 @@ impl TvProx {
 
     /// The penalty and its proximal map for a place with kernels.
     pub fn kernels(&mut self, steps: usize) -> Dual<'_> {
-        let fragment = Fragment::new(&[if self.edges.is_some() { ALONG_EDGES } else { PLAIN }]);
+        let fragment = match self.limited {
+            Some(Limited { middle: [x, y, z], factor }) => {
+                let constants =
+                    format!("const stage_MIDDLE = vec3<f32>({x:?}, {y:?}, {z:?});\nconst stage_FACTOR = {factor:?};\n");
+                Fragment::new(&[&constants, LIMITED])
+            }
+            None => Fragment::new(&[if self.edges.is_some() { ALONG_EDGES } else { PLAIN }]),
+        };
         let guide = self.edges.as_mut().map(Edges::guide);
         Dual { fragment, weights: self.g, steps, bounds: self.bounds, p: self.dual.each_mut(), guide }
     }
@@ -248,7 +298,8 @@ impl TvProx {
             let edges = edges.map(|n| n.map(|n| &n[first..first + planes.0[0].len() * plane]));
             slabs.push(Sweep { planes, own, lines, v, edges, line: nz, steps: split.reach });
         }
-        let scale = Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.bounds);
+        let limited = self.limited.map(|limited| limited.turned([0, y, z]));
+        let scale = Scale { limited, ..Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.bounds) };
         slabs.into_par_iter().for_each(|slab| run(Sweeping(slab, scale)));
     }
 }
@@ -295,12 +346,13 @@ struct Scale {
     /// For a dual step: `g/(L·τ)`, L a bound on `‖∇‖²`.
     up: [f32; 3],
     bounds: Bounds,
+    limited: Option<Limited>,
 }
 
 impl Scale {
     fn new(g: [f32; 3], tau: f32, bounds: Bounds) -> Self {
         let bound = Dual::bound(g);
-        Self { down: g.map(|g| g * tau), up: g.map(|g| g / (bound * tau)), bounds }
+        Self { down: g.map(|g| g * tau), up: g.map(|g| g / (bound * tau)), bounds, limited: None }
     }
 }
 
@@ -420,7 +472,7 @@ impl<L: Lines> Sweep<'_, L> {
                         let next = if j + 1 < ny { &kept[at(i - 1, j + 1)..][..nz] } else { u };
                         let at = (i - 1) * plane + j * nz;
                         let n = self.edges.map(|n| n.map(|n| &n[at..at + nz]));
-                        ascend(s, u, [after, next], n, scale.up, self.planes.line(i - 1, j, nz));
+                        ascend(s, u, [after, next], n, scale, self.planes.line(i - 1, j, nz));
                     }
                 }
                 let Some(i) = front.checked_sub(self.steps).filter(|i| self.own.contains(i)) else { continue };
@@ -509,25 +561,26 @@ fn descent<V: SimdFloat<S>, S: Simd>(behind: [V; 3], p: [V; 3], v: V, scale: [V;
     (v - turn).max(low).min(high)
 }
 
-/// `p ← p + D·∇u/(L·τ)` along a line, then projection onto the unit ball. `u` has its last number doubled; `after` are
-/// the next lines along x and y, or `u` itself at the end; `n` are the edges, if `D` is not 1.
+/// `p ← p + A·D·∇u/(L·τ)` along a line, then projection onto the unit ball. `u` has its last number doubled; `after`
+/// are the next lines along x and y, or `u` itself at the end; `n` are the edges, if `D` is not 1.
 #[inline(always)]
 fn ascend<S: Simd>(
     s: S,
     u: &[f32],
     after: [&[f32]; 2],
     n: Option<[&[f32]; 3]>,
-    scale: [f32; 3],
+    scale: Scale,
     [px, py, pz]: [&mut [f32]; 3],
 ) {
     let (count, len) = (px.len(), S::f32s::LEN);
-    let scale = scale.map(|x| S::f32s::splat(s, x));
+    let limited = scale.limited.map(|limited| limited.splat(s));
+    let scale = scale.up.map(|x| S::f32s::splat(s, x));
     let mut k = 0;
     while k + len <= count {
         let p = [whole(s, px, k), whole(s, py, k), whole(s, pz, k)];
         let next = [whole(s, after[0], k), whole(s, after[1], k), whole(s, u, k + 1)];
         let n = n.map(|n| n.map(|n| whole(s, n, k)));
-        let [x, y, z] = ascent(s, whole(s, u, k), next, p, n, scale);
+        let [x, y, z] = ascent(s, whole(s, u, k), next, p, n, limited, scale);
         x.store_slice(&mut px[k..k + len]);
         y.store_slice(&mut py[k..k + len]);
         z.store_slice(&mut pz[k..k + len]);
@@ -537,15 +590,15 @@ fn ascend<S: Simd>(
         let p = [load(s, px, k), load(s, py, k), load(s, pz, k)];
         let next = [load(s, after[0], k), load(s, after[1], k), load(s, u, k + 1)];
         let n = n.map(|n| n.map(|n| load(s, n, k)));
-        let [x, y, z] = ascent(s, load(s, u, k), next, p, n, scale);
+        let [x, y, z] = ascent(s, load(s, u, k), next, p, n, limited, scale);
         store::<S, f32>(x, px, k);
         store::<S, f32>(y, py, k);
         store::<S, f32>(z, pz, k);
     }
 }
 
-/// The dual of a vector of voxels after a step. With edges it is stored as `w = D·p`, so that the primal does not need
-/// them; then `p = D⁻¹·w = w + n·(n·w)/(1 − |n|²)`.
+/// The dual of a vector of voxels after a step. With edges or a limited arc it is stored as `w = D·A·p`, so that the
+/// primal does not need them. `D⁻¹·w = w + n·(n·w)/(1 − |n|²)` and `A⁻¹·w = w − (1 − 1/f)·m·(m·w)`.
 #[inline(always)]
 fn ascent<S: Simd>(
     s: S,
@@ -553,9 +606,19 @@ fn ascent<S: Simd>(
     next: [S::f32s; 3],
     p: [S::f32s; 3],
     n: Option<[S::f32s; 3]>,
+    limited: Option<([S::f32s; 3], S::f32s)>,
     scale: [S::f32s; 3],
 ) -> [S::f32s; 3] {
     let one = S::f32s::splat(s, 1.0);
+    if let Some((m, f)) = limited {
+        let n = n.unwrap_or([S::f32s::splat(s, 0.0); 3]);
+        let d = less(n, one, std::array::from_fn(|k| (next[k] - here) * scale[k]));
+        let d = less(m, one - f, d);
+        let p = less(m, one - one / f, less(n, -(one / (one - dot(n, n))), p));
+        let p: [S::f32s; 3] = std::array::from_fn(|k| p[k] + d[k]);
+        let shrink = one / dot(p, p).sqrt().max(one);
+        return less(n, one, less(m, one - f, p.map(|p| p * shrink)));
+    }
     let Some(n) = n else {
         let [x, y, z]: [S::f32s; 3] = std::array::from_fn(|k| (next[k] - here).mul_add(scale[k], p[k]));
         let square = x.mul_add(x, y.mul_add(y, z * z));
@@ -577,6 +640,8 @@ fn ascent<S: Simd>(
 /// [`ascent`] and [`Variation`] in WGSL, without edges and with them.
 const PLAIN: &str = include_str!("tv.wgsl");
 const ALONG_EDGES: &str = include_str!("tv_edges.wgsl");
+/// The same of a limited arc, without edges (n = 0) and with them.
+const LIMITED: &str = include_str!("tv_limited.wgsl");
 
 #[inline(always)]
 fn dot<T: Copy + std::ops::Add<Output = T> + std::ops::Mul<Output = T>>(a: [T; 3], b: [T; 3]) -> T {
@@ -694,8 +759,11 @@ mod tests {
         let shape = [9, 8, 19];
         let (g, tau) = ([1.0, 0.7, 1.3], 0.15f32);
         let v = noisy(shape);
-        for directional in [false, true] {
+        for (directional, limited) in [(false, false), (true, false), (false, true), (true, true)] {
             let mut prox = if directional { with_edges(shape, g, &v) } else { prox(shape, g) };
+            if limited {
+                prox.limit(Limited::new([0.6, 0.8, 0.0], 0.3));
+            }
             let mut u = Array3::zeros(shape);
             let gap = |prox: &TvProx, u: &Array3<f32>| {
                 // P(u) = ½‖u − v‖² + τTV(u); D(p) = ½‖v‖² − ½‖max(0, v − τ∇ᵀp)‖², and u is that maximum.
@@ -722,16 +790,35 @@ mod tests {
         let (shape, g) = ([12, 9, 10], [1.0; 3]);
         let step = Array3::from_shape_fn(shape, |(x, _, _)| f32::from(u8::from(x >= 6)));
         let prox = with_edges(shape, g, &step);
-        let plain = total_variation(step.view(), g, None);
+        let plain = total_variation(step.view(), g, None, None);
         assert!(prox.value(step.view()) < 0.3 * plain, "{} and {plain}", prox.value(step.view()));
         let along = Array3::from_shape_fn(shape, |(_, y, _)| f32::from(u8::from(y >= 4)));
-        let plain = total_variation(along.view(), g, None);
+        let plain = total_variation(along.view(), g, None, None);
         assert!((prox.value(along.view()) - plain).abs() < 1e-3 * plain);
     }
 
-    /// The same steps one after another, voxel by voxel; `dual` is `D·p`.
+    /// The cost does not depend on the frame: a face at any angle costs f times as much if the arc's middle is its normal.
+    #[test]
+    fn slopes_along_the_middle_of_an_arc_cost_less_at_any_angle() {
+        let shape = [16, 16, 4];
+        for angle in [0.0f64, 0.7, 1.2] {
+            let middle = [angle.cos(), angle.sin(), 0.0];
+            let across = [-angle.sin(), angle.cos(), 0.0];
+            let ramp = Array3::from_shape_fn(shape, |(x, y, _)| (x as f64 * middle[0] + y as f64 * middle[1]) as f32);
+            let cost = |limited| total_variation(ramp.view(), [1.0; 3], None, limited);
+            let (plain, along) = (cost(None), cost(Some(Limited::new(middle, 0.25))));
+            let other = cost(Some(Limited::new(across, 0.25)));
+            // At the far faces one of the differences is 0, so that the slope has another direction there.
+            assert!(
+                (along / plain - 0.25).abs() < 0.06 && other / plain > 0.94,
+                "{angle}: {along}, {other} of {plain}"
+            );
+        }
+    }
+
+    /// The same steps one after another, voxel by voxel; `dual` is `D·A·p`.
     fn plain(prox: &mut TvProx, v: &Array3<f32>, tau: f32, steps: usize) -> Array3<f32> {
-        let TvProx { shape, g, bounds, dual, edges } = prox;
+        let TvProx { shape, g, bounds, dual, edges, limited } = prox;
         let (shape, g, bounds, dual) = (*shape, *g, *bounds, &mut dual.each_mut().map(|p| p.on_host_mut().unwrap()));
         let moved = |at: [usize; 3], k: usize, by: isize| {
             let mut to = at;
@@ -754,12 +841,16 @@ mod tests {
                 let ahead = |k: usize| if at[k] + 1 < shape[k] { u[moved(at, k, 1)] - here } else { 0.0 };
                 let n = edges.as_ref().map_or([0.0; 3], |edges| edges.vectors().map(|n| n[index]));
                 let directed = |d: [f32; 3]| std::array::from_fn::<f32, 3, _>(|k| d[k] - n[k] * dot(n, d));
-                let slope = directed(std::array::from_fn(|k| ahead(k) * g[k] / (bound * tau)));
+                let (m, f) = limited.map_or(([0.0; 3], 1.0), |limited| (limited.middle, limited.factor));
+                let along =
+                    |f: f32, d: [f32; 3]| std::array::from_fn::<f32, 3, _>(|k| d[k] + (f - 1.0) * m[k] * dot(m, d));
+                let slope = along(f, directed(std::array::from_fn(|k| ahead(k) * g[k] / (bound * tau))));
                 let w: [f32; 3] = std::array::from_fn(|k| dual[k][at]);
                 // D⁻¹ = 1 + n·nᵀ/(1 − |n|²)
-                let p: [f32; 3] = std::array::from_fn(|k| w[k] + n[k] * dot(n, w) / (1.0 - dot(n, n)) + slope[k]);
+                let p = along(1.0 / f, std::array::from_fn(|k| w[k] + n[k] * dot(n, w) / (1.0 - dot(n, n))));
+                let p: [f32; 3] = std::array::from_fn(|k| p[k] + slope[k]);
                 let length = dot(p, p).sqrt().max(1.0);
-                let w = directed(p.map(|p| p / length));
+                let w = directed(along(f, p.map(|p| p / length)));
                 (0..3).for_each(|k| dual[k][at] = w[k]);
             }
         }
@@ -781,9 +872,12 @@ mod tests {
             ([97, 2, 5], 5),
         ] {
             let v = noisy(shape);
-            for directional in [false, true] {
+            for (directional, limited) in [(false, false), (true, false), (false, true), (true, true)] {
                 let made = || {
                     let mut made = if directional { with_edges(shape, g, &v) } else { prox(shape, g) };
+                    if limited {
+                        made.limit(Limited::new([0.6, 0.8, 0.0], 0.3));
+                    }
                     made.confine(Bounds { low: 0.02, high: 0.9 });
                     made
                 };
@@ -868,7 +962,7 @@ mod tests {
                 let squares = ahead.iter().zip(g).map(|(a, g)| a.map_or(0.0, |a| f64::from(g * (a - here)).powi(2)));
                 want += squares.sum::<f64>().sqrt();
             }
-            let found = total_variation(x.view(), g, None);
+            let found = total_variation(x.view(), g, None, None);
             assert!((found - want).abs() <= 1e-5 * want, "{shape:?}: {found} and {want}");
         }
     }

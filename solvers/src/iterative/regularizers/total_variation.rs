@@ -1,6 +1,6 @@
 //! Total variation: attenuation is piecewise constant with few edges.
 
-use crate::iterative::tv::{TvProx, anisotropy};
+use crate::iterative::tv::{Limited, TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Vec3, VoxelGrid};
 use conefield_core::place::StatePart;
@@ -22,9 +22,8 @@ pub struct TotalVariation {
     /// more.
     #[serde(skip_serializing_if = "are_equal")]
     pub weights: [f64; 3],
-    /// Factor of differences along the middle of an arc of less than half a turn. Edges across it are the ones that the
-    /// views do not show; with a smaller factor they cost less. An axis at an angle α to the middle gets
-    /// `1 − (1 − arc)·cos²α`. Wider arcs ignore it.
+    /// Factor of slopes along the middle of an arc of less than half a turn, whatever its angle. Edges across it are the
+    /// ones that the views do not show; with a smaller factor they cost less. Wider arcs ignore it.
     #[serde(skip_serializing_if = "is_one")]
     pub arc: f64,
 }
@@ -47,7 +46,7 @@ pub(super) fn weighted(grid: &VoxelGrid, weights: [f64; 3]) -> [f32; 3] {
 
 /// Refuses an invalid weight, number of dual steps, or factor.
 pub(super) fn validate(weight: Weight, inner: usize, weights: [f64; 3], arc: f64) -> Result<()> {
-    ensure((1e-3..=1e3).contains(&arc), "spec", "arc", arc, "a number from 0.001 to 1000")?;
+    ensure((1e-3..=1.0).contains(&arc), "spec", "arc", arc, "a number from 0.001 to 1")?;
     let some = weights.iter().any(|w| *w > 0.0);
     for w in weights {
         let expected = "three numbers from 0.001 to 1000 or 0, not all 0";
@@ -131,7 +130,9 @@ impl Penalty for On {
     }
 
     fn limited(&mut self, middle: Vec3) {
-        self.prox.weigh(middle.map(|d| (1.0 - (1.0 - self.arc) * d * d) as f32));
+        if !is_one(&self.arc) {
+            self.prox.limit(Limited::new(middle, self.arc));
+        }
     }
 
     fn update(&mut self, update: Update<'_>, tau: f32) {
