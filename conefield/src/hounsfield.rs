@@ -93,7 +93,10 @@ pub enum Region {
     },
 }
 
-/// The forms of `--hu`.
+/// What errors call the conversion.
+const FIELD: &str = "Hounsfield units";
+
+/// The forms of [`How`] as text.
 const FORMS: &str = "water=MU,air=MU in 1/mm such as water=0.0206,air=0, with sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z in mm in \
                      place of a MU to measure it, or an energy such as 60keV, a calibration file (.toml) or as-is";
 
@@ -238,7 +241,7 @@ impl How {
             Self::Energy(energy) => {
                 remark = format!(" at {energy} keV");
                 let expected = format!("{} to {} keV", WATER[0].0, WATER[20].0);
-                let water = water(*energy).ok_or_else(|| Error::invalid("--hu", "energy", energy, expected))?;
+                let water = water(*energy).ok_or_else(|| Error::invalid(FIELD, "energy", energy, expected))?;
                 Some([water, 0.0].map(Level::Given))
             }
             Self::File(path) => {
@@ -261,7 +264,7 @@ impl How {
                     let last = grid.shape.map(|n| n - 1);
                     let [a, b] = [[0; 3], last].map(|v| at(grid, affine, v));
                     let expected = format!("a region with voxels, whose centres lie from {a:.3?} to {b:.3?} mm");
-                    ensure(some, place, "--hu", format!("{region:?} without a voxel"), expected)?;
+                    ensure(some, place, FIELD, format!("{region:?} without a voxel"), expected)?;
                 }
             }
         }
@@ -283,7 +286,7 @@ impl Calibration {
     /// than air.
     pub fn measure(&self, voxels: &mut dyn Voxels) -> Result<Levels> {
         let Some(levels) = &self.levels else {
-            return Ok(Levels { water: 0.0, air: -1000.0, note: "HU, as read".into() });
+            return Ok(Levels::already("HU, as read".into()));
         };
         let mm = self.unit.as_ref().map_or(1.0, |u| u.mm);
         let mut found = [0.0; 2];
@@ -296,7 +299,7 @@ impl Calibration {
         let [water, air] = found;
         let good = water.is_finite() && air.is_finite() && water > air;
         let expected = "water that attenuates more than air";
-        ensure(good, &self.place, "--hu", format!("water {water} and air {air}"), expected)?;
+        ensure(good, &self.place, FIELD, format!("water {water} and air {air}"), expected)?;
         let unit = self.unit.as_ref().map_or("mm", |u| &u.name);
         let measured = levels.iter().any(|l| matches!(l, Level::Mean(_)));
         let unit = if measured && self.unit.is_none() { String::new() } else { format!(" per {unit}") };
@@ -336,6 +339,11 @@ pub struct Levels {
 }
 
 impl Levels {
+    /// Of values that are Hounsfield units already.
+    pub fn already(note: String) -> Self {
+        Self { water: 0.0, air: -1000.0, note }
+    }
+
     /// `voxels` in Hounsfield units.
     pub fn of<'a>(&'a self, voxels: &'a mut dyn Voxels) -> HounsfieldVoxels<'a> {
         HounsfieldVoxels { voxels, levels: self }
@@ -425,7 +433,7 @@ mod tests {
         assert!(said.contains("a.nii: unit: found \"cube half side\"") && said.contains("regions"), "{said}");
         assert!(converted("water=sphere:3,0,1,2.5,air=box:0,-2,-1,-9,2,1", cube).is_ok());
         let said = converted("water=sphere:30,0,1,2,air=0", None).unwrap_err().to_string();
-        assert!(said.contains("--hu") && said.contains("without a voxel") && said.contains("3.000"), "{said}");
+        assert!(said.contains(FIELD) && said.contains("without a voxel") && said.contains("3.000"), "{said}");
         let said = converted("water=0.001,air=0.02", None).unwrap_err().to_string();
         assert!(said.contains("water 0.001 and air 0.02"), "{said}");
     }
