@@ -27,8 +27,8 @@ class Volume:
     affine
         Four by four: voxel indices to the patient's or the file's own coordinates in mm (NIfTI's, RAS), if known.
 
-    ``data`` is a NumPy array of ``float32``. It is writable. ``hu`` is None for attenuation; for Hounsfield units it says
-    what water and air were, for the headers of files.
+    ``data`` is a NumPy array of ``float32``. It is writable. ``hu`` is None for attenuation; for Hounsfield units it
+    says what water and air were, for the headers of files.
     """
 
     __slots__ = ("data", "spacing", "center", "affine", "hu")
@@ -60,8 +60,8 @@ class Volume:
         ----------
         how
             ``"water=0.0206,air=0"`` in 1/mm, with ``sphere:X,Y,Z,R`` or ``box:X,Y,Z,X,Y,Z`` (mm, in the coordinates of
-            ``affine``) in place of a value to measure it there; ``"60keV"``; a calibration file (``.toml``) with water and
-            air; or ``"as-is"``: the values are Hounsfield units already.
+            ``affine``) in place of a value to take the median there; ``"60keV"``; a calibration file (``.toml``) with
+            water and air; or ``"as-is"``: the values are Hounsfield units already.
         unit
             The values are in 1/unit: ``scan.unit``, or None for 1/mm. Values in 1/mm need a unit of length.
         """
