@@ -91,8 +91,14 @@ fn in_c() {
         let made =
             Command::new("make").current_dir(&folder).env("CFLAGS", "-O2 -Wall -Wextra -Werror").output().unwrap();
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-        let record = use_it(kind, &folder, &folder.join(format!("{name}.so")), &scan);
+        let library = folder.join(format!("{name}.so"));
+        let record = use_it(kind, &folder, &library, &scan);
         assert_eq!(record["plugins"][0]["name"], name.as_str());
+        if kind == "encoder" {
+            // Its author learns what turns the checks in double precision on.
+            let said = done(&["plugins", "check", &text(&library)]);
+            assert!(said.contains("in C, info leaves double_precision 0"), "{said}");
+        }
     }
 }
 
