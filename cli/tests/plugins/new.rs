@@ -31,6 +31,10 @@ fn use_it(kind: &str, folder: &Path, library: &Path, scan: &Path) -> serde_json:
     let record =
         json(&[&["--plugin", &library, "reconstruct", &text(scan), "--spec", &spec, "-o", &run][..], &small].concat());
     if kind == "encoder" {
+        // It says how fine it is: a step of the spec is one cell.
+        let (scan, run, encoder) = (text(scan), text(&folder.join("cells")), format!("encoder.type=new-{kind}"));
+        let balanced = ["--spec", "balanced", "--steps", "2", "--set", &encoder, "-o", &run];
+        done(&[&["--plugin", &library, "reconstruct", &scan][..], &balanced].concat());
         // Without its plugin a field cannot be evaluated; the message has the option for it.
         let path = record["plugins"][0]["path"].as_str().unwrap();
         for (command, output) in [("export", "export.nii"), ("features", "features.png")] {
