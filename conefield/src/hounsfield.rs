@@ -8,6 +8,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Unit};
 use conefield_core::{Error, Result};
+use conefield_scans::diagnosis::quantiles::median;
 use ndarray::{Array3, ArrayViewMut3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -70,8 +71,8 @@ pub enum How {
 pub enum Level {
     /// This value, in 1/mm.
     Given(f64),
-    /// The mean of the voxels in a region.
-    Mean(Region),
+    /// The median of the voxels in a region.
+    Median(Region),
 }
 
 /// A region in the coordinates of the written file, in mm, RAS.
@@ -93,7 +94,10 @@ pub enum Region {
     },
 }
 
-/// The forms of `--hu`.
+/// What errors call the conversion.
+const FIELD: &str = "Hounsfield units";
+
+/// The forms of [`How`] as text.
 const FORMS: &str = "water=MU,air=MU in 1/mm such as water=0.0206,air=0, with sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z in mm in \
                      place of a MU to measure it, or an energy such as 60keV, a calibration file (.toml) or as-is";
 
@@ -136,7 +140,7 @@ impl FromStr for Level {
             },
             Some(("sphere", list)) => match numbers(list).as_deref() {
                 Some(&[x, y, z, radius]) if radius > 0.0 => {
-                    Ok(Self::Mean(Region::Sphere { center: [x, y, z], radius }))
+                    Ok(Self::Median(Region::Sphere { center: [x, y, z], radius }))
                 }
                 _ => Err("expected sphere:X,Y,Z,R with a radius above 0, in mm".into()),
             },
@@ -145,7 +149,7 @@ impl FromStr for Level {
                     let corners = [[a, d], [b, e], [c, f]];
                     let [low, high] =
                         [f64::min as fn(f64, f64) -> f64, f64::max].map(|pick| corners.map(|[p, q]| pick(p, q)));
-                    Ok(Self::Mean(Region::Box { low, high }))
+                    Ok(Self::Median(Region::Box { low, high }))
                 }
                 _ => Err("expected box:X,Y,Z,X,Y,Z, two corners in mm".into()),
             },
@@ -238,7 +242,7 @@ impl How {
             Self::Energy(energy) => {
                 remark = format!(" at {energy} keV");
                 let expected = format!("{} to {} keV", WATER[0].0, WATER[20].0);
-                let water = water(*energy).ok_or_else(|| Error::invalid("--hu", "energy", energy, expected))?;
+                let water = water(*energy).ok_or_else(|| Error::invalid(FIELD, "energy", energy, expected))?;
                 Some([water, 0.0].map(Level::Given))
             }
             Self::File(path) => {
@@ -256,12 +260,12 @@ impl How {
                     let found = relative.map_or("", |u| &u.name);
                     ensure(relative.is_none(), place, "unit", format!("\"{found}\""), expected)?;
                 }
-                Level::Mean(region) => {
+                Level::Median(region) => {
                     let some = planes(grid).flat_map(|p| voxels_of(&p)).any(|v| region.holds(at(grid, affine, v)));
                     let last = grid.shape.map(|n| n - 1);
                     let [a, b] = [[0; 3], last].map(|v| at(grid, affine, v));
                     let expected = format!("a region with voxels, whose centres lie from {a:.3?} to {b:.3?} mm");
-                    ensure(some, place, "--hu", format!("{region:?} without a voxel"), expected)?;
+                    ensure(some, place, FIELD, format!("{region:?} without a voxel"), expected)?;
                 }
             }
         }
@@ -283,34 +287,34 @@ impl Calibration {
     /// than air.
     pub fn measure(&self, voxels: &mut dyn Voxels) -> Result<Levels> {
         let Some(levels) = &self.levels else {
-            return Ok(Levels { water: 0.0, air: -1000.0, note: "HU, as read".into() });
+            return Ok(Levels::already("HU, as read".into()));
         };
         let mm = self.unit.as_ref().map_or(1.0, |u| u.mm);
         let mut found = [0.0; 2];
         for (found, level) in found.iter_mut().zip(levels) {
             *found = match level {
                 Level::Given(mu) => mu * mm,
-                Level::Mean(region) => mean(voxels, region)?,
+                Level::Median(region) => median_in(voxels, region)?,
             };
         }
         let [water, air] = found;
         let good = water.is_finite() && air.is_finite() && water > air;
         let expected = "water that attenuates more than air";
-        ensure(good, &self.place, "--hu", format!("water {water} and air {air}"), expected)?;
+        ensure(good, &self.place, FIELD, format!("water {water} and air {air}"), expected)?;
         let unit = self.unit.as_ref().map_or("mm", |u| &u.name);
-        let measured = levels.iter().any(|l| matches!(l, Level::Mean(_)));
+        let measured = levels.iter().any(|l| matches!(l, Level::Median(_)));
         let unit = if measured && self.unit.is_none() { String::new() } else { format!(" per {unit}") };
         let (short, remark) = (|x: f64| x as f32, &self.remark);
         Ok(Levels { water, air, note: format!("HU: water {}, air {}{unit}{remark}", short(water), short(air)) })
     }
 }
 
-/// The mean of the voxels in `region`, one plane at a time.
-fn mean(voxels: &mut dyn Voxels, region: &Region) -> Result<f64> {
+/// The median of the voxels in `region`, one plane at a time: a streak or a bubble does not shift it as it does a mean.
+fn median_in(voxels: &mut dyn Voxels, region: &Region) -> Result<f64> {
     let (grid, affine) = (voxels.grid(), voxels.affine());
     let [nx, ny, _] = grid.shape;
     let mut plane = Array3::zeros([nx, ny, 1]);
-    let (mut sum, mut count) = (0.0, 0u64);
+    let mut values = vec![];
     for part in planes(&grid) {
         let inside: Vec<[usize; 3]> =
             voxels_of(&part).filter(|v| region.holds(at(&grid, affine.as_ref(), *v))).collect();
@@ -318,10 +322,9 @@ fn mean(voxels: &mut dyn Voxels, region: &Region) -> Result<f64> {
             continue;
         }
         voxels.fill(&part, plane.view_mut())?;
-        sum += inside.iter().map(|[x, y, _]| f64::from(plane[[*x, *y, 0]])).sum::<f64>();
-        count += inside.len() as u64;
+        values.extend(inside.iter().map(|[x, y, _]| plane[[*x, *y, 0]]));
     }
-    Ok(sum / count as f64)
+    Ok(median(&mut values).map_or(f64::NAN, f64::from))
 }
 
 /// Water and air of a volume, in its unit.
@@ -336,6 +339,11 @@ pub struct Levels {
 }
 
 impl Levels {
+    /// Of values that are Hounsfield units already.
+    pub fn already(note: String) -> Self {
+        Self { water: 0.0, air: -1000.0, note }
+    }
+
     /// `voxels` in Hounsfield units.
     pub fn of<'a>(&'a self, voxels: &'a mut dyn Voxels) -> HounsfieldVoxels<'a> {
         HounsfieldVoxels { voxels, levels: self }
@@ -419,13 +427,22 @@ mod tests {
     }
 
     #[test]
+    fn a_streak_and_a_bubble_in_a_region_do_not_shift_it() {
+        let mut volume = volume();
+        (volume.data[[0, 1, 1]], volume.data[[3, 1, 1]]) = (0.4, 0.0);
+        let how: How = "water=box:1,-2,-1,3,2,1,air=box:-3,-2,-1,-1,2,1".parse().unwrap();
+        let levels = how.open("a.nii", None, &volume.grid, None).unwrap().measure(&mut &volume).unwrap();
+        assert_eq!([levels.water as f32, levels.air as f32], [0.021, 0.001]);
+    }
+
+    #[test]
     fn a_relative_unit_needs_regions() {
         let cube = Some(Unit { name: "cube half side".into(), mm: 4.0 });
         let said = converted("60keV", cube.clone()).unwrap_err().to_string();
         assert!(said.contains("a.nii: unit: found \"cube half side\"") && said.contains("regions"), "{said}");
         assert!(converted("water=sphere:3,0,1,2.5,air=box:0,-2,-1,-9,2,1", cube).is_ok());
         let said = converted("water=sphere:30,0,1,2,air=0", None).unwrap_err().to_string();
-        assert!(said.contains("--hu") && said.contains("without a voxel") && said.contains("3.000"), "{said}");
+        assert!(said.contains(FIELD) && said.contains("without a voxel") && said.contains("3.000"), "{said}");
         let said = converted("water=0.001,air=0.02", None).unwrap_err().to_string();
         assert!(said.contains("water 0.001 and air 0.02"), "{said}");
     }

@@ -114,6 +114,11 @@ pub trait Settings {
 }
 
 impl Kind {
+    /// Whether plugins can bring types of this kind.
+    pub fn is_of_plugins(self) -> bool {
+        !matches!(self, Self::Method | Self::Callback | Self::VoxelProjector)
+    }
+
     /// The kind named `name`.
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|k| k.name() == name)

@@ -27,20 +27,23 @@ class Volume:
     affine
         Four by four: voxel indices to the patient's or the file's own coordinates in mm (NIfTI's, RAS), if known.
 
-    ``data`` is a NumPy array of ``float32``. It is writable.
+    ``data`` is a NumPy array of ``float32``. It is writable. ``hu`` is None for attenuation; for Hounsfield units it
+    says what water and air were, for the headers of files.
     """
 
-    __slots__ = ("data", "spacing", "center", "affine")
+    __slots__ = ("data", "spacing", "center", "affine", "hu")
 
     data: np.ndarray
     spacing: tuple[float, float, float]
     center: tuple[float, float, float]
     affine: np.ndarray | None
+    hu: str | None
 
     def __init__(self, data: Any, spacing: Any = 1.0, center: Any = 0.0, affine: Any = None) -> None:
         self.data = as_floats(data, "data", 3)
         self.spacing = triple(spacing, "spacing")
         self.center = triple(center, "center")
+        self.hu = None
         self.affine = None if affine is None else as_floats(affine, "affine", 2, np.float64)
         if self.affine is not None and self.affine.shape != (4, 4):
             raise invalid("arguments", "affine", f"an array of shape {self.affine.shape}", "(4, 4)")
@@ -49,6 +52,20 @@ class Volume:
     def shape(self) -> tuple[int, int, int]:
         """Voxels along x, y and z."""
         return self.data.shape  # type: ignore[return-value]
+
+    def hounsfield(self, how: str | os.PathLike[str], unit: tuple[str, float] | None) -> Volume:
+        """The volume in Hounsfield units, ``1000·(μ − water)/(water − air)``. As ``--hu`` of the command.
+
+        Parameters
+        ----------
+        how
+            ``"water=0.0206,air=0"`` in 1/mm, with ``sphere:X,Y,Z,R`` or ``box:X,Y,Z,X,Y,Z`` (mm, in the coordinates of
+            ``affine``) in place of a value to take the median there; ``"60keV"``; a calibration file (``.toml``) with
+            water and air; or ``"as-is"``: the values are Hounsfield units already.
+        unit
+            The values are in 1/unit: ``scan.unit``, or None for 1/mm. Values in 1/mm need a unit of length.
+        """
+        return _native.hounsfield(self, os.fspath(how), unit)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Writes ``.nii``, ``.nii.gz``, ``.mha``, ``.mhd``, ``.nrrd``, ``.npy``, ``.tif``, ``.zarr``, ``.dicom``

@@ -14,7 +14,7 @@ pub fn read<T: DeserializeOwned>(py: Python<'_>, text: &str) -> PyResult<T> {
 }
 
 /// An argument in command-line syntax.
-fn parsed<T>(name: &str, text: &str, parse: impl Fn(&str) -> Result<T, String>) -> Result<T> {
+pub fn parsed<T>(name: &str, text: &str, parse: impl Fn(&str) -> Result<T, String>) -> Result<T> {
     parse(text)
         .map_err(|why| Error::invalid("arguments", name, format!("{text:?}"), why.trim_start_matches("expected ")))
 }

@@ -48,7 +48,7 @@ mod _native {
     #[pymodule_export]
     use crate::stages::{check_stage, register, stage_names};
     #[pymodule_export]
-    use crate::volume::{read_volume, write_volume};
+    use crate::volume::{hounsfield, read_volume, write_volume};
     use pyo3::prelude::*;
 
     #[pymodule_init]

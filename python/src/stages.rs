@@ -5,11 +5,10 @@ use crate::encoder::PythonEncoder;
 use crate::errors::{OrRaise, raised as exception};
 use crate::regularizer::PythonRegularizer;
 use crate::work::without_lock;
-use conefield_conformance::{Options, Outcome, Report, check_encoder, check_regularizer};
+use conefield_conformance::{Outcome, Report, With, check_type};
 use conefield_core::registry::{self, Kind, Make, NewType};
 use conefield_core::regularizer::{Regularizer, RegularizerSpec};
 use conefield_core::settings::EncoderSpec;
-use conefield_core::spec::stage;
 use conefield_core::stage::Encoder;
 use conefield_core::{Error, Result};
 use pyo3::prelude::*;
@@ -65,15 +64,13 @@ pub fn within<T>(raised: &Arc<Raised>, work: impl FnOnce() -> T) -> T {
     done
 }
 
-/// The kind of a stage, if it can be written in Python.
+/// The kind of a stage.
 fn kind(py: Python<'_>, name: &str) -> PyResult<Kind> {
-    match Kind::named(name) {
-        Some(kind @ (Kind::Encoder | Kind::Regularizer)) => Ok(kind),
-        _ => Err(exception(py, &Error::invalid("stage", "kind", name, "encoder or regularizer"))),
-    }
+    let all = || Kind::ALL.iter().map(|k| k.name()).collect::<Vec<_>>().join(", ");
+    Kind::named(name).ok_or_else(|| exception(py, &Error::invalid("stage", "kind", name, all())))
 }
 
-/// Registers a class, so that a spec can name it as a type of this kind.
+/// Registers a class, so that a spec can name it as a type of this kind: an encoder or a regularizer.
 #[pyfunction]
 pub fn register(py: Python<'_>, kind_name: &str, name: String, doc: String, class: Py<PyAny>) -> PyResult<()> {
     let kind = kind(py, kind_name)?;
@@ -96,10 +93,8 @@ pub fn register(py: Python<'_>, kind_name: &str, name: String, doc: String, clas
 
 /// All types of a kind available to specs.
 #[pyfunction]
-pub fn stage_names(py: Python<'_>, kind: &str) -> PyResult<Vec<&'static str>> {
-    let found = Kind::named(kind);
-    let all = Kind::ALL.iter().map(|k| k.name()).collect::<Vec<_>>().join(", ");
-    found.map(registry::names).ok_or_else(|| exception(py, &Error::invalid("stage", "kind", kind, all)))
+pub fn stage_names(py: Python<'_>, kind_name: &str) -> PyResult<Vec<&'static str>> {
+    kind(py, kind_name).map(registry::names)
 }
 
 /// Settings of a Python stage.
@@ -186,21 +181,10 @@ type Properties = Vec<(&'static str, &'static str, String)>;
 pub fn check_stage(py: Python<'_>, kind_name: &str, table: &str) -> PyResult<(bool, String, Properties)> {
     let kind = kind(py, kind_name)?;
     let table: Value = arguments::read(py, table)?;
-    let report = without_lock(py, |_| match kind {
-        Kind::Encoder => {
-            let spec: Box<dyn EncoderSpec> = stage::read(table).map_err(unread)?;
-            Ok(check_encoder(spec.build()?.as_ref(), &Options::encoder()))
-        }
-        _ => {
-            let spec: Box<dyn RegularizerSpec> = stage::read(table).map_err(unread)?;
-            Ok(check_regularizer(spec.build()?.as_ref()))
-        }
-    })?;
-    Ok((report.passed(), report.to_string(), properties(report)))
-}
-
-fn unread(why: String) -> Error {
-    Error::invalid("stage", "type", why, "a registered type with its settings")
+    let found = without_lock(py, |_| check_type(kind, &table, &With::ON_THE_HOST))?;
+    let reports: Vec<Report> = found.into_iter().map(|(_, report)| report).collect();
+    let text = reports.iter().map(Report::to_string).collect();
+    Ok((reports.iter().all(Report::passed), text, reports.into_iter().flat_map(properties).collect()))
 }
 
 fn properties(report: Report) -> Properties {

@@ -1,10 +1,12 @@
 //! Volumes: `conefield.Volume` is written in Python, as it holds a NumPy array that users may change.
 
+use crate::arguments;
 use crate::arrays::{given, owned};
 use crate::errors::OrRaise;
 use crate::work::without_lock;
+use conefield::hounsfield::{How, Levels};
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::scan::Volume;
+use conefield_core::scan::{Unit, Volume};
 use numpy::{PyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use std::path::PathBuf;
@@ -51,9 +53,35 @@ pub fn read_volume(py: Python<'_>, name: String) -> PyResult<Bound<'_, PyAny>> {
     made(py, volume)
 }
 
-/// Writes a volume in the format given by the file extension.
+/// Writes a volume in the format given by the file extension; the header says if it is in Hounsfield units.
 #[pyfunction]
 pub fn write_volume(py: Python<'_>, path: PathBuf, volume: &Bound<'_, PyAny>) -> PyResult<()> {
+    let note: Option<String> = volume.getattr("hu")?.extract()?;
     let volume = taken(volume)?;
-    without_lock(py, |_| conefield_io::write_volume(&path, &volume))
+    without_lock(py, |_| match note {
+        None => conefield_io::write_volume(&path, &volume),
+        Some(note) => conefield_io::write_voxels(&path, &mut Levels::already(note).of(&mut &volume)),
+    })
+}
+
+/// The volume in Hounsfield units. Its values are in 1/`unit` (name and mm), without a unit in 1/mm.
+#[pyfunction]
+pub fn hounsfield<'py>(
+    py: Python<'py>,
+    volume: &Bound<'py, PyAny>,
+    how: &str,
+    unit: Option<(String, f64)>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let volume = taken(volume)?;
+    let unit = unit.map(|(name, mm)| Unit { name, mm });
+    let (converted, note) = without_lock(py, |_| {
+        let how: How = arguments::parsed("how", how, |text| text.parse())?;
+        let calibration = how.open("volume", unit.as_ref(), &volume.grid, volume.affine.as_ref())?;
+        let levels = calibration.measure(&mut &volume)?;
+        let converted = Volume::collect(&mut levels.of(&mut &volume))?;
+        Ok((converted, levels.note))
+    })?;
+    let converted = made(py, converted)?;
+    converted.setattr("hu", note)?;
+    Ok(converted)
 }

@@ -24,6 +24,32 @@ def test_volumes_keep_their_place(tmp_path):
     assert conefield.Volume(volume.data, 2).spacing == (2.0, 2.0, 2.0)
 
 
+def test_hounsfield_units_are_those_of_the_command(command, scan, tmp_path):
+    x, y, z = np.meshgrid(*3 * [4.0 * np.arange(24) - 46.0], indexing="ij")
+    ball = np.where(x**2 + y**2 + z**2 <= 34.0**2, 0.0206, 0.0)
+    source, ours, its, file = [tmp_path / name for name in ("a.mha", "python.mha", "command.mha", "scanner.toml")]
+    conefield.Volume(ball, 4.0).write(source)
+    file.write_text("water = 0.0206\nair = 0.0\nenergy_kev = 60.0\n")
+    volume = conefield.read_volume(source)
+    for how in ("water=0.0206,air=0", "water=sphere:0,0,0,20,air=box:30,30,30,50,50,50", "60keV", file, "as-is"):
+        hu = volume.hounsfield(how, None)
+        hu.write(ours)
+        command("convert", source, its, "--hu", how, "--force")
+        assert ours.read_bytes() == its.read_bytes(), how
+        if how != "as-is":
+            np.testing.assert_allclose([hu.data[12, 12, 12], hu.data[0, 0, 0]], [0, -1000], atol=0.6)
+    assert volume.hu is None and volume.hounsfield(file, None).hu == "HU: water 0.0206, air 0 per mm at 60 keV"
+    # Values of another unit.
+    ten = conefield.Volume(10 * ball, 4.0).hounsfield("60keV", ("cm", 10.0))
+    np.testing.assert_allclose(ten.data, volume.hounsfield("60keV", None).data, atol=1e-3)
+    with pytest.raises(conefield.InvalidError, match="regions"):
+        scan.truth.hounsfield("60keV", scan.unit)
+    with pytest.raises(conefield.InvalidError, match="how: .*such as 60keV"):
+        volume.hounsfield("water", None)
+    with pytest.raises(FileNotFoundError):
+        volume.hounsfield("none.toml", None)
+
+
 def test_arrays_of_other_libraries_are_taken():
     class Other:
         """An array of another library that only exports DLPack."""

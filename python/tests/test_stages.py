@@ -103,6 +103,38 @@ def test_a_regularizer_passes_the_kit_and_a_wrong_one_does_not():
     assert "proximal map" in conefield.check_stage("regularizer", "test-ridge", fault="wrong").failed
 
 
+@pytest.mark.parametrize(
+    "kind, name, settings",
+    [
+        ("encoder", "frequency", {"bands": 2}),
+        ("normalizer", "layer-norm", {}),
+        ("field", "mlp", {"width": 8}),
+        ("projector", "ray-march", {"samples": 9}),
+        ("initializer", "random", {}),
+        ("loss", "huber", {"delta": 0.5}),
+        ("prior", "total-variation", {}),
+        ("voxel-projector", "siddon", {}),
+        ("basis", "voxels", {}),
+        ("data-term", "least-squares", {}),
+        ("regularizer", "total-variation", {"weight": {"fixed": 0.1}}),
+    ],
+)
+def test_stages_of_every_kind_are_checked(kind, name, settings):
+    check = conefield.check_stage(kind, name, **settings)
+    assert check and check.properties, str(check)
+
+
+def test_what_cannot_be_checked_is_refused():
+    for kind, name, settings, words in [
+        ("hat", "mlp", {}, "kind: found hat, expected .*regularizer"),
+        ("encoder", "test-wave", {}, "type: found no encoder type .*test-waves"),
+        ("field", "mlp", {"widht": 3}, "settings of mlp: widht: .*width"),
+        ("method", "sart", {}, "no checks of a method"),
+    ]:
+        with pytest.raises(conefield.Error, match=words):
+            conefield.check_stage(kind, name, **settings)
+
+
 def test_a_regularizer_regularizes(scan):
     def of(**prior):
         spec = {"type": "fista", "prior": {"type": "test-ridge", **prior}, "stop": {"passes": 4}}
@@ -167,8 +199,6 @@ def test_what_is_no_stage_is_refused():
             kind("test-none")(cls)
     with pytest.raises(conefield.InvalidError, match="conefield itself"):
         conefield.encoder("hash-grid")(Waves)
-    with pytest.raises(conefield.InvalidError, match="encoder or regularizer"):
-        conefield.check_stage("field", "mlp")
 
     @conefield.encoder("test-flat")
     class Flat(Waves):

@@ -13,7 +13,7 @@ use std::path::Path;
 #[derive(Debug, Clone, Args)]
 pub struct HounsfieldOption {
     /// Write Hounsfield units: water=MU,air=MU in 1/mm, such as water=0.0206,air=0; sphere:X,Y,Z,R or
-    /// box:X,Y,Z,X,Y,Z in place of a MU takes the mean of these voxels (mm, in the coordinates of the file, RAS). Or
+    /// box:X,Y,Z,X,Y,Z in place of a MU takes the median of these voxels (mm, in the coordinates of the file, RAS). Or
     /// 60keV: water at this energy, air 0. Or a calibration file (.toml) with water and air. Or as-is: the values are
     /// Hounsfield units already. "reconstruct" writes volume-hu.nii.gz in addition.
     #[arg(long, value_name = "HOW")]

@@ -98,6 +98,13 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
     return CONEFIELD_OK;
 }
 
+/* For `step_cells` of a projector, as in the spec balanced: resolving a period takes two cells. */
+static ConefieldStatus resolutions(const void *stage, double *cells, size_t count, struct ConefieldText *error) {
+    (void)error;
+    for (size_t c = 0; c < count; c++) cells[c] = 1u << (c % ((const Waves *)stage)->bands);
+    return CONEFIELD_OK;
+}
+
 static const struct ConefieldMap MAP = {
     .size = sizeof MAP,
     .info = info,
@@ -105,6 +112,7 @@ static const struct ConefieldMap MAP = {
     .init = init,
     .forward = forward,
     .backward = backward,
+    .resolutions = resolutions,
 };
 
 static const struct ConefieldStage STAGES[] = {{

@@ -32,8 +32,7 @@ impl EncoderSpec for Settings {
 impl Settings {
     /// The angle of wave `c`, whose parameters are its direction and its phase.
     fn angle<R: Real>(params: &[R], x: &[R], c: usize) -> R {
-        let [a, b, d, phase] = [0, 1, 2, 3].map(|k| params[4 * c + k]);
-        a * x[0] + b * x[1] + d * x[2] + phase
+        (0..3).fold(params[4 * c + 3], |sum, k| sum + params[4 * c + k] * x[k])
     }
 }
 
@@ -67,6 +66,11 @@ impl RowMap for Settings {
             }
             grads.add(4 * c + 3, slope);
         }
+    }
+
+    /// For `step_cells` of a projector, as in the spec balanced: resolving a period takes two cells.
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        Some(vec![f64::from(self.frequency / std::f32::consts::PI).max(1.0); self.waves])
     }
 
     fn describe(&self) -> String {

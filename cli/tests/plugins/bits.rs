@@ -177,7 +177,7 @@ fn killed_and_resumed() {
     let mut bare = arguments[4..].to_vec();
     bare.push("--resume");
     let e = refused(1, &bare);
-    assert!(e.contains("no encoder type \"triplane\""), "{e}");
+    assert!(e.contains("no encoder type \"triplane\"") && e.contains("load it with --plugin PATH"), "{e}");
 
     let mut again = arguments.clone();
     again.push("--resume");

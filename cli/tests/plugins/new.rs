@@ -31,6 +31,10 @@ fn use_it(kind: &str, folder: &Path, library: &Path, scan: &Path) -> serde_json:
     let record =
         json(&[&["--plugin", &library, "reconstruct", &text(scan), "--spec", &spec, "-o", &run][..], &small].concat());
     if kind == "encoder" {
+        // It says how fine it is: a step of the spec is one cell.
+        let (scan, run, encoder) = (text(scan), text(&folder.join("cells")), format!("encoder.type=new-{kind}"));
+        let balanced = ["--spec", "balanced", "--steps", "2", "--set", &encoder, "-o", &run];
+        done(&[&["--plugin", &library, "reconstruct", &scan][..], &balanced].concat());
         // Without its plugin a field cannot be evaluated; the message has the option for it.
         let path = record["plugins"][0]["path"].as_str().unwrap();
         for (command, output) in [("export", "export.nii"), ("features", "features.png")] {
@@ -91,8 +95,14 @@ fn in_c() {
         let made =
             Command::new("make").current_dir(&folder).env("CFLAGS", "-O2 -Wall -Wextra -Werror").output().unwrap();
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-        let record = use_it(kind, &folder, &folder.join(format!("{name}.so")), &scan);
+        let library = folder.join(format!("{name}.so"));
+        let record = use_it(kind, &folder, &library, &scan);
         assert_eq!(record["plugins"][0]["name"], name.as_str());
+        if kind == "encoder" {
+            // Its author learns what turns the checks in double precision on.
+            let said = done(&["plugins", "check", &text(&library)]);
+            assert!(said.contains("in C, info leaves double_precision 0"), "{said}");
+        }
     }
 }
 

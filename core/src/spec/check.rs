@@ -46,7 +46,11 @@ fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
     let Some(name) = name else { return Err(invalid(&node.at, &at, "nothing".into(), types())) };
     let Some(text) = name.text() else { return Err(invalid(&name.at, &at, name.shown(), types())) };
     let Some(found) = find(kind, text) else {
-        return Err(invalid(&name.at, &at, format!("no {} type {text:?}", kind.name()), suggest(text, &known)));
+        let mut expected = suggest(text, &known);
+        if kind.is_of_plugins() {
+            expected += "; if it comes from a plugin, load it with --plugin PATH";
+        }
+        return Err(invalid(&name.at, &at, format!("no {} type {text:?}", kind.name()), expected));
     };
     let schema = of_type(found);
     let cx = Context::new(&schema, Some(kind));

@@ -645,6 +645,11 @@ mod tests {
             let e = refusal(&format!("{base}{line}\n"), &[]);
             assert!(e.contains(want), "{line}\n{e}\n{want}");
         }
+        // Plugins bring stages, but no methods.
+        let e = refusal(&format!("{base}type = 'mine'\n"), &[]);
+        assert!(e.contains("test-grid") && e.ends_with("from a plugin, load it with --plugin PATH"), "{e}");
+        let e = refusal("type = 'mine'\n", &[]);
+        assert!(e.contains("no method type \"mine\"") && !e.contains("plugin"), "{e}");
         let e = refusal("extends = 'plain'\n\nencodr = 3\n", &[]);
         assert!(e.starts_with("a.toml:3:1: encodr: found an unknown key, expected \"encoder\""), "{e}");
         let e = refusal("name = 'x'\n", &[]);

@@ -1,6 +1,7 @@
 //! Properties of a basis: a linear map without negative entries, and its exact adjoint.
 
 use crate::call::{differing, settle};
+use crate::gradients::no_double;
 use crate::voxels::{above, apart, dot, flat, noise};
 use crate::{Outcome, Report};
 use conefield_core::basis::{Basis, BasisOperator, Expansion};
@@ -21,10 +22,9 @@ pub fn check_basis(basis: &dyn Basis) -> Report {
     let made: Result<Vec<_>, _> = grids().iter().map(|grid| basis.on(grid).map(|b| (*grid, b))).collect();
     let Ok(all) = made else { return report };
     let double = all.iter().all(|(_, basis)| basis.reference().is_some());
-    let skipped = || Outcome::Skipped("no operator in double precision".into());
-    report.add("adjoint: double precision", || if double { adjoint(&all, reference, ADJOINT[0]) } else { skipped() });
+    report.add("adjoint: double precision", || if double { adjoint(&all, reference, ADJOINT[0]) } else { no_double() });
     report.add("adjoint: single precision", || adjoint(&all, |b| b.operator(), ADJOINT[1]));
-    report.add("single precision", || if double { single_precision(&all) } else { skipped() });
+    report.add("single precision", || if double { single_precision(&all) } else { no_double() });
     report.add("linear", || linear(&all, if double { 1e-12 } else { SINGLE }));
     report.add("overwrites", || overwrites(&all));
     report.add("no negative entries", || no_negative_entries(&all));

@@ -232,9 +232,16 @@ pub fn narrow(v: &[f64]) -> Vec<f32> {
     v.iter().map(|&v| v as f32).collect()
 }
 
+/// The outcome of a check that needs double precision, for a stage without. A plugin in C may have the functions and not
+/// declare them, and would see no other sign.
+pub fn no_double() -> Outcome {
+    let text = "no double precision (in C, info leaves double_precision 0: functions ending in _f64 are not called)";
+    Outcome::Skipped(text.into())
+}
+
 /// Outputs of the training kernel against the reference.
 pub fn single_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
-    let Some(k) = stage.reference() else { return Outcome::Skipped("no double-precision kernel".into()) };
+    let Some(k) = stage.reference() else { return no_double() };
     let Some([p, x, _]) = shared(stage, k, options) else { return no_rows::<f64>() };
     let info = stage.info();
     let [want, _] = forward(k, &info, &p, &x, options.rows);
@@ -244,7 +251,7 @@ pub fn single_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
 
 /// Gradients of the training kernel against the reference.
 pub fn single_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
-    let Some(k) = stage.reference() else { return Outcome::Skipped("no double-precision kernel".into()) };
+    let Some(k) = stage.reference() else { return no_double() };
     let Some([p, x, dy]) = shared(stage, k, options) else { return no_rows::<f64>() };
     let info = stage.info();
     let [g, dx] = gradients(k, &info, &p, &x, &dy, options.rows);

@@ -16,6 +16,7 @@ use conefield_core::runner::Runner;
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
+use conefield_core::spec::check;
 use conefield_core::spec::stage::read;
 use conefield_core::stage::Stage;
 use conefield_core::voxel::VoxelProjectorSpec;
@@ -82,26 +83,34 @@ impl With<'_> {
     }
 }
 
+impl With<'static> {
+    /// The defaults, without a device.
+    pub const ON_THE_HOST: Self = Self {
+        widths: &WIDTHS,
+        options: &|options| options,
+        device: &|| Err("no device is opened here; `conefield plugins check` opens one".into()),
+    };
+}
+
 /// Numbers of input channels at which normalizers and fields are checked by default.
 pub const WIDTHS: [usize; 4] = [1, 3, 8, 20];
 
 /// Checks every stage type that the crate `package` registers, with the settings of its registration, for the tests of
 /// a plugin.
 pub fn check_package(package: &str) -> Result<Vec<Report>> {
-    let device = || Err("this test opens none; `conefield plugins check` does".into());
-    let with = With { widths: &WIDTHS, options: &|options| options, device: &device };
     let mut reports = vec![];
     for t in stage_types() {
         if matches!(t.origin, Origin::Linked { package: own, .. } if own == package) {
-            reports.extend(check_type(t.kind, &t.example(), &with)?.into_iter().map(|(_, report)| report));
+            let found = check_type(t.kind, &t.example(), &With::ON_THE_HOST)?;
+            reports.extend(found.into_iter().map(|(_, report)| report));
         }
     }
     ensure(!reports.is_empty(), package, "stages", "none", "at least one registered stage type")?;
     Ok(reports)
 }
 
-/// Builds a stage of `kind` from `settings`, which include its type, and runs the checks of the kind. Gives each report
-/// with the number of input channels, where that is a choice.
+/// Builds a stage of `kind` from `settings`, which include its type and are checked as those in a spec are, and runs the
+/// checks of the kind. Gives each report with the number of input channels, where that is a choice.
 pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(Option<usize>, Report)>> {
     fn of<T: Settings + ?Sized>(settings: &Value) -> Result<Box<T>>
     where
@@ -109,6 +118,7 @@ pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(
     {
         read(settings.clone()).map_err(|e| Error::invalid("stage", "type", e, "a registered type with its settings"))
     }
+    check::settings(kind, settings, &format!("settings of {}", settings["type"].as_str().unwrap_or_default()))?;
     let one = |report| Ok(vec![(None, report)]);
     match kind {
         Kind::Encoder => {

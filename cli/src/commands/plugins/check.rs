@@ -6,7 +6,6 @@ use conefield::{parse, plugins};
 use conefield_backend_wgpu::Wgpu;
 use conefield_conformance::{Options, Outcome, Report, WIDTHS, With, check_type};
 use conefield_core::runner::Runner;
-use conefield_core::spec;
 use conefield_core::{Error, Result};
 use conefield_plugins::library::Type;
 use conefield_plugins::spec::with_defaults;
@@ -216,7 +215,6 @@ impl Check {
     fn stage(&self, t: &Type, settings: &Value, device: &Device, all: &mut Vec<StageReport>) -> Result<()> {
         let mut table = settings.clone();
         table["type"] = t.name.clone().into();
-        spec::check::settings(t.kind, &table, &format!("settings of {}", t.name))?;
         let with = With {
             widths: &self.widths(),
             options: &|options| Options { single: self.single, ..options },
