@@ -72,7 +72,7 @@ fn main() -> Result<()> {
         let update = Update { gradient, ahead, x, step: -0.1, momentum: 0.5, towards: None, inside: None };
         assert!(prox.update(update, 0.1, STEPS).is_none());
     });
-    let value = times(RUNS, || assert!(total_variation(volume.view(), [1.0; 3], None) > 0.0));
+    let value = times(RUNS, || assert!(total_variation(volume.view(), [1.0; 3], None, None) > 0.0));
     let scan = Scan { geometry, projections, unit: Unit::default(), provenance: serde_json::Value::Null };
     let fdk = solver(&scan, "type = \"fdk\"\n", RUNS)?;
     // What two passes more take, and what comes before the first.
