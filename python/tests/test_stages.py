@@ -107,7 +107,7 @@ def test_a_regularizer_passes_the_kit_and_a_wrong_one_does_not():
     "kind, name, settings",
     [
         ("encoder", "frequency", {"bands": 2}),
-        ("normalizer", "layer-norm", {}),
+        ("normalizer", "level-attention", {}),
         ("field", "mlp", {"width": 8}),
         ("projector", "ray-march", {"samples": 9}),
         ("initializer", "random", {}),
