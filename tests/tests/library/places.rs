@@ -287,6 +287,7 @@ fn updates_differ(
         if bounded {
             penalty.confine(Bounds { low: -0.1, high: 0.3 })?;
         }
+        penalty.limited([0.6, -0.8, 0.0]);
         Ok(penalty)
     };
     let run = |place: &Arc<dyn Place>, mut penalty: Box<dyn Penalty>| -> conefield_core::Result<Vec<Array3<f32>>> {
@@ -332,6 +333,8 @@ fn updates_in_a_place_are_those_of_the_host() {
         json!({"type": "none"}),
         json!({"type": "total-variation", "inner": 3}),
         json!({"type": "directional-total-variation", "edge": 0.5, "inner": 4}),
+        json!({"type": "total-variation", "inner": 3, "arc": 0.3}),
+        json!({"type": "directional-total-variation", "edge": 0.5, "inner": 4, "arc": 0.3}),
     ];
     for (name, place) in places("updates") {
         for prior in &priors {
