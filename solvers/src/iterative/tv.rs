@@ -450,6 +450,7 @@ impl<L: Lines> Sweep<'_, L> {
         let mut given = vec![0.0f32; reach * nz];
         let given_at = |i: usize, j: usize| (i * ny + j) % reach * nz;
         let (zeros, mut map) = (vec![0.0f32; nz], vec![0.0f32; nz]);
+        let (limited, mut line) = (scale.limited.is_some(), vec![0.0f32; nz]);
         for front in 0..count + self.steps {
             for j in 0..ny {
                 if front < count {
@@ -463,7 +464,7 @@ impl<L: Lines> Sweep<'_, L> {
                     if known {
                         let v = &given[given_at(i, j)..][..nz];
                         let fresh = &mut kept[at(i, j)..][..stride];
-                        primal(s, self.planes.beside(i, j, &zeros), v, scale, &mut fresh[..nz]);
+                        primal(s, self.beside(i, j, &zeros, limited.then_some(&mut line)), v, scale, &mut fresh[..nz]);
                         fresh[nz] = fresh[nz - 1];
                     }
                     if i > 0 && i <= count {
@@ -476,10 +477,34 @@ impl<L: Lines> Sweep<'_, L> {
                     }
                 }
                 let Some(i) = front.checked_sub(self.steps).filter(|i| self.own.contains(i)) else { continue };
-                primal(s, self.planes.beside(i, j, &zeros), &given[given_at(i, j)..][..nz], scale, &mut map);
+                primal(
+                    s,
+                    self.beside(i, j, &zeros, limited.then_some(&mut line)),
+                    &given[given_at(i, j)..][..nz],
+                    scale,
+                    &mut map,
+                );
                 self.lines.write((i - self.own.start) * plane + j * nz, &map);
             }
         }
+    }
+
+    /// The dual at and before line `j` of plane `i`. With `line`, of a limited arc, it has no components across the far
+    /// faces: there is no difference, but `A` puts a part of the others there.
+    #[inline(always)]
+    fn beside<'b>(&'b self, i: usize, j: usize, zeros: &'b [f32], line: Option<&'b mut Vec<f32>>) -> Beside<'b> {
+        let mut beside = self.planes.beside(i, j, zeros);
+        let Some(line) = line else { return beside };
+        if i + 1 == self.planes.0[0].len() && i + 1 == self.own.end {
+            beside.p[0] = zeros;
+        }
+        if (j + 1) * self.line == self.planes.0[0][i].len() {
+            beside.p[1] = zeros;
+        }
+        line.copy_from_slice(beside.p[2]);
+        line[self.line - 1] = 0.0;
+        beside.p[2] = line;
+        beside
     }
 
     /// Overwrites `v` with line `j` of plane `i` of the map's input.
@@ -829,7 +854,9 @@ mod tests {
             Array3::from_shape_fn(shape, |(x, y, z)| {
                 let at = [x, y, z];
                 let behind = |k: usize| if at[k] > 0 { dual[k][moved(at, k, -1)] } else { 0.0 };
-                let turn: f32 = (0..3).map(|k| (behind(k) - dual[k][at]) * g[k] * tau).sum();
+                // No difference across the far faces.
+                let here = |k: usize| if at[k] + 1 < shape[k] { dual[k][at] } else { 0.0 };
+                let turn: f32 = (0..3).map(|k| (behind(k) - here(k)) * g[k] * tau).sum();
                 bounds.clip(v[at] - turn)
             })
         };

@@ -1,8 +1,10 @@
 // v - τ ∇ᵀp within the bounds at voxel i; v is the gradient's buffer.
 fn primal_of(i: u32) -> f32 {
-    var d = -vec3<f32>(dual_x[i], dual_y[i], dual_z[i]);
     let plane = stencil.shape.y * stencil.shape.z;
     let at = place(i);
+    // No difference across the far faces.
+    let inner = at + vec3<u32>(1u) < stencil.shape;
+    var d = select(vec3<f32>(), -vec3<f32>(dual_x[i], dual_y[i], dual_z[i]), inner);
     if at.x > 0u {
         if i >= plane { d.x += dual_x[i - plane]; } else { d.x += before[i]; }
     }
