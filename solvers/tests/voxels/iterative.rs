@@ -345,7 +345,8 @@ fn every_projector_serves_and_the_unit_is_the_scan_s() {
     assert!(apart < 1e-7, "{apart}");
 }
 
-/// A factor along the middle of an arc acts on the axis there; without such an arc it is ignored.
+/// A factor along the middle of an arc acts on the axis there, as one for the axis, whose dual steps are larger; without
+/// such an arc it is ignored.
 #[test]
 fn differences_along_the_middle_of_an_arc_cost_less() {
     let scan = |degrees: f64| {
@@ -357,10 +358,13 @@ fn differences_along_the_middle_of_an_arc_cost_less() {
         let text = spec("fista", &format!("prior = {{ {prior} }}\nstop = {{ passes = 4 }}"));
         Case::of(&scan(degrees)).volume(&text).0.data
     };
-    for kind in ["total-variation", "directional-total-variation"] {
+    // Edges are found without the factor of an arc, and with those of axes.
+    for (kind, most) in [("total-variation", 0.1), ("directional-total-variation", 0.5)] {
         let of = |degrees, factor: &str| solved(degrees, &format!("type = \"{kind}\"{factor}"));
         let (arc, axes, plain) = (of(100.0, ", arc = 0.5"), of(100.0, ", weights = [0.5, 1, 1]"), of(100.0, ""));
-        assert!(arc == axes && arc != plain, "{kind}");
+        let [near, far] =
+            [&axes, &plain].map(|other| (&arc - other).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt());
+        assert!(near < most * far, "{kind}: {near} from the factor of the axis, {far} from none");
         assert!(of(200.0, ", arc = 0.5") == of(200.0, ""), "{kind}");
     }
 }
