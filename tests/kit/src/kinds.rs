@@ -63,20 +63,15 @@ impl With<'_> {
         if is_last { self.rows(report, stage, options) } else { report }
     }
 
-    /// The report of each width. With `some`, the stage may refuse all widths but one: a field may accept only the
-    /// channels of a point.
-    fn wide(
-        &self,
-        some: bool,
-        check: impl Fn(usize, &Options) -> Result<Report>,
-    ) -> Result<Vec<(Option<usize>, Report)>> {
+    /// The report of each width. The stage may refuse all but one: a field may accept only the channels of a point, a
+    /// normalizer only whole levels.
+    fn wide(&self, check: impl Fn(usize, &Options) -> Result<Report>) -> Result<Vec<(Option<usize>, Report)>> {
         let options = (self.options)(Options::features());
         let (mut found, mut refused) = (vec![], None);
         for width in self.widths {
             match check(*width, &options) {
                 Ok(report) => found.push((Some(*width), report)),
-                Err(e) if some => refused = Some(e),
-                Err(e) => return Err(e),
+                Err(e) => refused = Some(e),
             }
         }
         refused.filter(|_| found.is_empty()).map_or(Ok(found), Err)
@@ -127,7 +122,7 @@ pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(
         }
         Kind::Normalizer => {
             let spec = of::<dyn NormalizerSpec>(settings)?;
-            with.wide(false, |width, options| {
+            with.wide(|width, options| {
                 let stage = spec.build(width)?;
                 let report = check_normalizer(stage.as_ref(), options);
                 Ok(with.last(width, report, stage.as_ref(), options))
@@ -135,7 +130,7 @@ pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(
         }
         Kind::Field => {
             let spec = of::<dyn FieldSpec>(settings)?;
-            with.wide(true, |width, options| {
+            with.wide(|width, options| {
                 let stage = spec.build(width)?;
                 let report = check_field(stage.as_ref(), options);
                 Ok(with.last(width, report, stage.as_ref(), options))
