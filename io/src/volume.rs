@@ -253,6 +253,8 @@ impl Voxels for Layers<'_> {
         if z.start < self.first || self.first + self.held.dim().2 < z.end {
             self.first = z.start;
             let last = (z.start + self.many.max(z.len())).min(nz);
+            // The layers of before go first: both together would be all that may be at work.
+            self.held = Array3::zeros([0; 3]);
             self.held = Array3::zeros([nx, ny, last - z.start]);
             self.voxels.fill(&[0..nx, 0..ny, z.start..last], self.held.view_mut())?;
         }
