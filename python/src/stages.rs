@@ -80,7 +80,8 @@ pub fn register(py: Python<'_>, kind_name: &str, name: String, doc: String, clas
         let settings = move |settings: Value| Written { name: own, settings };
         let make = match kind {
             Kind::Encoder => Make::Encoder(Box::new(move |v| Ok(Box::new(settings(v))))),
-            _ => Make::Regularizer(Box::new(move |v| Ok(Box::new(settings(v))))),
+            Kind::Regularizer => Make::Regularizer(Box::new(move |v| Ok(Box::new(settings(v))))),
+            _ => return Err(exception(py, &Error::invalid("stage", "kind", kind_name, "encoder or regularizer"))),
         };
         // The settings are known only to the class, which may be replaced: any key is allowed here.
         let schema = json!({ "type": "object" });
