@@ -32,7 +32,8 @@ pub fn set_room(bytes: u64, trim: fn()) {
     let _ = TRIM.set(trim);
 }
 
-/// For loops that touch many pages in a short time: gives some back if the process holds too many.
+/// For loops through large arrays, once per part: gives pages back if the process holds too many. On a busy machine, the
+/// thread that also does so may come late.
 pub fn trim() {
     if let Some(trim) = TRIM.get() {
         trim();

@@ -3,6 +3,7 @@
 //! Hash tables are read at random addresses. On pages of 4 KiB most reads miss the translation lookaside buffer (TLB),
 //! and a step takes about twice as long.
 
+use crate::allowance;
 use bytemuck::Pod;
 use memmap2::MmapMut;
 use rayon::prelude::*;
@@ -18,7 +19,10 @@ const PART: usize = 1 << 18;
 /// Copies `from` to `to`, of the same length, on all threads.
 pub fn copy<T: Pod + Send + Sync>(to: &mut [T], from: &[T]) {
     debug_assert_eq!(to.len(), from.len());
-    to.par_chunks_mut(PART).zip(from.par_chunks(PART)).for_each(|(to, from)| to.copy_from_slice(from));
+    to.par_chunks_mut(PART).zip(from.par_chunks(PART)).for_each(|(to, from)| {
+        to.copy_from_slice(from);
+        allowance::trim();
+    });
 }
 
 /// A slice of numbers of fixed length, initially zero.

@@ -1,5 +1,6 @@
 //! Elementwise maps and reductions: each with one text in Rust and one in WGSL.
 
+use crate::allowance;
 use ndarray::{Array3, CowArray, Ix3};
 use rayon::prelude::*;
 
@@ -101,6 +102,7 @@ impl Map {
             let part = n * PART..n * PART + out.len();
             let input = |i: usize| inputs.get(i).map_or(&[][..], |x| &x[part.clone()]);
             (self.host)(factors, out, [input(0), input(1)]);
+            allowance::trim();
         });
     }
 }
@@ -140,7 +142,7 @@ impl Reduction {
             Self::Differences => {
                 let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
                 let part = |(x, y): (&[f32], &[f32])| x.iter().zip(y).map(square).sum::<f64>();
-                ordered(x.par_chunks(SUMMED).zip(y.par_chunks(SUMMED)).map(part).collect())
+                ordered(x.par_chunks(SUMMED).zip(y.par_chunks(SUMMED)).map(part))
             }
             Self::Maximum => f64::from(x.iter().fold(0.0f32, |m, &v| m.max(v))),
             Self::Nonzero => x.iter().filter(|x| **x != 0.0).count() as f64,
@@ -151,9 +153,10 @@ impl Reduction {
 /// `Σ x²`, independent of the number of threads.
 pub fn squares(x: &[f32]) -> f64 {
     let part = |part: &[f32]| part.iter().map(|&v| f64::from(v) * f64::from(v)).sum::<f64>();
-    ordered(x.par_chunks(SUMMED).map(part).collect())
+    ordered(x.par_chunks(SUMMED).map(part))
 }
 
-fn ordered(parts: Vec<f64>) -> f64 {
+fn ordered(parts: impl IndexedParallelIterator<Item = f64>) -> f64 {
+    let parts: Vec<f64> = parts.inspect(|_| allowance::trim()).collect();
     parts.iter().sum()
 }

@@ -1,6 +1,7 @@
 //! A penalty of coefficients, as a place works with it: its proximal map, and the update around that.
 
 use super::{Array, StatePart};
+use crate::allowance;
 use crate::error::{Error, Result};
 use crate::geometry::Vec3;
 use crate::wgsl::Fragment;
@@ -232,6 +233,7 @@ impl<'a> Update<'a> {
             let v = &mut v[..part.x.len()];
             part.read(0, v);
             part.gradient.copy_from_slice(v);
+            allowance::trim();
         });
     }
 
@@ -242,6 +244,7 @@ impl<'a> Update<'a> {
             let u = &mut u[..part.x.len()];
             u.copy_from_slice(part.ahead);
             part.write(0, u);
+            allowance::trim();
         });
     }
 

@@ -8,6 +8,7 @@
 use super::layout::{ColumnMajor, Pinhole};
 use super::readers::{Among, Ends, PAD, Path, Stands, places, read};
 use super::upright::{Blend, Upright};
+use conefield_core::allowance;
 use conefield_core::geometry::Geometry;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, WIDEST, run};
 use conefield_core::voxel::VoxelView;
@@ -45,6 +46,7 @@ pub fn backproject<R: Real>(
     }
     tiles.into_par_iter().for_each(|(first, lines)| {
         run(Tile { detector: geometry.detector, pixels, zeros: &zeros, views: &all, shape, first, lines });
+        allowance::trim();
     });
 }
 

@@ -8,6 +8,7 @@
 //! [`Limited`] arcs put `A = I − (1 − f)·m·mᵀ` in front, with the same direction m for all voxels: `Σ_j |A·D_j·∇x_j|`.
 
 use super::edges::Edges;
+use conefield_core::allowance;
 use conefield_core::error::Result;
 use conefield_core::geometry::{Vec3, VoxelGrid};
 use conefield_core::place::{ADD, Array, Place, VariationSlope};
@@ -452,6 +453,7 @@ impl<L: Lines> Sweep<'_, L> {
         let (zeros, mut map) = (vec![0.0f32; nz], vec![0.0f32; nz]);
         let (limited, mut line) = (scale.limited.is_some(), vec![0.0f32; nz]);
         for front in 0..count + self.steps {
+            allowance::trim();
             for j in 0..ny {
                 if front < count {
                     self.give(front, j, &mut given[given_at(front, j)..][..nz]);
