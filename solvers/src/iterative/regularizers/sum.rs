@@ -71,7 +71,7 @@ impl Regularizer for Built {
         let part = |(i, regularizer): (usize, &dyn Regularizer)| {
             let mut penalty = regularizer.on(grid, &host).map_err(|e| e.within(&format!("priors.{i}")))?;
             let names = penalty.state().iter().map(|(name, _)| format!("{i}.{name}")).collect();
-            Ok(Part { penalty, share, dual: host.on_host(count), dual_name: format!("{i}.dual"), names })
+            Ok(Part { penalty, share, dual: host.on_host(count), dual_name: format!("dual.{i}"), names })
         };
         let parts = self.parts.iter().map(AsRef::as_ref).enumerate().map(part).collect::<Result<_>>()?;
         let work = host.on_host(count);
@@ -102,7 +102,7 @@ struct Part {
     share: f64,
     /// What it takes away, `y_i`; 0 outside the support.
     dual: Vec<f32>,
-    /// Names for checkpoints.
+    /// Names for checkpoints. Those of the prior's own state begin with its number, whatever it calls them.
     dual_name: String,
     names: Vec<String>,
 }
@@ -175,5 +175,54 @@ impl Penalty for On {
 
     fn fault(&self) -> Result<()> {
         self.parts.iter().try_for_each(|part| part.penalty.fault())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_core::Result;
+    use conefield_core::scan::ScanHeader;
+    use std::collections::BTreeSet;
+
+    /// A prior from elsewhere, whose state has the name that a sum could use itself.
+    struct Foreign(Vec<f32>);
+
+    impl Regularizer for Foreign {
+        fn on(&self, _: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
+            Ok(Box::new(Self(vec![0.0; 3])))
+        }
+
+        fn weight(&self, _: &VoxelGrid, _: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
+            Ok(1.0)
+        }
+
+        fn describe(&self) -> String {
+            "foreign".into()
+        }
+    }
+
+    impl Penalty for Foreign {
+        fn value(&self, _: ArrayView3<'_, f32>) -> f64 {
+            0.0
+        }
+
+        fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
+            u.copy_from_slice(v);
+        }
+
+        fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
+            vec![("dual", StatePart::Host(&mut self.0))]
+        }
+    }
+
+    #[test]
+    fn the_state_has_a_name_for_each_part() {
+        let part = || Box::new(Foreign(vec![])) as Box<dyn Regularizer>;
+        let grid = VoxelGrid { shape: [2; 3], spacing: [1.0; 3], center: [0.0; 3] };
+        let header = ScanHeader { views: 2, detector: [2; 2], volume: [2; 3] };
+        let mut sum = Built { parts: vec![part(), part()], turns: 1 }.on(&grid, &Space::tally(header)).unwrap();
+        let names: BTreeSet<&str> = sum.state().into_iter().map(|(name, _)| name).collect();
+        assert_eq!(names, BTreeSet::from(["0.dual", "1.dual", "dual.0", "dual.1"]));
     }
 }
