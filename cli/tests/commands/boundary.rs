@@ -407,7 +407,8 @@ fn the_log_has_times_and_hears_its_variable() {
 fn what_a_killed_comparison_had_started_is_waited_for() {
     let (dir, scan) = with_scan();
     let all = dir.path().join("all");
-    // Steps of about a second, so that the run outlives its comparison.
+    // Steps of about a second: the run, which ends with the step when its comparison is gone, outlives it. It has a checkpoint,
+    // without which it would take its folder away.
     let sets = ["--set", "training.rays=5000", "--set", "projector.samples=800", "--steps", "3"];
     let begin = ["compare", &scan, "--specs", "fast", "-o", &text(&all), "--checkpoint-every", "0.05s"];
     let args = [&begin[..], &sets].concat();
@@ -417,7 +418,7 @@ fn what_a_killed_comparison_had_started_is_waited_for() {
         .stderr(Stdio::null())
         .spawn()
         .unwrap();
-    wait_for(&all.join("fast/spec.toml"));
+    wait_for(&all.join("fast/checkpoint.safetensors"));
     kill(&child, "KILL");
     child.wait().unwrap();
     let folder = fs::File::open(all.join("fast")).unwrap();
