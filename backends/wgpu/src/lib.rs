@@ -25,8 +25,6 @@ pub mod profile;
 pub mod single;
 pub mod source;
 mod staging;
-#[cfg(feature = "translations")]
-mod translations;
 pub mod wave;
 
 use compose::{Chain, Target};

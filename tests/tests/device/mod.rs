@@ -1,7 +1,9 @@
 //! The device on which tests run kernels: a software one does. `CONEFIELD_ADAPTER=N` asks for adapter N of `conefield backends`;
 //! tests then fail where it cannot be opened. Without it they take the best adapter, and skip where there is none.
 
-use conefield_backend_wgpu::{Limits, Shared, Wgpu};
+mod translations;
+
+use conefield_backend_wgpu::{Limits, Shared, Wgpu, source};
 use std::sync::{Arc, OnceLock};
 
 /// The adapter that was asked for.
@@ -12,6 +14,7 @@ fn asked() -> Option<usize> {
 
 fn open(limits: Limits) -> Option<Wgpu> {
     let index = asked();
+    let _ = source::FURTHER.set(translations::check);
     match Wgpu::with_limits(index, limits) {
         Ok(opened) => Some(opened),
         Err(e) if index.is_some() => panic!("CONEFIELD_ADAPTER: {e}"),

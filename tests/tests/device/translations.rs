@@ -1,12 +1,20 @@
 //! Translates kernels to HLSL (for DX12) and to Metal's language, to find constructs that these lack. No driver of those
 //! systems compiles the result here.
 
-use wgpu::naga::back::{hlsl, msl};
-use wgpu::naga::valid::ModuleInfo;
-use wgpu::naga::{Module, Scalar, TypeInner};
+use naga::back::{hlsl, msl};
+use naga::valid::ModuleInfo;
+use naga::{Module, Scalar, TypeInner};
+
+/// Refuses a module that a language cannot say.
+pub fn check(module: &Module, info: &ModuleInfo) -> Result<(), String> {
+    all(module, info).into_iter().try_for_each(|(language, text)| match text {
+        Ok(_) => Ok(()),
+        Err(why) => Err(format!("{language}: {why}")),
+    })
+}
 
 /// The module in each language that its devices could be asked for, or why not.
-pub fn all(module: &Module, info: &ModuleInfo) -> Vec<(&'static str, Result<String, String>)> {
+fn all(module: &Module, info: &ModuleInfo) -> Vec<(&'static str, Result<String, String>)> {
     // DX12 has no atomic sums of f32, and never reports them.
     let sums = module.types.iter().any(|(_, t)| t.inner == TypeInner::Atomic(Scalar::F32));
     let hlsl = (!sums).then(|| ("HLSL", hlsl(module, info)));
@@ -29,8 +37,8 @@ fn metal(module: &Module, info: &ModuleInfo) -> Result<String, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use wgpu::naga::front::wgsl::parse_str;
-    use wgpu::naga::valid::{Capabilities, ValidationFlags, Validator};
+    use naga::front::wgsl::parse_str;
+    use naga::valid::{Capabilities, ValidationFlags, Validator};
 
     fn translated(text: &str) -> Vec<(&'static str, Result<String, String>)> {
         let module = parse_str(text).unwrap();
