@@ -7,7 +7,7 @@ use conefield_core::method::{Context, Job, Limits, Silent};
 use conefield_core::prelude::*;
 use conefield_projectors::simulate::{Protocol, phantom, simulate};
 
-stage_type!(Encoder, "waves", Waves, "waves of learned directions");
+stage_type!(EncoderSpec, "waves", Waves, "waves of learned directions");
 
 /// `y = sin(d·x + p)` with directions `d` and phases `p` that are learned.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -25,7 +25,6 @@ impl Default for Waves {
     }
 }
 
-#[typetag::serde(name = "waves")]
 impl EncoderSpec for Waves {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         ensure((1..=4096).contains(&self.waves), "spec", "waves", self.waves, "1 to 4096")?;

@@ -7,8 +7,8 @@ use conefield_backend_cpu::Cpu;
 use conefield_benches::{rays, spread};
 use conefield_core::backend::{Adam, Backend, Executable, TrainRay, Work};
 use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::registry::read;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
-use conefield_core::spec::stage;
 use conefield_core::stage::Encoder;
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
@@ -28,7 +28,7 @@ const WARM_UP: u64 = 10;
 
 fn main() -> Result<(), Box<dyn Error>> {
     Plugins::default().load(library()?, Place::Named)?;
-    let loaded = stage::read::<dyn EncoderSpec>(serde_json::json!({ "type": "rehashed" }))?;
+    let loaded = read::<dyn EncoderSpec>(serde_json::json!({ "type": "rehashed" }))?;
     let rays = rays(RAYS);
     let mut built_in = Runner::new(HashGrid::default().build()?)?;
     let mut plugin = Runner::new(loaded.build()?)?;

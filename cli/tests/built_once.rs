@@ -15,32 +15,37 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 static BUILT: [AtomicUsize; 3] = [const { AtomicUsize::new(0) }; 3];
 
 /// Settings of stages that count how often they are built.
-#[derive(Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-struct Counted {}
+macro_rules! counted {
+    ($($own:ident $spec:ident;)*) => {$(
+        #[derive(Serialize, Deserialize, JsonSchema)]
+        #[serde(deny_unknown_fields)]
+        struct $own {}
 
-conefield_core::stage_type!(Encoder, "counted", Counted, "for tests");
-conefield_core::stage_type!(Field, "counted", Counted, "for tests");
-conefield_core::stage_type!(Projector, "counted", Counted, "for tests");
+        conefield_core::stage_type!($spec, "counted", $own, "for tests");
+    )*};
+}
 
-#[typetag::serde(name = "counted")]
-impl EncoderSpec for Counted {
+counted! {
+    CountedEncoder EncoderSpec;
+    CountedField FieldSpec;
+    CountedProjector ProjectorSpec;
+}
+
+impl EncoderSpec for CountedEncoder {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         BUILT[0].fetch_add(1, Ordering::Relaxed);
         DenseGrid { levels: 2, base_resolution: 4, ..DenseGrid::default() }.build()
     }
 }
 
-#[typetag::serde(name = "counted")]
-impl FieldSpec for Counted {
+impl FieldSpec for CountedField {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {
         BUILT[1].fetch_add(1, Ordering::Relaxed);
         Mlp { width: 8, depth: 2, skips: vec![], ..Mlp::default() }.build(width)
     }
 }
 
-#[typetag::serde(name = "counted")]
-impl ProjectorSpec for Counted {
+impl ProjectorSpec for CountedProjector {
     fn build(&self) -> Result<Box<dyn Projector>> {
         BUILT[2].fetch_add(1, Ordering::Relaxed);
         RayMarch { samples: Some(16), ..RayMarch::default() }.build()

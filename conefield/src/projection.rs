@@ -3,9 +3,9 @@
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::registry::read;
 use conefield_core::registry::{Kind, names};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::spec::stage;
 use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
 use conefield_evaluation::metrics::rmse;
 use ndarray::{Array3, Axis, Zip};
@@ -25,8 +25,8 @@ pub fn projector(value: Value) -> Result<Box<dyn VoxelProjector>> {
     let name = value.as_str().or(value["type"].as_str());
     let known = name.is_some_and(|n| names(Kind::VoxelProjector).contains(&n));
     ensure(known, "projection", "projector", &found, expected())?;
-    let spec: Box<dyn VoxelProjectorSpec> = stage::read(value)
-        .map_err(|e| Error::invalid("projection", "projector", format!("{found}: {e}"), expected()))?;
+    let spec: Box<dyn VoxelProjectorSpec> =
+        read(value).map_err(|e| Error::invalid("projection", "projector", format!("{found}: {e}"), expected()))?;
     spec.build()
 }
 

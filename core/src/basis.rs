@@ -2,15 +2,17 @@
 
 use crate::error::Result;
 use crate::geometry::VoxelGrid;
+use crate::registry::Registered;
 use crate::simd::Real;
 use ndarray::{ArrayView3, ArrayViewMut3};
 
 /// Settings of a basis.
-#[typetag::serde(tag = "type")]
-pub trait BasisSpec: Send + Sync {
+pub trait BasisSpec: Registered + Send + Sync {
     /// Builds the basis; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn Basis>>;
 }
+
+crate::settings_of!(Basis, BasisSpec);
 
 /// A basis of volumes on any grid of voxels.
 pub trait Basis: Send + Sync {

@@ -1,16 +1,18 @@
 //! Data terms: distance between computed and measured line integrals.
 
 use crate::error::Result;
+use crate::registry::Registered;
 use crate::scan::ScanHeader;
 use crate::wgsl::Fragment;
 use ndarray::ArrayView3;
 
 /// Settings of a data term.
-#[typetag::serde(tag = "type")]
-pub trait DataTermSpec: Send + Sync {
+pub trait DataTermSpec: Registered + Send + Sync {
     /// Builds the data term; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn DataTerm>>;
 }
+
+crate::settings_of!(DataTerm, DataTermSpec);
 
 /// A convex function of the residuals `r = p − A·x`, pixel by pixel, for any scan.
 pub trait DataTerm: Send + Sync {

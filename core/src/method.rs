@@ -9,6 +9,7 @@ use crate::geometry::VoxelGrid;
 use crate::input_file::InputFile;
 use crate::parts::{Part, Voxels};
 use crate::pipeline::{Model, Pipeline};
+use crate::registry::Registered;
 use crate::scan::{Scan, ScanHeader, Volume};
 use crate::stage::{GradKind, Stage};
 use crate::trained::{Placement, TrainedField};
@@ -270,8 +271,7 @@ impl<'a> Context<'a> {
 }
 
 /// The settings of a method and of the stages it owns, as given by a spec.
-#[typetag::serde(tag = "type")]
-pub trait Method: Send + Sync {
+pub trait Method: Registered + Send + Sync {
     /// Checks the settings, builds and compiles every stage, and reads the weights named in the settings, each once.
     fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>>;
 
@@ -281,6 +281,8 @@ pub trait Method: Send + Sync {
         None
     }
 }
+
+crate::settings_of!(Method, Method);
 
 /// A file that a run starts from.
 #[derive(Debug, Clone, PartialEq)]

@@ -1,116 +1,149 @@
 //! The stage types that a spec may name.
 //!
-//! Built-in types register with [`stage_type!`](crate::stage_type) beside their `typetag` implementation; types of
-//! libraries loaded at run time are registered by [`add`]. Editor schemas and the lists in error messages use this
+//! Linked types register with [`stage_type!`](crate::stage_type), those of libraries loaded at run time with [`add`]. Editor schemas and the lists in error messages use this
 //! registry.
 
-use crate::basis::BasisSpec;
-use crate::data_term::DataTermSpec;
 use crate::error::{Error, Result};
-use crate::regularizer::RegularizerSpec;
-use crate::settings::{EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec};
-use crate::voxel::VoxelProjectorSpec;
 use schemars::Schema;
-use serde_json::Value;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::{Value, json};
+use std::any::Any;
 use std::fmt;
 use std::sync::{PoisonError, RwLock};
 
-/// Defines the kinds: name in a spec, settings trait and description.
+/// Defines the kinds: name in a spec and description.
 macro_rules! kinds {
-    (
-        linked { $($(#[$linked_doc:meta])* $linked:ident $linked_name:literal,)* }
-        loadable { $($(#[$doc:meta])* $kind:ident $name:literal $spec:ident,)* }
-    ) => {
+    ($($(#[$doc:meta])* $kind:ident $name:literal,)*) => {
         /// Kinds of types in a spec: methods, and the stages that they consist of.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
         #[serde(rename_all = "kebab-case")]
         pub enum Kind {
-            $($(#[$linked_doc])* $linked,)*
             $($(#[$doc])* $kind,)*
         }
 
         impl Kind {
             /// Every kind: methods, then their stages in order.
-            pub const ALL: &'static [Self] = &[$(Self::$linked,)* $(Self::$kind,)*];
+            pub const ALL: &'static [Self] = &[$(Self::$kind,)*];
 
             /// Its name in a spec.
             pub fn name(self) -> &'static str {
                 match self {
-                    $(Self::$linked => $linked_name,)*
                     $(Self::$kind => $name,)*
                 }
             }
         }
+    };
+}
 
-        /// The [`MakeFn`] of each kind that a library can provide.
-        pub enum Make {
-            $($(#[$doc])* $kind(MakeFn<dyn $spec>),)*
+/// Makes a trait of settings that of a kind of stage: boxes of it are read from and written to specs.
+#[macro_export]
+macro_rules! settings_of {
+    ($kind:ident, $spec:ident) => {
+        impl $crate::registry::Settings for dyn $spec {
+            const KIND: $crate::registry::Kind = $crate::registry::Kind::$kind;
         }
 
-        impl Make {
-            fn kind(&self) -> Kind {
-                match self {
-                    $(Self::$kind(_) => Kind::$kind,)*
-                }
+        impl $crate::registry::serde::Serialize for dyn $spec {
+            fn serialize<S: $crate::registry::serde::Serializer>(
+                &self,
+                to: S,
+            ) -> ::std::result::Result<S::Ok, S::Error> {
+                $crate::registry::write(self, to)
             }
         }
 
-        $(impl Settings for dyn $spec {
-            const KIND: Kind = Kind::$kind;
-
-            fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
-                match make {
-                    Make::$kind(make) => Some(make),
-                    _ => None,
-                }
+        impl<'de> $crate::registry::serde::Deserialize<'de> for Box<dyn $spec> {
+            fn deserialize<D: $crate::registry::serde::Deserializer<'de>>(
+                from: D,
+            ) -> ::std::result::Result<Self, D::Error> {
+                $crate::registry::deserialize(from)
             }
-        })*
+        }
     };
 }
 
 kinds! {
-    linked {
-        /// Scan to volume.
-        Method "method",
-        /// Observes training and acts on it.
-        Callback "callback",
-    }
-    loadable {
-        /// Points to features.
-        Encoder "encoder" EncoderSpec,
-        /// Features to features.
-        Normalizer "normalizer" NormalizerSpec,
-        /// Features to attenuation.
-        Field "field" FieldSpec,
-        /// Rays to samples of a field.
-        Projector "projector" ProjectorSpec,
-        /// Source of weights.
-        Initializer "initializer" InitializerSpec,
-        /// Predicted against measured values.
-        Loss "loss" LossSpec,
-        /// A penalty on a field, independent of the measurements.
-        Prior "prior" PriorSpec,
-        /// Line integrals of voxels, for iterative methods.
-        VoxelProjector "voxel-projector" VoxelProjectorSpec,
-        /// Coefficients to voxels, for iterative methods.
-        Basis "basis" BasisSpec,
-        /// Distance between computed and measured line integrals, for iterative methods.
-        DataTerm "data-term" DataTermSpec,
-        /// Penalty of coefficients with its proximal map, for iterative methods.
-        Regularizer "regularizer" RegularizerSpec,
-    }
+    /// Scan to volume.
+    Method "method",
+    /// Observes training and acts on it.
+    Callback "callback",
+    /// Points to features.
+    Encoder "encoder",
+    /// Features to features.
+    Normalizer "normalizer",
+    /// Features to attenuation.
+    Field "field",
+    /// Rays to samples of a field.
+    Projector "projector",
+    /// Source of weights.
+    Initializer "initializer",
+    /// Predicted against measured values.
+    Loss "loss",
+    /// A penalty on a field, independent of the measurements.
+    Prior "prior",
+    /// Line integrals of voxels, for iterative methods.
+    VoxelProjector "voxel-projector",
+    /// Coefficients to voxels, for iterative methods.
+    Basis "basis",
+    /// Distance between computed and measured line integrals, for iterative methods.
+    DataTerm "data-term",
+    /// Penalty of coefficients with its proximal map, for iterative methods.
+    Regularizer "regularizer",
+}
+
+/// A settings type that is registered by [`stage_type!`](crate::stage_type).
+pub trait Registered {
+    /// The value of `type` in specs.
+    fn type_name(&self) -> &'static str;
+
+    /// The other keys of its table.
+    fn keys(&self) -> serde_json::Result<Value>;
 }
 
 /// The settings of one kind of stage.
-pub trait Settings {
+pub trait Settings: Registered {
     /// The kind.
     const KIND: Kind;
+}
 
-    /// The constructor of a library's type of this kind; `None` for kinds that libraries cannot provide.
-    fn made_by(make: &Make) -> Option<&MakeFn<Self>> {
-        let _ = make;
-        None
+/// Writes the table of a stage.
+pub fn write<S: Serializer>(settings: &dyn Registered, to: S) -> Result<S::Ok, S::Error> {
+    let mut table = settings.keys().map_err(serde::ser::Error::custom)?;
+    if let Some(table) = table.as_object_mut() {
+        table.insert("type".into(), settings.type_name().into());
     }
+    table.serialize(to)
+}
+
+/// Reads settings from a table with a `type`, or from the name of a type.
+pub fn read<T: Settings + ?Sized + 'static>(mut value: Value) -> Result<Box<T>, String> {
+    if value.is_string() {
+        value = json!({ "type": value });
+    }
+    if !value.is_object() {
+        return Err(format!("found {value}, expected a table or the name of a type ({})", T::KIND));
+    }
+    let name = value.as_object_mut().and_then(|table| table.remove("type")).ok_or("missing field `type`")?;
+    let found = name.as_str().and_then(|name| find(T::KIND, name));
+    let settings = found.and_then(|t| match &t.origin {
+        Origin::Linked { make, .. } => make().call(value),
+        Origin::Loaded { make, .. } => make.call(value),
+    });
+    settings.unwrap_or_else(|| Err(format!("found type {name}, expected {}", names(T::KIND).join(", "))))
+}
+
+/// Reads settings for `serde`.
+pub fn deserialize<'de, T: Settings + ?Sized + 'static, D: Deserializer<'de>>(from: D) -> Result<Box<T>, D::Error> {
+    read(Value::deserialize(from)?).map_err(serde::de::Error::custom)
+}
+
+/// Reads settings from the keys of a table except `type`. The error begins with the path to the key.
+pub fn keys<T: DeserializeOwned>(keys: Value) -> Result<T, String> {
+    serde_path_to_error::deserialize(keys).map_err(|e| match e.path().to_string().as_str() {
+        "." => e.inner().to_string(),
+        path => format!("{path}: {}", e.inner()),
+    })
 }
 
 impl Kind {
@@ -145,7 +178,7 @@ pub struct StageType {
 
 /// Origin of a stage type.
 pub enum Origin {
-    /// Linked into the program; known to `typetag`.
+    /// Linked into the program.
     Linked {
         /// The package that defines it.
         package: &'static str,
@@ -153,6 +186,8 @@ pub enum Origin {
         schema: fn() -> Schema,
         /// Example settings in JSON, without `type`, for tests.
         example: &'static str,
+        /// Builds its settings.
+        make: fn() -> Make,
     },
     /// From a library loaded at run time.
     Loaded {
@@ -165,8 +200,26 @@ pub enum Origin {
     },
 }
 
-/// Builds a stage's settings from the keys of a spec except `type`.
-pub type MakeFn<T> = Box<dyn Fn(Value) -> Result<Box<T>> + Send + Sync>;
+/// Builds a stage's settings from the keys of its table except `type`, or says what is wrong with them.
+pub type MakeFn<T> = Box<dyn Fn(Value) -> Result<Box<T>, String> + Send + Sync>;
+
+/// The [`MakeFn`] of one kind.
+pub struct Make {
+    kind: Kind,
+    make: Box<dyn Any + Send + Sync>,
+}
+
+impl Make {
+    /// That of the kind whose settings are `T`.
+    pub fn new<T: Settings + ?Sized + 'static>(make: MakeFn<T>) -> Self {
+        Self { kind: T::KIND, make: Box::new(make) }
+    }
+
+    /// Builds settings; `None` for those of another kind.
+    pub fn call<T: Settings + ?Sized + 'static>(&self, keys: Value) -> Option<Result<Box<T>, String>> {
+        self.make.downcast_ref::<MakeFn<T>>().map(|make| make(keys))
+    }
+}
 
 impl StageType {
     /// JSON Schema of its settings, without `type`.
@@ -225,10 +278,10 @@ pub fn add(owner: &str, types: Vec<NewType>) -> Result<()> {
     let mut loaded = LOADED.write().unwrap_or_else(PoisonError::into_inner);
     let mut fresh: Vec<&NewType> = vec![];
     for t in &types {
-        let kind = t.make.kind();
+        let kind = t.make.kind;
         let taken = inventory::iter::<StageType>.into_iter().chain(loaded.iter().copied());
         let taken = taken.filter(|s| s.kind == kind && s.name == t.name).map(StageType::owner).next();
-        let twin = fresh.iter().any(|s| s.make.kind() == kind && s.name == t.name).then(|| owner.to_string());
+        let twin = fresh.iter().any(|s| s.make.kind == kind && s.name == t.name).then(|| owner.to_string());
         if let Some(other) = taken.or(twin) {
             let found = format!("a name that {other} has");
             return Err(Error::invalid(owner, format!("{kind} type {:?}", t.name), found, "a unique name"));
@@ -255,7 +308,7 @@ impl NewType {
     fn owned_by(self, owner: &str) -> StageType {
         let Self { name, doc, schema, make } = self;
         StageType {
-            kind: make.kind(),
+            kind: make.kind,
             name: name.leak(),
             doc: doc.leak(),
             origin: Origin::Loaded { owner: owner.into(), schema, make },
@@ -267,24 +320,43 @@ impl NewType {
 pub use inventory;
 #[doc(hidden)]
 pub use schemars;
+#[doc(hidden)]
+pub use serde;
+#[doc(hidden)]
+pub use serde_json;
 
-/// Registers a settings type under its name in specs. The type implements `JsonSchema`. If there are no default
+/// Registers a settings type, which implements the given trait of settings, under its name in specs. The type implements `JsonSchema`. If there are no default
 /// settings, or they make a large stage, `example = "{ … }"` gives settings in JSON for the conformance kit.
 #[macro_export]
 macro_rules! stage_type {
-    ($kind:ident, $name:literal, $settings:ty, $doc:literal $(,)?) => {
-        $crate::stage_type!($kind, $name, $settings, $doc, example = "{}");
+    ($spec:ident, $name:literal, $settings:ty, $doc:literal $(,)?) => {
+        $crate::stage_type!($spec, $name, $settings, $doc, example = "{}");
     };
-    ($kind:ident, $name:literal, $settings:ty, $doc:literal, example = $example:literal $(,)?) => {
+    ($spec:ident, $name:literal, $settings:ty, $doc:literal, example = $example:literal $(,)?) => {
+        impl $crate::registry::Registered for $settings {
+            fn type_name(&self) -> &'static str {
+                $name
+            }
+
+            fn keys(&self) -> $crate::registry::serde_json::Result<$crate::registry::serde_json::Value> {
+                $crate::registry::serde_json::to_value(self)
+            }
+        }
+
         $crate::registry::inventory::submit! {
             $crate::registry::StageType {
-                kind: $crate::registry::Kind::$kind,
+                kind: <dyn $spec as $crate::registry::Settings>::KIND,
                 name: $name,
                 doc: $doc,
                 origin: $crate::registry::Origin::Linked {
                     package: env!("CARGO_PKG_NAME"),
                     schema: || $crate::registry::schemars::schema_for!($settings),
                     example: $example,
+                    make: || {
+                        $crate::registry::Make::new::<dyn $spec>(Box::new(|keys| {
+                            Ok(Box::new($crate::registry::keys::<$settings>(keys)?))
+                        }))
+                    },
                 },
             }
         }
@@ -294,11 +366,12 @@ macro_rules! stage_type {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::settings::ProjectorSpec;
 
     fn new(name: &str) -> NewType {
-        let make: MakeFn<dyn ProjectorSpec> = Box::new(|_| Err(Error::unsupported("a test", "it makes nothing")));
+        let make: MakeFn<dyn ProjectorSpec> = Box::new(|_| Err("it makes nothing".into()));
         let schema = serde_json::json!({});
-        NewType { name: name.into(), doc: "for tests".into(), schema, make: Make::Projector(make) }
+        NewType { name: name.into(), doc: "for tests".into(), schema, make: Make::new(make) }
     }
 
     #[test]

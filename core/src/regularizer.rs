@@ -3,20 +3,22 @@
 use crate::error::{Result, ensure};
 use crate::geometry::VoxelGrid;
 pub use crate::place::{Bounds, Dual, Guide, Kernels, Penalty, Update};
+use crate::registry::Registered;
 use crate::space::Space;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::{Display, Formatter};
 
 /// Settings of a regularizer.
-#[typetag::serde(tag = "type")]
-pub trait RegularizerSpec: Send + Sync {
+pub trait RegularizerSpec: Registered + Send + Sync {
     /// Builds the regularizer.
     ///
     /// # Errors
     /// Invalid settings.
     fn build(&self) -> Result<Box<dyn Regularizer>>;
 }
+
+crate::settings_of!(Regularizer, RegularizerSpec);
 
 /// Strength of a regularizer.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]

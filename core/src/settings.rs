@@ -5,56 +5,64 @@ use crate::arena::{Arena, InitReport, Layout, Weights};
 use crate::error::Result;
 use crate::loss::Loss;
 use crate::prior::Prior;
+use crate::registry::Registered;
 use crate::stage::{Encoder, Field, Normalizer, Projector};
 
 /// Settings of an encoder.
-#[typetag::serde(tag = "type")]
-pub trait EncoderSpec: Send + Sync {
+pub trait EncoderSpec: Registered + Send + Sync {
     /// Builds the stage; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn Encoder>>;
 }
 
+crate::settings_of!(Encoder, EncoderSpec);
+
 /// Settings of a normalizer.
-#[typetag::serde(tag = "type")]
-pub trait NormalizerSpec: Send + Sync {
+pub trait NormalizerSpec: Registered + Send + Sync {
     /// The stage for features of `width` channels.
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>>;
 }
 
+crate::settings_of!(Normalizer, NormalizerSpec);
+
 /// Settings of a field.
-#[typetag::serde(tag = "type")]
-pub trait FieldSpec: Send + Sync {
+pub trait FieldSpec: Registered + Send + Sync {
     /// The stage for features of `width` channels.
     fn build(&self, width: usize) -> Result<Box<dyn Field>>;
 }
 
+crate::settings_of!(Field, FieldSpec);
+
 /// Settings of a projector that samples rays for a field.
-#[typetag::serde(tag = "type")]
-pub trait ProjectorSpec: Send + Sync {
+pub trait ProjectorSpec: Registered + Send + Sync {
     /// The stage.
     fn build(&self) -> Result<Box<dyn Projector>>;
 }
 
+crate::settings_of!(Projector, ProjectorSpec);
+
 /// Settings of an initializer.
-#[typetag::serde(tag = "type")]
-pub trait InitializerSpec: Send + Sync {
+pub trait InitializerSpec: Registered + Send + Sync {
     /// Builds the initializer. `weights` reads a weights file named in the settings.
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>>;
 }
 
+crate::settings_of!(Initializer, InitializerSpec);
+
 /// Settings of a loss.
-#[typetag::serde(tag = "type")]
-pub trait LossSpec: Send + Sync {
+pub trait LossSpec: Registered + Send + Sync {
     /// Builds the loss; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn Loss>>;
 }
 
+crate::settings_of!(Loss, LossSpec);
+
 /// Settings of a prior.
-#[typetag::serde(tag = "type")]
-pub trait PriorSpec: Send + Sync {
+pub trait PriorSpec: Registered + Send + Sync {
     /// Builds the prior; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn Prior>>;
 }
+
+crate::settings_of!(Prior, PriorSpec);
 
 /// Initializes parameters in the arena.
 pub trait Initializer: Send + Sync {

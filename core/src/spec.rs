@@ -63,7 +63,7 @@ impl<'de> Deserialize<'de> for Spec {
         let label = LABEL.iter().filter_map(|key| method.remove_entry(*key)).collect();
         let Label { name, description, plugins } =
             serde_json::from_value(Value::Object(label)).map_err(D::Error::custom)?;
-        let method = stage::read(Value::Object(method)).map_err(D::Error::custom)?;
+        let method = crate::registry::read(Value::Object(method)).map_err(D::Error::custom)?;
         Ok(Self { name, description, plugins, method })
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::error::Result;
 use crate::geometry::Geometry;
+use crate::registry::Registered;
 use crate::scan::ScanHeader;
 use crate::simd::Real;
 use crate::wgsl::Fragment;
@@ -9,11 +10,12 @@ use ndarray::{ArrayView3, ArrayViewMut3};
 use std::sync::Arc;
 
 /// Settings of a projector of voxel volumes.
-#[typetag::serde(tag = "type")]
-pub trait VoxelProjectorSpec: Send + Sync {
+pub trait VoxelProjectorSpec: Registered + Send + Sync {
     /// Builds the projector; fails on invalid settings.
     fn build(&self) -> Result<Box<dyn VoxelProjector>>;
 }
+
+crate::settings_of!(VoxelProjector, VoxelProjectorSpec);
 
 /// A projector of voxel volumes, in single precision for work and in double precision for checks.
 pub trait VoxelProjector: Send + Sync {

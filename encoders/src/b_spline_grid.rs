@@ -36,14 +36,13 @@ impl Default for BSplineGrid {
 }
 
 conefield_core::stage_type!(
-    Encoder,
+    EncoderSpec,
     "b-spline-grid",
     BSplineGrid,
     "multi-resolution grid of cubic B-splines",
     example = r#"{"levels": 3, "base_resolution": 4}"#
 );
 
-#[typetag::serde(name = "b-spline-grid")]
 impl EncoderSpec for BSplineGrid {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         Ok(Box::new(Levels::<Level>::new(self)?))

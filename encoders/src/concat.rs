@@ -23,14 +23,13 @@ pub struct Concat {
 }
 
 conefield_core::stage_type!(
-    Encoder,
+    EncoderSpec,
     "concat",
     Concat,
     "several encoders side by side",
     example = r#"{"encoders": ["identity", {"type": "frequency", "bands": 2, "max_frequency": 2.0}]}"#
 );
 
-#[typetag::serde(name = "concat")]
 impl EncoderSpec for Concat {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         let mut parts = vec![];

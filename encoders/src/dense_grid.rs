@@ -37,14 +37,13 @@ impl Default for DenseGrid {
 }
 
 conefield_core::stage_type!(
-    Encoder,
+    EncoderSpec,
     "dense-grid",
     DenseGrid,
     "multi-resolution grid without hashing",
     example = r#"{"levels": 3, "base_resolution": 4}"#
 );
 
-#[typetag::serde(name = "dense-grid")]
 impl EncoderSpec for DenseGrid {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         Ok(Box::new(Levels::<Level>::new(self)?))

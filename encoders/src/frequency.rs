@@ -45,14 +45,13 @@ impl Default for Frequency {
 }
 
 conefield_core::stage_type!(
-    Encoder,
+    EncoderSpec,
     "frequency",
     Frequency,
     "sines and cosines of the position",
     example = r#"{"bands": 4, "max_frequency": 8.0}"#
 );
 
-#[typetag::serde(name = "frequency")]
 impl EncoderSpec for Frequency {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         Ok(Box::new(FrequencyStage::new(self)?))

@@ -65,14 +65,13 @@ impl Default for HashGrid {
 }
 
 conefield_core::stage_type!(
-    Encoder,
+    EncoderSpec,
     "hash-grid",
     HashGrid,
     "multi-resolution hash grid",
     example = r#"{"levels": 3, "log2_table_size": 8, "base_resolution": 4}"#
 );
 
-#[typetag::serde(name = "hash-grid")]
 impl EncoderSpec for HashGrid {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         Ok(Box::new(Levels::<Level>::new(self)?))

@@ -13,9 +13,8 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields)]
 pub struct Identity {}
 
-conefield_core::stage_type!(Encoder, "identity", Identity, "the three coordinates, unchanged");
+conefield_core::stage_type!(EncoderSpec, "identity", Identity, "the three coordinates, unchanged");
 
-#[typetag::serde(name = "identity")]
 impl EncoderSpec for Identity {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         Ok(Box::new(IdentityStage { axes: vec![0, 1, 2] }))

@@ -49,14 +49,13 @@ impl Default for Permutohedral {
 }
 
 conefield_core::stage_type!(
-    Encoder,
+    EncoderSpec,
     "permutohedral",
     Permutohedral,
     "multi-resolution hash of a lattice of simplices: 4 corners instead of 8",
     example = r#"{"levels": 3, "log2_table_size": 8, "base_resolution": 4}"#
 );
 
-#[typetag::serde(name = "permutohedral")]
 impl EncoderSpec for Permutohedral {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         Ok(Box::new(Levels::<Level>::new(self)?))

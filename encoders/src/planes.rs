@@ -52,14 +52,13 @@ impl Default for Planes {
 }
 
 conefield_core::stage_type!(
-    Encoder,
+    EncoderSpec,
     "planes",
     Planes,
     "planes and lines, or three planes, of features on several levels",
     example = r#"{"levels": 2, "base_resolution": 4}"#
 );
 
-#[typetag::serde(name = "planes")]
 impl EncoderSpec for Planes {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         Ok(Box::new(Levels::<Factor>::new(self)?))

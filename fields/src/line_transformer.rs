@@ -47,13 +47,12 @@ impl Default for LineTransformer {
 }
 
 conefield_core::stage_type!(
-    Field,
+    FieldSpec,
     "line-transformer",
     LineTransformer,
     "SAX-NeRF's network: attention between neighbouring samples of a ray"
 );
 
-#[typetag::serde(name = "line-transformer")]
 impl FieldSpec for LineTransformer {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {
         Ok(Box::new(LineTransformerStage::new(self, width)?))

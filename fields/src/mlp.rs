@@ -61,9 +61,8 @@ impl Default for Mlp {
     }
 }
 
-conefield_core::stage_type!(Field, "mlp", Mlp, "multi-layer perceptron with skip connections");
+conefield_core::stage_type!(FieldSpec, "mlp", Mlp, "multi-layer perceptron with skip connections");
 
-#[typetag::serde(name = "mlp")]
 impl FieldSpec for Mlp {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {
         Ok(Box::new(MlpStage::new(self, width)?))

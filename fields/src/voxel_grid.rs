@@ -44,14 +44,13 @@ impl Default for VoxelGridSettings {
 }
 
 conefield_core::stage_type!(
-    Field,
+    FieldSpec,
     "voxel-grid",
     VoxelGridSettings,
     "a grid of voxels, read by position",
     example = r#"{"resolution": 6}"#
 );
 
-#[typetag::serde(name = "voxel-grid")]
 impl FieldSpec for VoxelGridSettings {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {
         Ok(Box::new(VoxelGridStage::new(self, width)?))

@@ -68,14 +68,13 @@ impl Default for RayMarch {
     }
 }
 
-conefield_core::stage_type!(Projector, "ray-march", RayMarch, "equal intervals along the ray, one sample each");
+conefield_core::stage_type!(ProjectorSpec, "ray-march", RayMarch, "equal intervals along the ray, one sample each");
 
 /// Default number of samples per ray.
 const SAMPLES: usize = 192;
 /// More samples per ray must be an error in units.
 const MOST_SAMPLES: usize = 65_536;
 
-#[typetag::serde(name = "ray-march")]
 impl ProjectorSpec for RayMarch {
     fn build(&self) -> Result<Box<dyn Projector>> {
         let n = self.count();

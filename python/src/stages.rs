@@ -6,14 +6,13 @@ use crate::errors::{OrRaise, raised as exception};
 use crate::regularizer::PythonRegularizer;
 use crate::work::without_lock;
 use conefield_conformance::{Outcome, Report, With, check_type};
-use conefield_core::registry::{self, Kind, Make, NewType};
+use conefield_core::registry::{self, Kind, Make, NewType, Registered};
 use conefield_core::regularizer::{Regularizer, RegularizerSpec};
 use conefield_core::settings::EncoderSpec;
 use conefield_core::stage::Encoder;
 use conefield_core::{Error, Result};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -79,8 +78,8 @@ pub fn register(py: Python<'_>, kind_name: &str, name: String, doc: String, clas
         let own: &'static str = name.clone().leak();
         let settings = move |settings: Value| Written { name: own, settings };
         let make = match kind {
-            Kind::Encoder => Make::Encoder(Box::new(move |v| Ok(Box::new(settings(v))))),
-            Kind::Regularizer => Make::Regularizer(Box::new(move |v| Ok(Box::new(settings(v))))),
+            Kind::Encoder => Make::new::<dyn EncoderSpec>(Box::new(move |v| Ok(Box::new(settings(v))))),
+            Kind::Regularizer => Make::new::<dyn RegularizerSpec>(Box::new(move |v| Ok(Box::new(settings(v))))),
             _ => return Err(exception(py, &Error::invalid("stage", "kind", kind_name, "encoder or regularizer"))),
         };
         // The settings are known only to the class, which may be replaced: any key is allowed here.
@@ -132,22 +131,14 @@ pub fn words(py: Python<'_>, e: &PyErr) -> String {
     format!("{kind}: {}", e.value(py))
 }
 
-impl Serialize for Written {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        self.settings.serialize(serializer)
+impl Registered for Written {
+    fn type_name(&self) -> &'static str {
+        self.name
     }
-}
 
-// `#[typetag::serde]` gives a Rust type one name; here it is the registered one. Its two methods are therefore
-// implemented by hand. Reading settings back goes through the registry (`conefield_core::spec::stage`).
-macro_rules! named {
-    () => {
-        fn typetag_name(&self) -> &'static str {
-            self.name
-        }
-
-        fn typetag_deserialize(&self) {}
-    };
+    fn keys(&self) -> serde_json::Result<Value> {
+        Ok(self.settings.clone())
+    }
 }
 
 impl EncoderSpec for Written {
@@ -158,8 +149,6 @@ impl EncoderSpec for Written {
             Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
         })
     }
-
-    named!();
 }
 
 impl RegularizerSpec for Written {
@@ -170,8 +159,6 @@ impl RegularizerSpec for Written {
             Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
         })
     }
-
-    named!();
 }
 
 /// Name, outcome and evidence of each property of a stage.

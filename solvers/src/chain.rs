@@ -54,7 +54,6 @@ conefield_core::stage_type!(
     "methods in sequence, each starting from the volume of the previous one"
 );
 
-#[typetag::serde(name = "chain")]
 impl Method for Chain {
     fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
         let count = self.methods.len();
@@ -71,7 +70,7 @@ impl Method for Chain {
             let mut link = method.plan(context).map_err(|e| e.within(&at(i)))?;
             ensure(link.links().is_empty(), "spec", &at(i), "a chain in a chain", "a method that is none")?;
             let starts = i == 0 || link.starts_from_volume();
-            ensure(starts, "spec", &at(i), method.typetag_name(), "a method that starts from a volume")?;
+            ensure(starts, "spec", &at(i), method.type_name(), "a method that starts from a volume")?;
             links.push(link);
         }
         Ok(Box::new(ChainPlan { links, mean: self.mean, merge: self.merge }))

@@ -80,14 +80,14 @@ impl Trained<'_> {
         }
         let (exe, compiled) = context.backend.compile(&pipeline)?;
         exe.admits(loss.as_ref(), &priors)?;
-        beside.push(Line::new("initializer", self.initializer.typetag_name(), &initializer.describe()));
-        beside.push(Line::new("loss", self.loss.typetag_name(), &loss.describe()));
+        beside.push(Line::new("initializer", self.initializer.type_name(), &initializer.describe()));
+        beside.push(Line::new("loss", self.loss.type_name(), &loss.describe()));
         for (i, (p, spec)) in priors.iter().zip(self.priors).enumerate() {
-            beside.push(Line::new(&format!("priors.{i}"), spec.typetag_name(), &p.describe()));
+            beside.push(Line::new(&format!("priors.{i}"), spec.type_name(), &p.describe()));
         }
         for (i, (c, spec)) in callbacks.iter().zip(self.callbacks).enumerate() {
             let said = c.describe().unwrap_or_default();
-            beside.push(Line::new(&format!("callbacks.{i}"), spec.typetag_name(), &said));
+            beside.push(Line::new(&format!("callbacks.{i}"), spec.type_name(), &said));
         }
         let parameters = pipeline.layout().len() as u64;
         let kept = callbacks.iter().map(|c| c.bytes(parameters)).sum();

@@ -8,6 +8,7 @@ use conefield_core::error::Result;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Line, Method, Plan, StageLine};
 use conefield_core::pipeline::Pipeline;
+use conefield_core::registry::Registered;
 use conefield_core::scene::SceneSettings;
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
@@ -26,7 +27,6 @@ pub struct NeuralField {
     #[serde(default)]
     pub scene: SceneSettings,
     /// Encoder: points to features.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn EncoderSpec>")]
     pub encoder: Box<dyn EncoderSpec>,
     /// Normalizers: features to features, in order.
@@ -34,19 +34,17 @@ pub struct NeuralField {
     #[schemars(schema_with = "stage::schema_of_list::<dyn NormalizerSpec>")]
     pub normalizers: Vec<Box<dyn NormalizerSpec>>,
     /// Field: features to attenuation.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn FieldSpec>")]
     pub field: Box<dyn FieldSpec>,
     /// Projector: rays to samples.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn ProjectorSpec>")]
     pub projector: Box<dyn ProjectorSpec>,
     /// Source of the initial weights.
-    #[serde(default = "random", deserialize_with = "stage::needed")]
+    #[serde(default = "random")]
     #[schemars(schema_with = "stage::schema::<dyn InitializerSpec>")]
     pub initializer: Box<dyn InitializerSpec>,
     /// Loss between predicted and measured line integrals.
-    #[serde(default = "l1", deserialize_with = "stage::needed")]
+    #[serde(default = "l1")]
     #[schemars(schema_with = "stage::schema::<dyn LossSpec>")]
     pub loss: Box<dyn LossSpec>,
     /// Priors on the field, independent of the measurements.
@@ -70,18 +68,17 @@ pub struct NeuralField {
 
 conefield_core::stage_type!(Method, "neural-field", NeuralField, "a neural attenuation field, trained on rays");
 
-#[typetag::serde(name = "neural-field")]
 impl Method for NeuralField {
     fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
         let pipeline = self.pipeline()?;
-        let mut stages = vec![StageLine::new("encoder", self.encoder.typetag_name(), pipeline.encoder.as_ref())];
+        let mut stages = vec![StageLine::new("encoder", self.encoder.type_name(), pipeline.encoder.as_ref())];
         for (i, (n, spec)) in pipeline.normalizers.iter().zip(&self.normalizers).enumerate() {
-            stages.push(StageLine::new(&format!("normalizers.{i}"), spec.typetag_name(), n.as_ref()));
+            stages.push(StageLine::new(&format!("normalizers.{i}"), spec.type_name(), n.as_ref()));
         }
-        stages.push(StageLine::new("field", self.field.typetag_name(), pipeline.field.as_ref()));
-        let projector = Line::new("projector", self.projector.typetag_name(), &pipeline.projector.describe());
+        stages.push(StageLine::new("field", self.field.type_name(), pipeline.field.as_ref()));
+        let projector = Line::new("projector", self.projector.type_name(), &pipeline.projector.describe());
         let trained = Trained {
-            kind: self.typetag_name(),
+            kind: self.type_name(),
             scene: &self.scene,
             initializer: self.initializer.as_ref(),
             loss: self.loss.as_ref(),

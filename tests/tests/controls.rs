@@ -898,13 +898,14 @@ fn wgsl_with_another_derivative_fails() {
 }
 
 /// Settings that lose a number when they are read.
-#[derive(serde::Serialize, serde::Deserialize)]
+#[derive(serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
 struct Lossy {
     #[serde(skip_deserializing)]
     lost: f64,
 }
 
-#[typetag::serde(name = "test-lossy")]
+conefield_core::stage_type!(LossSpec, "test-lossy", Lossy, "for tests", example = r#"{"lost": 1.0}"#);
+
 impl LossSpec for Lossy {
     fn build(&self) -> Result<Box<dyn Loss>> {
         Ok(Box::new(ToyLoss::new(LossFault::None)))

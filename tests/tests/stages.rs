@@ -5,10 +5,10 @@ mod device;
 
 use conefield_conformance::{Options, Outcome, Report, With, check_encoder, check_settings, check_type, check_wgsl};
 use conefield_core::opened::Opened;
+use conefield_core::registry::read;
 use conefield_core::registry::{Kind, stage_types};
 use conefield_core::runner::Runner;
 use conefield_core::settings::{EncoderSpec, InitializerSpec, LossSpec, PriorSpec};
-use conefield_core::spec::stage::read;
 use conefield_core::spec::{load, schema};
 use conefield_core::{Result, arena::Weights};
 use serde_json::{Value, json};

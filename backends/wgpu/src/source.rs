@@ -4,8 +4,11 @@ use conefield_core::error::{Error, Result};
 use std::sync::OnceLock;
 use wgpu::naga;
 
-/// A further check of every valid kernel. Tests set it, to translate kernels for systems that are not at hand.
-pub static FURTHER: OnceLock<fn(&naga::Module, &naga::valid::ModuleInfo) -> Result<(), String>> = OnceLock::new();
+/// Checks a valid kernel.
+pub type Check = fn(&naga::Module, &naga::valid::ModuleInfo) -> Result<(), String>;
+
+/// A further check of every kernel. Tests set it, to translate kernels for systems that are not at hand.
+pub static FURTHER: OnceLock<Check> = OnceLock::new();
 
 /// How a kernel accesses a buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -3,7 +3,7 @@
 use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-stage_type!(Basis, "@name@", Settings, "blocks of voxels");
+stage_type!(BasisSpec, "@name@", Settings, "blocks of voxels");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -19,7 +19,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl BasisSpec for Settings {
     fn build(&self) -> Result<Box<dyn Basis>> {
         ensure((1..=64).contains(&self.edge), "spec", "edge", self.edge, "1 to 64")?;

@@ -4,7 +4,7 @@
 use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-stage_type!(DataTerm, "@name@", Settings, "quadratic for small residuals, linear for large ones");
+stage_type!(DataTermSpec, "@name@", Settings, "quadratic for small residuals, linear for large ones");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -20,7 +20,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl DataTermSpec for Settings {
     fn build(&self) -> Result<Box<dyn DataTerm>> {
         let good = self.from.is_finite() && self.from > 0.0;

@@ -3,7 +3,7 @@
 use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-stage_type!(Encoder, "@name@", Settings, "waves of learned directions");
+stage_type!(EncoderSpec, "@name@", Settings, "waves of learned directions");
 
 /// What a spec may set.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -21,7 +21,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl EncoderSpec for Settings {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         ensure((1..=4096).contains(&self.waves), "spec", "waves", self.waves, "1 to 4096")?;

@@ -4,7 +4,7 @@
 use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-stage_type!(Field, "@name@", Settings, "a weighted sum through a softplus");
+stage_type!(FieldSpec, "@name@", Settings, "a weighted sum through a softplus");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -20,7 +20,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl FieldSpec for Settings {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {
         Ok(Box::new(ByRow::new(Sum { width, bias: self.bias })))

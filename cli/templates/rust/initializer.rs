@@ -11,7 +11,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(Initializer, "@name@", Settings, "uniform numbers in the blocks of one stage");
+conefield_plugin::stage_type!(InitializerSpec, "@name@", Settings, "uniform numbers in the blocks of one stage");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -29,7 +29,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl InitializerSpec for Settings {
     fn build(&self, _: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
         let good = self.bound.is_finite() && self.bound >= 0.0;

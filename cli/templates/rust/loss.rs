@@ -3,7 +3,7 @@
 use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-stage_type!(Loss, "@name@", Settings, "the absolute difference, rounded near 0");
+stage_type!(LossSpec, "@name@", Settings, "the absolute difference, rounded near 0");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -19,7 +19,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl LossSpec for Settings {
     fn build(&self) -> Result<Box<dyn Loss>> {
         // Shaders use single precision.

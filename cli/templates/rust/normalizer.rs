@@ -13,7 +13,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(Normalizer, "@name@", Settings, "a learned scale and shift of every channel");
+conefield_plugin::stage_type!(NormalizerSpec, "@name@", Settings, "a learned scale and shift of every channel");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -29,7 +29,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl NormalizerSpec for Settings {
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
         Ok(Box::new(Affine { width, scale: self.scale }))

@@ -3,7 +3,7 @@
 use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-stage_type!(Prior, "@name@", Settings, "squared differences of neighbouring points");
+stage_type!(PriorSpec, "@name@", Settings, "squared differences of neighbouring points");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -25,7 +25,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl PriorSpec for Settings {
     fn build(&self) -> Result<Box<dyn Prior>> {
         Prior::blocks(self).validate()?;

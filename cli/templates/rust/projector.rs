@@ -11,7 +11,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(Projector, "@name@", Settings, "equal intervals within the box");
+conefield_plugin::stage_type!(ProjectorSpec, "@name@", Settings, "equal intervals within the box");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -29,7 +29,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl ProjectorSpec for Settings {
     fn build(&self) -> Result<Box<dyn Projector>> {
         ensure((1..=65_536).contains(&self.samples), "spec", "samples", self.samples, "1 to 65536")?;

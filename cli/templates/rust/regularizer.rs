@@ -3,7 +3,7 @@
 use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-stage_type!(Regularizer, "@name@", Settings, "squared differences of neighbours");
+stage_type!(RegularizerSpec, "@name@", Settings, "squared differences of neighbours");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
@@ -21,7 +21,6 @@ impl Default for Settings {
     }
 }
 
-#[typetag::serde(name = "@name@")]
 impl RegularizerSpec for Settings {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
         let good = self.weight.is_finite() && self.weight >= 0.0;

@@ -8,8 +8,8 @@ use conefield_core::backend::{Backend, BlockWork, Work};
 use conefield_core::method::{Context, Job, Limits, Silent};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
+use conefield_core::registry::read;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
-use conefield_core::spec::stage::read;
 use conefield_core::stage::UnitRay;
 use std::path::{Path, PathBuf};
 

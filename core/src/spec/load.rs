@@ -467,8 +467,7 @@ mod tests {
         }
     }
 
-    crate::stage_type!(Encoder, "test-grid", TestGrid, "for tests");
-    #[typetag::serde(name = "test-grid")]
+    crate::stage_type!(EncoderSpec, "test-grid", TestGrid, "for tests");
     impl EncoderSpec for TestGrid {
         fn build(&self) -> Result<Box<dyn crate::stage::Encoder>> {
             Err(Error::invalid("spec", "levels", self.levels, "another number"))
@@ -482,8 +481,7 @@ mod tests {
         below: serde_json::Value,
     }
 
-    crate::stage_type!(Encoder, "test-stack", TestStack, "for tests");
-    #[typetag::serde(name = "test-stack")]
+    crate::stage_type!(EncoderSpec, "test-stack", TestStack, "for tests");
     impl EncoderSpec for TestStack {
         fn build(&self) -> Result<Box<dyn crate::stage::Encoder>> {
             Err(Error::unsupported("test-stack", "for tests"))
@@ -509,7 +507,6 @@ mod tests {
     }
 
     crate::stage_type!(Method, "test-clock", TestClock, "for tests");
-    #[typetag::serde(name = "test-clock")]
     impl Method for TestClock {
         fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
             Err(Error::unsupported("test-clock", "for tests"))
@@ -519,7 +516,6 @@ mod tests {
     #[derive(Serialize, Deserialize, JsonSchema)]
     #[serde(deny_unknown_fields)]
     struct TestField {
-        #[serde(deserialize_with = "stage::needed")]
         #[schemars(schema_with = "stage::schema::<dyn EncoderSpec>")]
         encoder: Box<dyn EncoderSpec>,
         #[serde(default, deserialize_with = "stage::list")]
@@ -534,7 +530,6 @@ mod tests {
     }
 
     crate::stage_type!(Method, "test-field", TestField, "for tests");
-    #[typetag::serde(name = "test-field")]
     impl Method for TestField {
         fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
             self.encoder.build().map_err(|e| e.within("encoder"))?;
@@ -551,7 +546,6 @@ mod tests {
     }
 
     crate::stage_type!(Method, "test-chain", TestChain, "for tests");
-    #[typetag::serde(name = "test-chain")]
     impl Method for TestChain {
         fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
             Err(Error::unsupported("test-chain", "for tests"))

@@ -61,9 +61,9 @@ fn each(value: &Value, path: &str, mut f: impl FnMut(Option<&str>, &Value, &str)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Error;
     use crate::input_file::FORMAT;
     use crate::registry::{Make, NewType, add};
+    use crate::settings::LossSpec;
     use serde_json::json;
 
     #[test]
@@ -78,7 +78,7 @@ mod tests {
             },
             "$defs": { "Deep": { "properties": { "file": file } } },
         });
-        let make = Make::Loss(Box::new(|_| Err(Error::unsupported("test", "this type is never built"))));
+        let make = Make::new::<dyn LossSpec>(Box::new(|_| Err("this type is never built".into())));
         add("a test", vec![NewType { name: "reads-files".into(), doc: "test".into(), schema, make }]).unwrap();
         let stage = json!({
             "type": "reads-files", "atlas": "a.nii", "maps": ["b.npy", "c.npy"], "deep": { "file": "d.mha" }, "note": "e",

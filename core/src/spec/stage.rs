@@ -1,55 +1,15 @@
 //! Stages as written in a spec: a table with a `type`, or the name of a type with defaults for all its settings.
-//!
-//! `typetag` reads linked types. It cannot see those of loaded libraries, as every library has its own statics;
-//! [`needed`] and [`list`] look their names up at run time.
+//! Boxes of settings read themselves ([`settings_of!`](crate::settings_of)).
 
 use super::schema::NESTED;
-use crate::method::Method;
-use crate::registry::{Kind, Origin, Settings, find};
+use crate::registry::{Settings, read};
 use schemars::{Schema, SchemaGenerator, json_schema};
 use serde::Deserialize;
-use serde::de::{DeserializeOwned, Deserializer, Error};
-use serde_json::{Value, json};
-
-/// Libraries cannot provide methods.
-impl Settings for dyn Method {
-    const KIND: Kind = Kind::Method;
-}
-
-/// Reads the settings in `value`.
-pub fn read<T: Settings + ?Sized>(mut value: Value) -> Result<Box<T>, String>
-where
-    Box<T>: DeserializeOwned,
-{
-    if value.is_string() {
-        value = json!({ "type": value });
-    }
-    let found = value["type"].as_str().and_then(|name| find(T::KIND, name));
-    if let Some(Origin::Loaded { make, .. }) = found.map(|t| &t.origin)
-        && let Some(make) = T::made_by(make)
-    {
-        value.as_object_mut().and_then(|v| v.remove("type"));
-        return make(value).map_err(|e| e.to_string());
-    }
-    serde_path_to_error::deserialize(value).map_err(|e| match e.path().to_string().as_str() {
-        "." => e.inner().to_string(),
-        path => format!("{path}: {}", e.inner()),
-    })
-}
-
-/// For `#[serde(deserialize_with = …)]`: one stage.
-pub fn needed<'de, T: Settings + ?Sized, D: Deserializer<'de>>(from: D) -> Result<Box<T>, D::Error>
-where
-    Box<T>: DeserializeOwned,
-{
-    read(Value::deserialize(from)?).map_err(D::Error::custom)
-}
+use serde::de::{Deserializer, Error};
+use serde_json::Value;
 
 /// For `#[serde(deserialize_with = …)]`: a list of stages.
-pub fn list<'de, T: Settings + ?Sized, D: Deserializer<'de>>(from: D) -> Result<Vec<Box<T>>, D::Error>
-where
-    Box<T>: DeserializeOwned,
-{
+pub fn list<'de, T: Settings + ?Sized + 'static, D: Deserializer<'de>>(from: D) -> Result<Vec<Box<T>>, D::Error> {
     let all = Vec::<Value>::deserialize(from)?.into_iter().enumerate();
     all.map(|(i, v)| read(v).map_err(|e| D::Error::custom(format!("{i}: {e}")))).collect()
 }

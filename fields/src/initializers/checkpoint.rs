@@ -16,14 +16,13 @@ pub struct CheckpointSettings {
 }
 
 conefield_core::stage_type!(
-    Initializer,
+    InitializerSpec,
     "checkpoint",
     CheckpointSettings,
     "every weight from a file",
     example = r#"{"weights": "weights.safetensors"}"#
 );
 
-#[typetag::serde(name = "checkpoint")]
 impl InitializerSpec for CheckpointSettings {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
         ensure(!self.weights.is_empty(), "spec", "weights", "no name", "a weights file")?;

@@ -20,14 +20,13 @@ pub struct Mci {
 }
 
 conefield_core::stage_type!(
-    Initializer,
+    InitializerSpec,
     "mci",
     Mci,
     "normalizers and field from a trained model, a fresh encoder",
     example = r#"{"weights": "weights.safetensors"}"#
 );
 
-#[typetag::serde(name = "mci")]
 impl InitializerSpec for Mci {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
         ensure(!self.weights.is_empty(), "spec", "weights", "no name", "a weights file")?;

@@ -11,9 +11,8 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields)]
 pub struct Random {}
 
-conefield_core::stage_type!(Initializer, "random", Random, "every stage by its own seeded scheme");
+conefield_core::stage_type!(InitializerSpec, "random", Random, "every stage by its own seeded scheme");
 
-#[typetag::serde(name = "random")]
 impl InitializerSpec for Random {
     fn build(&self, _: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
         Ok(Box::new(self.clone()))

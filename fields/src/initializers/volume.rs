@@ -31,14 +31,13 @@ fn steps() -> u64 {
 }
 
 conefield_core::stage_type!(
-    Initializer,
+    InitializerSpec,
     "volume",
     FromVolume,
     "a known volume that the field learns first",
     example = r#"{"path": "volume.nii.gz"}"#
 );
 
-#[typetag::serde(name = "volume")]
 impl InitializerSpec for FromVolume {
     fn build(&self, _: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
         ensure(!self.path.is_empty(), "spec", "path", "no name", "a volume file")?;

@@ -33,9 +33,13 @@ impl Default for LayerNorm {
     }
 }
 
-conefield_core::stage_type!(Normalizer, "layer-norm", LayerNorm, "mean 0 and variance 1 over the channels of a row");
+conefield_core::stage_type!(
+    NormalizerSpec,
+    "layer-norm",
+    LayerNorm,
+    "mean 0 and variance 1 over the channels of a row"
+);
 
-#[typetag::serde(name = "layer-norm")]
 impl NormalizerSpec for LayerNorm {
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
         Ok(Box::new(LayerNormStage::new(self, width)?))

@@ -37,13 +37,12 @@ impl Default for LevelAttention {
 }
 
 conefield_core::stage_type!(
-    Normalizer,
+    NormalizerSpec,
     "level-attention",
     LevelAttention,
     "weighs the encoder's levels at each point by a softmax"
 );
 
-#[typetag::serde(name = "level-attention")]
 impl NormalizerSpec for LevelAttention {
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
         Ok(Box::new(LevelAttentionStage::new(self, width)?))

@@ -51,13 +51,12 @@ impl Default for LineAttention {
 }
 
 conefield_core::stage_type!(
-    Normalizer,
+    NormalizerSpec,
     "line-attention",
     LineAttention,
     "attention between neighbouring samples of a ray, with a feed-forward network"
 );
 
-#[typetag::serde(name = "line-attention")]
 impl NormalizerSpec for LineAttention {
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
         Ok(Box::new(LineAttentionStage::new(self, width)?))

@@ -15,13 +15,12 @@ use conefield_core::data_term::{DataTerm, DataTermSpec};
 use conefield_core::error::{Error, Result};
 use conefield_core::loss::Loss;
 use conefield_core::prior::Prior;
-use conefield_core::registry::{self, Kind, Make, NewType};
+use conefield_core::registry::{self, Kind, Make, NewType, Registered};
 use conefield_core::regularizer::{Regularizer, RegularizerSpec};
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, Initializer, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 use conefield_core::stage::{Encoder, Field, Normalizer, Projector};
-use serde::{Serialize, Serializer};
 use serde_json::Value;
 use std::sync::Arc;
 
@@ -57,9 +56,13 @@ pub fn with_defaults(schema: &Value, mut written: Value) -> Value {
     written
 }
 
-impl Serialize for Loaded {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        self.settings.serialize(serializer)
+impl Registered for Loaded {
+    fn type_name(&self) -> &'static str {
+        self.name
+    }
+
+    fn keys(&self) -> serde_json::Result<Value> {
+        Ok(self.settings.clone())
     }
 }
 
@@ -72,7 +75,7 @@ macro_rules! kinds {
             let settings =
                 move |written: Value| Loaded { settings: with_defaults(&ty.schema, written), name, ty: ty.clone() };
             Ok(match kind {
-                $(Kind::$kind => Make::$kind(Box::new(move |v| Ok(Box::new(settings(v))))),)*
+                $(Kind::$kind => Make::new::<dyn $spec>(Box::new(move |v| Ok(Box::new(settings(v))))),)*
                 other => return Err(Error::unsupported(name, format!("a {other} cannot come from a plugin"))),
             })
         }
@@ -81,15 +84,6 @@ macro_rules! kinds {
             fn build(&$self $(, $argument: $type)?) -> Result<Box<$stage>> {
                 Ok(Box::new($build?))
             }
-
-            // `#[typetag::serde]` gives a Rust type one name; here it is the loaded type's. Its two methods are
-            // therefore implemented by hand. Reading settings back goes through the registry
-            // (`conefield_core::spec::stage`).
-            fn typetag_name(&self) -> &'static str {
-                self.name
-            }
-
-            fn typetag_deserialize(&self) {}
         })*
     };
 }

@@ -6,13 +6,13 @@ use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::{Error, Result};
 use conefield_core::loss::Loss;
 use conefield_core::prior::Prior;
+use conefield_core::registry::read;
 use conefield_core::registry::{Kind, StageType};
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, Initializer, InitializerSpec, KnownVolume, LossSpec, NormalizerSpec, PriorSpec,
     ProjectorSpec,
 };
-use conefield_core::spec::stage::read;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
 use conefield_plugin_abi::*;
 use serde_json::Value;

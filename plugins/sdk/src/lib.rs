@@ -6,9 +6,8 @@
 //!
 //! ```text
 //! conefield_plugin::export!();
-//! conefield_plugin::stage_type!(Encoder, "wavelet", Wavelet, "Gaussian-windowed waves");
+//! conefield_plugin::stage_type!(EncoderSpec, "wavelet", Wavelet, "Gaussian-windowed waves");
 //!
-//! #[typetag::serde(name = "wavelet")]
 //! impl EncoderSpec for Wavelet { … }
 //! ```
 //!

@@ -38,25 +38,27 @@ impl Default for Trilinear {
     }
 }
 
-conefield_core::stage_type!(VoxelProjector, "siddon", Siddon, "exact path lengths through voxels");
-conefield_core::stage_type!(VoxelProjector, "joseph", Joseph, "bilinear interpolation from plane to plane of voxels");
-conefield_core::stage_type!(VoxelProjector, "trilinear", Trilinear, "trilinear samples of voxels at equal steps");
+conefield_core::stage_type!(VoxelProjectorSpec, "siddon", Siddon, "exact path lengths through voxels");
+conefield_core::stage_type!(
+    VoxelProjectorSpec,
+    "joseph",
+    Joseph,
+    "bilinear interpolation from plane to plane of voxels"
+);
+conefield_core::stage_type!(VoxelProjectorSpec, "trilinear", Trilinear, "trilinear samples of voxels at equal steps");
 
-#[typetag::serde(name = "siddon")]
 impl VoxelProjectorSpec for Siddon {
     fn build(&self) -> Result<Box<dyn VoxelProjector>> {
         Ok(Box::new(*self))
     }
 }
 
-#[typetag::serde(name = "joseph")]
 impl VoxelProjectorSpec for Joseph {
     fn build(&self) -> Result<Box<dyn VoxelProjector>> {
         Ok(Box::new(*self))
     }
 }
 
-#[typetag::serde(name = "trilinear")]
 impl VoxelProjectorSpec for Trilinear {
     fn build(&self) -> Result<Box<dyn VoxelProjector>> {
         let n = self.samples_per_voxel;
@@ -65,10 +67,13 @@ impl VoxelProjectorSpec for Trilinear {
     }
 }
 
+// `inline(never)`: a crate that inlines these methods compiles the operators behind them again.
 impl VoxelProjector for Siddon {
+    #[inline(never)]
     fn operator(&self) -> &dyn VoxelOperator<f32> {
         self
     }
+    #[inline(never)]
     fn reference(&self) -> &dyn VoxelOperator<f64> {
         self
     }
@@ -81,9 +86,11 @@ impl VoxelProjector for Siddon {
 }
 
 impl VoxelProjector for Joseph {
+    #[inline(never)]
     fn operator(&self) -> &dyn VoxelOperator<f32> {
         self
     }
+    #[inline(never)]
     fn reference(&self) -> &dyn VoxelOperator<f64> {
         self
     }
@@ -110,9 +117,11 @@ impl Trilinear {
 }
 
 impl VoxelProjector for Trilinear {
+    #[inline(never)]
     fn operator(&self) -> &dyn VoxelOperator<f32> {
         self
     }
+    #[inline(never)]
     fn reference(&self) -> &dyn VoxelOperator<f64> {
         self
     }

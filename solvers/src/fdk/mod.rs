@@ -69,7 +69,6 @@ impl Default for Fdk {
 
 conefield_core::stage_type!(Method, "fdk", Fdk, "filtered back-projection");
 
-#[typetag::serde(name = "fdk")]
 impl Method for Fdk {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         let c = self.cutoff;

@@ -77,7 +77,7 @@ pub struct Gaussians {
     #[serde(default)]
     pub start: Start,
     /// Loss between predicted and measured line integrals.
-    #[serde(default = "l1", deserialize_with = "stages::needed")]
+    #[serde(default = "l1")]
     #[schemars(schema_with = "stages::schema::<dyn LossSpec>")]
     pub loss: Box<dyn LossSpec>,
     /// Weight of a view's structural dissimilarity relative to the mean loss of a pixel.
@@ -164,7 +164,6 @@ fn places() -> usize {
 
 conefield_core::stage_type!(Method, "gaussians", Gaussians, "a sum of Gaussians, trained on whole views");
 
-#[typetag::serde(name = "gaussians")]
 impl Method for Gaussians {
     fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
         self.scene.validate()?;
@@ -198,13 +197,13 @@ impl Method for Gaussians {
         let (exe, compiled) = context.backend.compile(&pipeline)?;
         exe.admits(loss.as_ref(), &priors)?;
         let stages = vec![StageLine::new("field", "gaussians", pipeline.field.as_ref())];
-        let mut beside = vec![Line::new("loss", self.loss.typetag_name(), &loss.describe())];
+        let mut beside = vec![Line::new("loss", self.loss.type_name(), &loss.describe())];
         for (i, (p, spec)) in priors.iter().zip(&self.priors).enumerate() {
-            beside.push(Line::new(&format!("priors.{i}"), spec.typetag_name(), &p.describe()));
+            beside.push(Line::new(&format!("priors.{i}"), spec.type_name(), &p.describe()));
         }
         for (i, (c, spec)) in callbacks.iter().zip(&self.callbacks).enumerate() {
             let said = c.describe().unwrap_or_default();
-            beside.push(Line::new(&format!("callbacks.{i}"), spec.typetag_name(), &said));
+            beside.push(Line::new(&format!("callbacks.{i}"), spec.type_name(), &said));
         }
         let Self { start, training, optimizer, .. } = self;
         let what = format!("{} from the start, {} views per step, Adam {}", start.count, training.views, optimizer.lr);

@@ -30,7 +30,6 @@ use std::time::Instant;
 #[serde(deny_unknown_fields, default)]
 pub struct AsdPocs {
     /// Voxel projector.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
     /// Support of the object, and attenuation beyond the volume.
@@ -71,7 +70,6 @@ const RATIO: f64 = 0.95;
 
 conefield_core::stage_type!(Method, "asd-pocs", AsdPocs, "alternates data passes and total-variation descent");
 
-#[typetag::serde(name = "asd-pocs")]
 impl Method for AsdPocs {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         Ok(Box::new(IterativePlan(self.built()?)))

@@ -27,7 +27,6 @@ use std::time::Instant;
 #[serde(deny_unknown_fields, default)]
 pub struct Cgls {
     /// Voxel projector.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
     /// Support of the object, and attenuation beyond the volume.
@@ -50,7 +49,6 @@ impl Default for Cgls {
 
 conefield_core::stage_type!(Method, "cgls", Cgls, "conjugate gradients for least squares");
 
-#[typetag::serde(name = "cgls")]
 impl Method for Cgls {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;

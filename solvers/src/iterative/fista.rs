@@ -50,19 +50,15 @@ use std::time::Instant;
 #[serde(deny_unknown_fields, default)]
 pub struct Fista {
     /// Voxel projector.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
     /// Basis of the volume.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn BasisSpec>")]
     pub basis: Box<dyn BasisSpec>,
     /// Data term: misfit between computed and measured line integrals.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn DataTermSpec>")]
     pub data: Box<dyn DataTermSpec>,
     /// Regularizer of the volume.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn RegularizerSpec>")]
     pub prior: Box<dyn RegularizerSpec>,
     /// Support of the object, and attenuation beyond the volume.
@@ -111,7 +107,6 @@ const MOMENTUM: f64 = 400.0;
 
 conefield_core::stage_type!(Method, "fista", Fista, "ordered-subset FISTA with any basis, data term and prior");
 
-#[typetag::serde(name = "fista")]
 impl Method for Fista {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         Ok(Box::new(IterativePlan(self.built()?)))
@@ -143,7 +138,7 @@ impl Fista {
             basis: self.basis.build().map_err(|e| e.within("basis"))?,
             data: self.data.build().map_err(|e| e.within("data"))?,
             prior: self.prior.build().map_err(|e| e.within("prior"))?,
-            kinds: [self.basis.typetag_name(), self.data.typetag_name(), self.prior.typetag_name()],
+            kinds: [self.basis.type_name(), self.data.type_name(), self.prior.type_name()],
             air: self.air,
             bin: self.bin,
             subsets: self.subsets,

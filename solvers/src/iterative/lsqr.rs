@@ -28,7 +28,6 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct Lsqr {
     /// Voxel projector.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
     /// Support of the object, and attenuation beyond the volume.
@@ -54,7 +53,6 @@ impl Default for Lsqr {
 
 conefield_core::stage_type!(Method, "lsqr", Lsqr, "least squares by bidiagonalization, with a pull towards a volume");
 
-#[typetag::serde(name = "lsqr")]
 impl Method for Lsqr {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         let pull = self.pull;

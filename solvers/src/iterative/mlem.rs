@@ -32,7 +32,6 @@ use std::time::Instant;
 #[serde(deny_unknown_fields, default)]
 pub struct Mlem {
     /// Voxel projector.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
     /// Support of the object, and attenuation beyond the volume.
@@ -64,7 +63,6 @@ impl Default for Mlem {
 
 conefield_core::stage_type!(Method, "mlem", Mlem, "maximum likelihood by expectation maximization, in ordered subsets");
 
-#[typetag::serde(name = "mlem")]
 impl Method for Mlem {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         self.subsets.validate()?;

@@ -28,7 +28,6 @@ use std::time::Instant;
 #[serde(deny_unknown_fields, default)]
 pub struct Sart {
     /// Voxel projector.
-    #[serde(deserialize_with = "stage::needed")]
     #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
     pub projector: Box<dyn VoxelProjectorSpec>,
     /// Support of the object, and attenuation beyond the volume.
@@ -68,7 +67,6 @@ impl Default for Sart {
 
 conefield_core::stage_type!(Method, "sart", Sart, "simultaneous algebraic reconstruction by subsets of the views");
 
-#[typetag::serde(name = "sart")]
 impl Method for Sart {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         Ok(Box::new(IterativePlan(self.built()?)))

@@ -41,7 +41,7 @@ impl Shared {
     ) -> Result<Self> {
         stop.validate()?;
         scene.validate()?;
-        let projector_kind = projector.typetag_name();
+        let projector_kind = projector.type_name();
         let projector = projector.build().map_err(|e| e.within("projector"))?;
         Ok(Self {
             projector: projector.into(),

@@ -22,9 +22,8 @@ impl Default for Huber {
     }
 }
 
-conefield_core::stage_type!(Loss, "huber", Huber, "half the squared difference, linear where it is large");
+conefield_core::stage_type!(LossSpec, "huber", Huber, "half the squared difference, linear where it is large");
 
-#[typetag::serde(name = "huber")]
 impl LossSpec for Huber {
     fn build(&self) -> Result<Box<dyn Loss>> {
         ensure(is_positive(self.delta), "spec", "delta", self.delta, "a positive number of single precision")?;

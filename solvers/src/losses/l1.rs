@@ -12,9 +12,8 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields)]
 pub struct L1 {}
 
-conefield_core::stage_type!(Loss, "l1", L1, "the absolute difference");
+conefield_core::stage_type!(LossSpec, "l1", L1, "the absolute difference");
 
-#[typetag::serde(name = "l1")]
 impl LossSpec for L1 {
     fn build(&self) -> Result<Box<dyn Loss>> {
         Ok(Box::new(*self))

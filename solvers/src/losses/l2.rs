@@ -12,9 +12,8 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields)]
 pub struct L2 {}
 
-conefield_core::stage_type!(Loss, "l2", L2, "half the squared difference");
+conefield_core::stage_type!(LossSpec, "l2", L2, "half the squared difference");
 
-#[typetag::serde(name = "l2")]
 impl LossSpec for L2 {
     fn build(&self) -> Result<Box<dyn Loss>> {
         Ok(Box::new(*self))

@@ -13,13 +13,12 @@ use serde::{Deserialize, Serialize};
 pub struct NoiseWeighted {}
 
 conefield_core::stage_type!(
-    Loss,
+    LossSpec,
     "noise-weighted",
     NoiseWeighted,
     "half the squared difference divided by the noise variance of the measured value"
 );
 
-#[typetag::serde(name = "noise-weighted")]
 impl LossSpec for NoiseWeighted {
     fn build(&self) -> Result<Box<dyn Loss>> {
         Ok(Box::new(Weighted { growth: 0.0, factor: 1.0 }))

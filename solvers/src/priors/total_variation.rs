@@ -30,13 +30,12 @@ impl Default for TotalVariation {
 }
 
 conefield_core::stage_type!(
-    Prior,
+    PriorSpec,
     "total-variation",
     TotalVariation,
     "isotropic total variation over small random blocks of neighbouring points"
 );
 
-#[typetag::serde(name = "total-variation")]
 impl PriorSpec for TotalVariation {
     fn build(&self) -> Result<Box<dyn Prior>> {
         self.blocks().validate()?;

@@ -7,25 +7,21 @@ use conefield_core::checkpoint::Resume;
 use conefield_core::error::{Error, Result};
 use conefield_core::method::Record;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::registry::Kind;
-use conefield_core::registry::Settings;
+use conefield_core::registry::Registered;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 use std::fmt::Debug;
 
 /// Settings of a callback.
-#[typetag::serde(tag = "type")]
-pub trait CallbackSpec: Debug + Send + Sync {
+pub trait CallbackSpec: Registered + Debug + Send + Sync {
     /// The callback, or why the settings are invalid.
     fn build(&self) -> Result<Box<dyn Callback>>;
     /// A copy of the settings.
     fn copy(&self) -> Box<dyn CallbackSpec>;
 }
 
-impl Settings for dyn CallbackSpec {
-    const KIND: Kind = Kind::Callback;
-}
+conefield_core::settings_of!(Callback, CallbackSpec);
 
 impl Clone for Box<dyn CallbackSpec> {
     fn clone(&self) -> Self {

@@ -20,9 +20,8 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 struct Blocks {}
 
-conefield_core::stage_type!(Basis, "test-blocks", Blocks, "for tests");
+conefield_core::stage_type!(BasisSpec, "test-blocks", Blocks, "for tests");
 
-#[typetag::serde(name = "test-blocks")]
 impl BasisSpec for Blocks {
     fn build(&self) -> Result<Box<dyn Basis>> {
         Ok(Box::new(*self))

@@ -10,17 +10,15 @@ use conefield_core::basis::BasisSpec;
 use conefield_core::data_term::DataTermSpec;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::loss::Loss;
-use conefield_core::registry::{Kind, Origin, Settings, stage_types};
+use conefield_core::registry::{Kind, Origin, Settings, read, stage_types};
 use conefield_core::regularizer::RegularizerSpec;
 use conefield_core::runner::Runner;
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 use conefield_core::spec::check;
-use conefield_core::spec::stage::read;
 use conefield_core::stage::Stage;
 use conefield_core::voxel::VoxelProjectorSpec;
-use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 /// How [`check_type`] checks a stage.
@@ -107,10 +105,7 @@ pub fn check_package(package: &str) -> Result<Vec<Report>> {
 /// Builds a stage of `kind` from `settings`, which include its type and are checked as those in a spec are, and runs the
 /// checks of the kind. Gives each report with the number of input channels, where that is a choice.
 pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(Option<usize>, Report)>> {
-    fn of<T: Settings + ?Sized>(settings: &Value) -> Result<Box<T>>
-    where
-        Box<T>: DeserializeOwned,
-    {
+    fn of<T: Settings + ?Sized + 'static>(settings: &Value) -> Result<Box<T>> {
         read(settings.clone()).map_err(|e| Error::invalid("stage", "type", e, "a registered type with its settings"))
     }
     check::settings(kind, settings, &format!("settings of {}", settings["type"].as_str().unwrap_or_default()))?;

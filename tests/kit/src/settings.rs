@@ -2,17 +2,14 @@
 
 use crate::Report;
 use crate::call::settle;
-use conefield_core::registry::Settings;
-use conefield_core::spec::stage::read;
+use conefield_core::registry::{Settings, read};
 use serde::Serialize;
-use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 /// Writes and reads the settings of the type `name`: the defaults, also given by the name only, and `settings`.
 pub fn check_settings<T>(name: &str, settings: &Value) -> Report
 where
-    T: Settings + Serialize + ?Sized,
-    Box<T>: DeserializeOwned,
+    T: Settings + Serialize + ?Sized + 'static,
 {
     let mut report = Report { stage: format!("settings of {} {name:?}", T::KIND), entries: vec![] };
     let written = |value: Value| -> Result<Value, String> {

@@ -26,9 +26,8 @@ impl Default for Huber {
     }
 }
 
-conefield_plugin::stage_type!(Regularizer, "huber", Huber, "flat or smooth attenuation with few edges");
+conefield_plugin::stage_type!(RegularizerSpec, "huber", Huber, "flat or smooth attenuation with few edges");
 
-#[typetag::serde(name = "huber")]
 impl RegularizerSpec for Huber {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
         let good = self.weight.is_finite() && self.weight >= 0.0;

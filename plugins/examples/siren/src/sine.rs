@@ -12,7 +12,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
 
-conefield_plugin::stage_type!(Field, "siren", Siren, "multi-layer perceptron of sines");
+conefield_plugin::stage_type!(FieldSpec, "siren", Siren, "multi-layer perceptron of sines");
 
 /// Settings of `siren`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -32,7 +32,6 @@ impl Default for Siren {
     }
 }
 
-#[typetag::serde(name = "siren")]
 impl FieldSpec for Siren {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {
         ensure((1..=1024).contains(&self.width), "spec", "width", self.width, "1 to 1024")?;

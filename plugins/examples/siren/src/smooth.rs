@@ -10,7 +10,7 @@ use conefield_plugin::stage::{
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-conefield_plugin::stage_type!(Normalizer, "ray-smooth", RaySmooth, "features smoothed along each ray");
+conefield_plugin::stage_type!(NormalizerSpec, "ray-smooth", RaySmooth, "features smoothed along each ray");
 
 /// Settings of `ray-smooth`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -26,7 +26,6 @@ impl Default for RaySmooth {
     }
 }
 
-#[typetag::serde(name = "ray-smooth")]
 impl NormalizerSpec for RaySmooth {
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
         let good = (0.0..1.0).contains(&self.strength);

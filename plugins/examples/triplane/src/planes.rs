@@ -14,7 +14,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
-conefield_plugin::stage_type!(Encoder, "triplane", Triplane, "products of planes and lines");
+conefield_plugin::stage_type!(EncoderSpec, "triplane", Triplane, "products of planes and lines");
 
 /// Settings of `triplane`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -34,7 +34,6 @@ impl Default for Triplane {
     }
 }
 
-#[typetag::serde(name = "triplane")]
 impl EncoderSpec for Triplane {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         let Self { levels, resolution, features } = *self;

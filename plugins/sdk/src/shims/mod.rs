@@ -248,8 +248,7 @@ mod tests {
         panics: bool,
     }
 
-    conefield_core::stage_type!(Encoder, "scaled", Scaled, "for tests");
-    #[typetag::serde(name = "scaled")]
+    conefield_core::stage_type!(EncoderSpec, "scaled", Scaled, "for tests");
     impl EncoderSpec for Scaled {
         fn build(&self) -> Result<Box<dyn Encoder>> {
             Ok(Box::new(self.clone()))

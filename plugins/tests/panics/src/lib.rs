@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicU32, Ordering};
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(Encoder, "panics", Panics, "panics on request");
+conefield_plugin::stage_type!(EncoderSpec, "panics", Panics, "panics on request");
 
 /// When to panic.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -33,7 +33,6 @@ impl Default for Panics {
     }
 }
 
-#[typetag::serde(name = "panics")]
 impl EncoderSpec for Panics {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         assert!(self.when != When::Create, "as ordered, in create");

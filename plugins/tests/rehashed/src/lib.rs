@@ -11,13 +11,12 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(Encoder, "rehashed", Rehashed, "the built-in hash grid as a plugin");
+conefield_plugin::stage_type!(EncoderSpec, "rehashed", Rehashed, "the built-in hash grid as a plugin");
 
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]
 struct Rehashed(HashGrid);
 
-#[typetag::serde(name = "rehashed")]
 impl EncoderSpec for Rehashed {
     fn build(&self) -> Result<Box<dyn Encoder>> {
         self.0.build()

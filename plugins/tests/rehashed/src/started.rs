@@ -11,13 +11,12 @@ use serde::{Deserialize, Serialize};
 
 macro_rules! stands_for {
     ($($name:literal $own:ident $other:ident;)*) => {$(
-        conefield_plugin::stage_type!(Initializer, $name, $own, "as the built-in one does it");
+        conefield_plugin::stage_type!(InitializerSpec, $name, $own, "as the built-in one does it");
 
         #[derive(Serialize, Deserialize, JsonSchema)]
         #[serde(transparent)]
         struct $own($other);
 
-        #[typetag::serde(name = $name)]
         impl InitializerSpec for $own {
             fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
                 self.0.build(weights)

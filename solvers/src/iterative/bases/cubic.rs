@@ -32,9 +32,8 @@ impl Default for Cubic {
     }
 }
 
-conefield_core::stage_type!(Basis, "cubic", Cubic, "samples of a cubic spline on a coarser grid");
+conefield_core::stage_type!(BasisSpec, "cubic", Cubic, "samples of a cubic spline on a coarser grid");
 
-#[typetag::serde(name = "cubic")]
 impl BasisSpec for Cubic {
     fn build(&self) -> Result<Box<dyn Basis>> {
         ensure((0.5..=64.0).contains(&self.spacing), "spec", "spacing", self.spacing, "0.5 to 64 voxels")?;

@@ -13,9 +13,8 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct Voxels {}
 
-conefield_core::stage_type!(Basis, "voxels", Voxels, "the voxels themselves");
+conefield_core::stage_type!(BasisSpec, "voxels", Voxels, "the voxels themselves");
 
-#[typetag::serde(name = "voxels")]
 impl BasisSpec for Voxels {
     fn build(&self) -> Result<Box<dyn Basis>> {
         Ok(Box::new(*self))

@@ -13,9 +13,8 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct LeastSquares {}
 
-conefield_core::stage_type!(DataTerm, "least-squares", LeastSquares, "squared residuals with equal weights");
+conefield_core::stage_type!(DataTermSpec, "least-squares", LeastSquares, "squared residuals with equal weights");
 
-#[typetag::serde(name = "least-squares")]
 impl DataTermSpec for LeastSquares {
     fn build(&self) -> Result<Box<dyn DataTerm>> {
         Ok(Box::new(*self))

@@ -15,13 +15,12 @@ use serde::{Deserialize, Serialize};
 pub struct NoiseWeighted {}
 
 conefield_core::stage_type!(
-    DataTerm,
+    DataTermSpec,
     "noise-weighted",
     NoiseWeighted,
     "squared residuals divided by the noise variance of the measured values"
 );
 
-#[typetag::serde(name = "noise-weighted")]
 impl DataTermSpec for NoiseWeighted {
     fn build(&self) -> Result<Box<dyn DataTerm>> {
         Ok(Box::new(*self))

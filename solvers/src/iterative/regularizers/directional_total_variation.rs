@@ -43,13 +43,12 @@ impl Default for DirectionalTotalVariation {
 }
 
 conefield_core::stage_type!(
-    Regularizer,
+    RegularizerSpec,
     "directional-total-variation",
     DirectionalTotalVariation,
     "flat regions with few, smooth edges"
 );
 
-#[typetag::serde(name = "directional-total-variation")]
 impl RegularizerSpec for DirectionalTotalVariation {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
         validate(self.weight, self.inner, self.weights, self.arc)?;

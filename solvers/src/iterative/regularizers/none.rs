@@ -14,9 +14,8 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct Nonnegative {}
 
-conefield_core::stage_type!(Regularizer, "none", Nonnegative, "non-negative attenuation, no other prior");
+conefield_core::stage_type!(RegularizerSpec, "none", Nonnegative, "non-negative attenuation, no other prior");
 
-#[typetag::serde(name = "none")]
 impl RegularizerSpec for Nonnegative {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
         Ok(Box::new(*self))

@@ -39,16 +39,15 @@ impl Default for Sum {
     }
 }
 
-conefield_core::stage_type!(Regularizer, "sum", Sum, "several priors, each with its own weight");
+conefield_core::stage_type!(RegularizerSpec, "sum", Sum, "several priors, each with its own weight");
 
-#[typetag::serde(name = "sum")]
 impl RegularizerSpec for Sum {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
         ensure(!self.priors.is_empty(), "spec", "priors", "none", "at least one prior")?;
         ensure((1..=1000).contains(&self.turns), "spec", "turns", self.turns, "1 to 1000")?;
         let build = |(i, prior): (usize, &dyn RegularizerSpec)| {
             let place = format!("priors.{i}");
-            ensure(prior.typetag_name() != SUM, "spec", &place, "a sum", "a prior of another type")?;
+            ensure(prior.type_name() != SUM, "spec", &place, "a sum", "a prior of another type")?;
             prior.build().map_err(|e| e.within(&place))
         };
         let parts = self.priors.iter().map(AsRef::as_ref).enumerate().map(build).collect::<Result<_>>()?;

@@ -67,9 +67,8 @@ impl Default for TotalVariation {
     }
 }
 
-conefield_core::stage_type!(Regularizer, "total-variation", TotalVariation, "flat attenuation with few edges");
+conefield_core::stage_type!(RegularizerSpec, "total-variation", TotalVariation, "flat attenuation with few edges");
 
-#[typetag::serde(name = "total-variation")]
 impl RegularizerSpec for TotalVariation {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
         validate(self.weight, self.inner, self.weights, self.arc)?;

@@ -35,13 +35,12 @@ impl Default for CoarseToFine {
 }
 
 conefield_core::stage_type!(
-    Callback,
+    CallbackSpec,
     "coarse-to-fine",
     CoarseToFine,
     "opens the encoder's levels one by one, coarse ones first"
 );
 
-#[typetag::serde(name = "coarse-to-fine")]
 impl CallbackSpec for CoarseToFine {
     fn build(&self) -> Result<Box<dyn Callback>> {
         ensure(self.levels > 0, "spec", "levels", 0, "at least 1")?;

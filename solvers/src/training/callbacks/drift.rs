@@ -38,9 +38,8 @@ impl Default for Drift {
     }
 }
 
-conefield_core::stage_type!(Callback, "drift", Drift, "logs how much a field changes under the same features");
+conefield_core::stage_type!(CallbackSpec, "drift", Drift, "logs how much a field changes under the same features");
 
-#[typetag::serde(name = "drift")]
 impl CallbackSpec for Drift {
     fn build(&self) -> Result<Box<dyn Callback>> {
         let every = self.every.is_finite() && self.every > 0.0;

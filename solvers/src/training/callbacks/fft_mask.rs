@@ -97,9 +97,8 @@ impl Default for FftMask {
     }
 }
 
-conefield_core::stage_type!(Callback, "fft-mask", FftMask, "removes channels whose spectrum is noise");
+conefield_core::stage_type!(CallbackSpec, "fft-mask", FftMask, "removes channels whose spectrum is noise");
 
-#[typetag::serde(name = "fft-mask")]
 impl CallbackSpec for FftMask {
     fn build(&self) -> Result<Box<dyn Callback>> {
         let Self { epoch, threshold, .. } = *self;

@@ -30,9 +30,13 @@ impl Default for Patience {
     }
 }
 
-conefield_core::stage_type!(Callback, "patience", Patience, "ends a run that no longer predicts held-out views better");
+conefield_core::stage_type!(
+    CallbackSpec,
+    "patience",
+    Patience,
+    "ends a run that no longer predicts held-out views better"
+);
 
-#[typetag::serde(name = "patience")]
 impl CallbackSpec for Patience {
     fn build(&self) -> Result<Box<dyn Callback>> {
         ensure(self.records > 0, "spec", "records", 0, "at least 1")?;

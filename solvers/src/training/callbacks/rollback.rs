@@ -54,9 +54,8 @@ impl Default for Rollback {
     }
 }
 
-conefield_core::stage_type!(Callback, "rollback", Rollback, "returns a diverging run to its last good state");
+conefield_core::stage_type!(CallbackSpec, "rollback", Rollback, "returns a diverging run to its last good state");
 
-#[typetag::serde(name = "rollback")]
 impl CallbackSpec for Rollback {
     fn build(&self) -> Result<Box<dyn Callback>> {
         ensure(self.times > 0, "spec", "times", 0, "at least 1; omit rollback to disable it")?;
