@@ -1,7 +1,8 @@
 //! Searches arrays for values that are not allowed, such as NaN.
 
+use crate::parallel;
 use ndarray::{ArrayBase, Data, Dimension};
-use rayon::prelude::*;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Numbers per task.
 const PART: usize = 1 << 16;
@@ -18,9 +19,17 @@ where
     D: Dimension,
 {
     // Nearly all arrays are fine: a fast pass over the memory says so. Only the slow one knows indices.
-    let all = |part: &[f32]| part.iter().fold(true, |all, x| all & fine(*x));
-    if array.as_slice_memory_order().is_some_and(|values| values.par_chunks(PART).all(all)) {
-        return None;
+    if let Some(values) = array.as_slice_memory_order() {
+        let all = AtomicBool::new(true);
+        parallel::each(values.len().div_ceil(PART), &|n| {
+            let part = &values[n * PART..values.len().min((n + 1) * PART)];
+            if all.load(Ordering::Relaxed) && !part.iter().fold(true, |all, x| all & fine(*x)) {
+                all.store(false, Ordering::Relaxed);
+            }
+        });
+        if all.into_inner() {
+            return None;
+        }
     }
     array.indexed_iter().find(|(_, x)| !fine(**x)).map(|(at, x)| (at, *x))
 }

@@ -40,6 +40,7 @@ pub mod opened;
 pub mod orbit;
 pub mod outside;
 pub mod pages;
+pub mod parallel;
 pub mod parts;
 pub mod pipeline;
 pub mod place;

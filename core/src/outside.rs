@@ -1,8 +1,8 @@
 //! Rays that pass beside the volume but are attenuated: the object is larger than the volume.
 
 use crate::geometry::{Ray, VoxelGrid, norm, sub};
+use crate::parallel;
 use crate::scan::Scan;
-use rayon::prelude::*;
 use serde::Serialize;
 
 /// Views that are examined, and blocks along each side of the detector.
@@ -33,33 +33,30 @@ impl Outside {
         let size = |n: usize| n.div_ceil(BLOCKS).max(1);
         let (tall, wide) = (size(rows), size(columns));
         let views: Vec<usize> = (0..g.views.len()).step_by(g.views.len().div_ceil(VIEWS).max(1)).collect();
-        let found: Vec<(usize, f32, [usize; 3])> = views
-            .par_iter()
-            .map(|&view| {
-                let image = scan.view(view);
-                let (mut blocks, mut most, mut along) = (0, 0.0f32, [0; 3]);
-                for row in (0..rows).step_by(tall) {
-                    for column in (0..columns).step_by(wide) {
-                        let ends = [(row + tall).min(rows), (column + wide).min(columns)];
-                        let [r, c] = [(row + ends[0]) as f64 / 2.0 - 0.5, (column + ends[1]) as f64 / 2.0 - 0.5];
-                        let v = &g.views[view];
-                        let to = sub(v.pixel(g.detector, r, c), v.source);
-                        let ray = Ray { origin: v.source, direction: to.map(|x| x / norm(to)) };
-                        if ray.clip(grid.bounds()).is_some() {
-                            continue;
-                        }
-                        let part = image.slice(ndarray::s![row..ends[0], column..ends[1]]);
-                        let mean = part.mean().unwrap_or(0.0);
-                        if mean > level {
-                            blocks += 1;
-                            most = most.max(mean);
-                            along[farthest(&ray, &grid)] += 1;
-                        }
+        let found: Vec<(usize, f32, [usize; 3])> = parallel::map(&views, |_, &view| {
+            let image = scan.view(view);
+            let (mut blocks, mut most, mut along) = (0, 0.0f32, [0; 3]);
+            for row in (0..rows).step_by(tall) {
+                for column in (0..columns).step_by(wide) {
+                    let ends = [(row + tall).min(rows), (column + wide).min(columns)];
+                    let [r, c] = [(row + ends[0]) as f64 / 2.0 - 0.5, (column + ends[1]) as f64 / 2.0 - 0.5];
+                    let v = &g.views[view];
+                    let to = sub(v.pixel(g.detector, r, c), v.source);
+                    let ray = Ray { origin: v.source, direction: to.map(|x| x / norm(to)) };
+                    if ray.clip(grid.bounds()).is_some() {
+                        continue;
+                    }
+                    let part = image.slice(ndarray::s![row..ends[0], column..ends[1]]);
+                    let mean = part.mean().unwrap_or(0.0);
+                    if mean > level {
+                        blocks += 1;
+                        most = most.max(mean);
+                        along[farthest(&ray, &grid)] += 1;
                     }
                 }
-                (blocks, most, along)
-            })
-            .collect();
+            }
+            (blocks, most, along)
+        });
         let shown = found.iter().filter(|f| f.0 > 2).count();
         let all: usize = found.iter().map(|f| f.0).sum();
         let sum = |k: usize| found.iter().map(|f| f.2[k]).sum::<usize>();

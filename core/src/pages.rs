@@ -4,9 +4,9 @@
 //! and a step takes about twice as long.
 
 use crate::allowance;
+use crate::parallel;
 use bytemuck::Pod;
 use memmap2::MmapMut;
-use rayon::prelude::*;
 use std::fmt;
 use std::ops::{Deref, DerefMut};
 
@@ -19,7 +19,7 @@ const PART: usize = 1 << 18;
 /// Copies `from` to `to`, of the same length, on all threads.
 pub fn copy<T: Pod + Send + Sync>(to: &mut [T], from: &[T]) {
     debug_assert_eq!(to.len(), from.len());
-    to.par_chunks_mut(PART).zip(from.par_chunks(PART)).for_each(|(to, from)| {
+    parallel::over(to.chunks_mut(PART).zip(from.chunks(PART)), |_, (to, from)| {
         to.copy_from_slice(from);
         allowance::trim();
     });

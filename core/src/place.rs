@@ -18,9 +18,9 @@ pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 use crate::allowance;
 use crate::error::Result;
 use crate::geometry::Geometry;
+use crate::parallel;
 use crate::voxel::{VoxelOperator, VoxelProjector};
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, Zip, s};
-use rayon::prelude::*;
 use serde::Serialize;
 use std::any::Any;
 use std::borrow::Cow;
@@ -361,8 +361,7 @@ pub trait Place: Send + Sync {
         first: usize,
     ) -> Result<()> {
         self.change(images, &mut |images| {
-            let each = images.axis_iter_mut(Axis(0)).into_par_iter().zip(views);
-            each.for_each(|(image, &view)| {
+            parallel::over(images.axis_iter_mut(Axis(0)).zip(views), |_, (image, &view)| {
                 work.filter(view, image.into_slice().unwrap_or_else(|| unreachable!("images are contiguous")));
             });
         })?;
@@ -457,14 +456,14 @@ impl Place for Host {
     fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()> {
         self.change(to, &mut |to| {
             let mut to = to.slice_mut(s![first..first + from.len_of(Axis(0)), .., ..]);
-            Zip::from(&mut to).and(from).par_for_each(|to, from| *to = *from);
+            parallel::over(to.outer_iter_mut().zip(from.outer_iter()), |_, (mut to, from)| to.assign(&from));
         })
     }
 
     fn store(&self, from: &Array, first: usize, mut to: ArrayViewMut3<'_, f32>) -> Result<()> {
         if let Some(from) = from.on_host() {
             let from = from.slice(s![first..first + to.len_of(Axis(0)), .., ..]);
-            Zip::from(&mut to).and(from).par_for_each(|to, from| *to = *from);
+            parallel::over(to.outer_iter_mut().zip(from.outer_iter()), |_, (mut to, from)| to.assign(&from));
         }
         Ok(())
     }
@@ -510,6 +509,6 @@ fn project(
         let planes = first..(first + planes).min(nx);
         let geometry = Geometry { volume: geometry.volume.slab(planes.clone()), ..geometry.clone() };
         operator.forward(&geometry, views, volume.slice(s![planes, .., ..]), part.view_mut());
-        Zip::from(&mut images).and(&part).par_for_each(|sum, part| *sum += part);
+        parallel::over(images.outer_iter_mut().zip(part.outer_iter()), |_, (mut sum, part)| sum += &part);
     }
 }

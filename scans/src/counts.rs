@@ -10,9 +10,9 @@ use crate::diagnosis::border::border_medians;
 use crate::diagnosis::quantiles::{median, quantile};
 use conefield_core::error::ensure;
 use conefield_core::finite::stray;
+use conefield_core::parallel;
 use conefield_core::{Error, Result};
 use conefield_io::{Conversion, OpenBeam};
-use ndarray::parallel::prelude::*;
 use ndarray::{Array2, Array3, ArrayView2, Axis, Zip};
 use serde::Serialize;
 
@@ -56,7 +56,7 @@ pub fn line_integrals(
     let dark = conversion.dark.as_ref();
     if let Some(d) = dark {
         check_field(place, "dark", d, [rows, columns])?;
-        values.axis_iter_mut(Axis(0)).into_par_iter().for_each(|mut v| v -= d);
+        parallel::over(values.axis_iter_mut(Axis(0)), |_, mut v| v -= d);
     }
     let response = response(place, conversion, [rows, columns])?;
     let mut open = open_beam(place, conversion, views)?;
@@ -75,7 +75,7 @@ pub fn line_integrals(
 
     // Without a flat field every pixel has the same response. A dead pixel's response would only produce infinities.
     let response = response.map(|r| r.mapv(|x| x.max(floor))).unwrap_or_else(|| Array2::ones((rows, columns)));
-    values.axis_iter_mut(Axis(0)).into_par_iter().zip(&open).for_each(|(mut view, &open)| {
+    parallel::over(values.axis_iter_mut(Axis(0)).zip(&open), |_, (mut view, &open)| {
         Zip::from(&mut view).and(&response).for_each(|x, &r| *x = (open * r / x.max(floor)).ln());
     });
     let staying = outliers(values.view(), &bad);
@@ -90,7 +90,7 @@ pub fn line_integrals(
         return Err(Error::invalid(place, "counts", found, expected));
     }
     let filling = Filling::new(&bad).ok_or_else(|| too_bad(place, count, pixels))?;
-    values.axis_iter_mut(Axis(0)).into_par_iter().for_each(|v| filling.fill(v));
+    parallel::over(values.axis_iter_mut(Axis(0)), |_, v| filling.fill(v));
     let report = CountsReport {
         open_beam: [low, mid, high].map(f64::from),
         floor: floor.into(),
@@ -171,7 +171,7 @@ fn clamped(values: &Array3<f32>, open: &[f32], response: &Array2<f32>, bad: &Arr
             .for_each(|&x, &r, &b| n += usize::from(!b && x == (open * r / floor).ln()));
         n
     };
-    values.axis_iter(Axis(0)).into_par_iter().zip(open).map(of_view).sum()
+    parallel::map(values.axis_iter(Axis(0)).zip(open), |_, view| of_view(view)).into_iter().sum()
 }
 
 fn check_field(place: &str, field: &str, image: &Array2<f32>, want: [usize; 2]) -> Result<()> {

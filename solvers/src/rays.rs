@@ -3,6 +3,7 @@
 use crate::shadow::{air_level, shadow};
 use conefield_core::backend::TrainRay;
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::parallel;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::random::stream;
 use conefield_core::scan::{Scan, ScanHeader};
@@ -128,27 +129,24 @@ impl<'a> RaySource<'a> {
     pub fn new(scan: &'a Scan, scene: &'a Scene, pipeline: &Pipeline, choice: RayChoice) -> Result<Self> {
         let RayChoice { views, pixels: which, margin, windows } = choice;
         let level = (which == Pixels::Support).then(|| air_level(scan));
-        let pixels: Vec<Vec<u32>> = (0..scan.geometry.views.len())
-            .into_par_iter()
-            .map(|v| {
-                let view = scan.view(v);
-                let support = level.map(|level| shadow(view, level, margin));
-                let columns = scan.geometry.detector[1];
-                let usable = |&p: &u32| {
-                    let (row, column) = (p as usize / columns, p as usize % columns);
-                    let counts = match (which, &support) {
-                        (Pixels::Positive, _) => view[[row, column]] > 0.0,
-                        (_, Some(s)) => s[[row, column]],
-                        _ => true,
-                    };
-                    counts && pipeline.sees(&scene.pixel_ray(&scan.geometry, v, row, column))
+        let pixels: Vec<Vec<u32>> = parallel::map(0..scan.geometry.views.len(), |_, v| {
+            let view = scan.view(v);
+            let support = level.map(|level| shadow(view, level, margin));
+            let columns = scan.geometry.detector[1];
+            let usable = |&p: &u32| {
+                let (row, column) = (p as usize / columns, p as usize % columns);
+                let counts = match (which, &support) {
+                    (Pixels::Positive, _) => view[[row, column]] > 0.0,
+                    (_, Some(s)) => s[[row, column]],
+                    _ => true,
                 };
-                let mut pixels: Vec<u32> = (0..view.len() as u32).filter(usable).collect();
-                // The list has grown by doubling, but the memory estimate assumes its exact length.
-                pixels.shrink_to_fit();
-                pixels
-            })
-            .collect();
+                counts && pipeline.sees(&scene.pixel_ray(&scan.geometry, v, row, column))
+            };
+            let mut pixels: Vec<u32> = (0..view.len() as u32).filter(usable).collect();
+            // The list has grown by doubling, but the memory estimate assumes its exact length.
+            pixels.shrink_to_fit();
+            pixels
+        });
         let usable: Vec<usize> = (0..pixels.len()).filter(|&v| !pixels[v].is_empty()).collect();
         if usable.is_empty() {
             return Err(Error::invalid(
@@ -160,7 +158,7 @@ impl<'a> RaySource<'a> {
         }
         let columns = scan.geometry.detector[1];
         let windows: Option<(Windows, Vec<Vec<u32>>)> =
-            windows.map(|w| (w, pixels.par_iter().map(|p| w.whole(p, columns)).collect()));
+            windows.map(|w| (w, parallel::map(&pixels, |_, p| w.whole(p, columns))));
         Ok(Self { scan, scene, pixels, windows, views, usable })
     }
 

@@ -10,10 +10,10 @@
 use crate::support::Blocks;
 use conefield_core::geometry::{Ray, norm};
 use conefield_core::matrix::{inner, inverse};
+use conefield_core::parallel;
 use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::scene::SupportRule;
 use conefield_core::support::Cylinder;
-use rayon::prelude::*;
 
 /// Most rays in the fit.
 const RAYS: usize = 50_000;
@@ -320,7 +320,7 @@ fn refine(start: Solid, measured: &[Measured], high: f64, pixel: f64) -> Solid {
     let mut damping = 1e-3;
     for _ in 0..60 {
         // Weights are those of the iteration's start, as in iteratively reweighted least squares.
-        let weights: Vec<f64> = measured.par_iter().map(|m| weight(solid.above(m))).collect();
+        let weights: Vec<f64> = parallel::map(measured, |_, m| weight(solid.above(m)));
         let cost = |solid: &Solid| {
             let one = |(m, w): (&Measured, &f64)| [w * solid.above(m).powi(2)];
             sums(measured, &weights, one)[0]
@@ -391,7 +391,7 @@ fn sums<const N: usize>(
         a
     };
     let part = |(m, w): (&[Measured], &[f64])| m.iter().zip(w).map(&of).fold([0.0; N], add);
-    let parts: Vec<_> = measured.par_chunks(4096).zip(weights.par_chunks(4096)).map(part).collect();
+    let parts: Vec<_> = parallel::map(measured.chunks(4096).zip(weights.chunks(4096)), |_, both| part(both));
     parts.into_iter().fold([0.0; N], add)
 }
 

@@ -8,11 +8,11 @@
 
 use crate::shadow::box_filter;
 use conefield_core::geometry::{Vec3, VoxelGrid};
+use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use conefield_core::support::Support;
 use conefield_projectors::voxel::layout::Pinhole;
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
-use rayon::prelude::*;
 
 /// Cells along the longest side of the volume.
 const CELLS: f64 = 64.0;
@@ -61,9 +61,9 @@ impl Blocks {
         let g = &scan.geometry;
         let size = g.detector[1].div_ceil(BLOCKS).max(2);
         let views: Vec<usize> = (0..g.views.len()).step_by(every).collect();
-        let means: Vec<Array2<f32>> = views.par_iter().map(|&v| block_means(scan.view(v), size)).collect();
-        let largest = |v: &usize| scan.view(*v).iter().copied().fold(0.0f32, f32::max);
-        let top = views.par_iter().map(largest).reduce(|| 0.0, f32::max);
+        let means: Vec<Array2<f32>> = parallel::map(&views, |_, &v| block_means(scan.view(v), size));
+        let largest = parallel::map(&views, |_, &v| scan.view(v).iter().copied().fold(0.0f32, f32::max));
+        let top = largest.into_iter().fold(0.0, f32::max);
         let deviation = deviation(&means, top);
         let air = air(&means, deviation, top);
         Self { size, every, means, deviation, top, air }
@@ -108,39 +108,34 @@ pub fn carve(scan: &Scan) -> CarvedSupport {
     let cells = cells(&g.volume);
     // Half a cell's diagonal on the detector, in blocks, at the largest magnification.
     let half = 0.5 * cells.spacing.iter().map(|s| s * s).sum::<f64>().sqrt();
-    let views: Vec<ViewShadow> = blocks
-        .means
-        .par_iter()
-        .enumerate()
-        .filter_map(|(v, means)| {
-            let pinhole = Pinhole::of(g, v);
-            let object = means.mapv(|m| m > level);
-            let nearest = corners(&cells).into_iter().map(|p| pinhole.project(p).1).fold(f64::INFINITY, f64::min);
-            if blocks.cut(v, 1) || nearest <= 0.0 {
-                return None;
-            }
-            let w = &g.views[v];
-            let pitch = [w.u, w.v].map(|a| a.iter().map(|x| x * x).sum::<f64>().sqrt());
-            let reach = half * pinhole.distance / nearest / (pitch[0].min(pitch[1]) * size as f64);
-            let wide = box_filter(object.mapv(|o| f32::from(u8::from(o))), 1 + reach.ceil() as usize, |window| {
-                window.iter().copied().fold(0.0, f32::max)
-            });
-            Some(ViewShadow { pinhole, object: wide.mapv(|x| x > 0.0) })
-        })
-        .collect();
+    let views: Vec<ViewShadow> = parallel::map(&blocks.means, |v, means| {
+        let pinhole = Pinhole::of(g, v);
+        let object = means.mapv(|m| m > level);
+        let nearest = corners(&cells).into_iter().map(|p| pinhole.project(p).1).fold(f64::INFINITY, f64::min);
+        if blocks.cut(v, 1) || nearest <= 0.0 {
+            return None;
+        }
+        let w = &g.views[v];
+        let pitch = [w.u, w.v].map(|a| a.iter().map(|x| x * x).sum::<f64>().sqrt());
+        let reach = half * pinhole.distance / nearest / (pitch[0].min(pitch[1]) * size as f64);
+        let wide = box_filter(object.mapv(|o| f32::from(u8::from(o))), 1 + reach.ceil() as usize, |window| {
+            window.iter().copied().fold(0.0, f32::max)
+        });
+        Some(ViewShadow { pinhole, object: wide.mapv(|x| x > 0.0) })
+    })
+    .into_iter()
+    .flatten()
+    .collect();
     if views.len() < VIEWS {
         return nothing("as the object reaches the sides of the views");
     }
     let [nx, ny, nz] = cells.shape;
-    let left: Vec<bool> = (0..nx * ny * nz)
-        .into_par_iter()
-        .map(|i| {
-            let p = cells.voxel([i / (ny * nz), i / nz % ny, i % nz]);
-            let votes = views.iter().filter_map(|v| v.air(p, g.detector, size));
-            let (seen, air) = votes.fold((0, 0), |(seen, air), a| (seen + 1, air + usize::from(a)));
-            air < VIEWS || (air as f64) < SHARE * seen as f64
-        })
-        .collect();
+    let left: Vec<bool> = parallel::map(0..nx * ny * nz, |_, i| {
+        let p = cells.voxel([i / (ny * nz), i / nz % ny, i % nz]);
+        let votes = views.iter().filter_map(|v| v.air(p, g.detector, size));
+        let (seen, air) = votes.fold((0, 0), |(seen, air), a| (seen + 1, air + usize::from(a)));
+        air < VIEWS || (air as f64) < SHARE * seen as f64
+    });
     let share = views.len();
     match Support::new(cells, widened(&left, cells.shape)) {
         None => nothing("as every view shows nothing but air"),
@@ -245,11 +240,8 @@ fn corners(grid: &VoxelGrid) -> [Vec3; 8] {
 /// Cells and all their neighbours.
 fn widened(cells: &[bool], [nx, ny, nz]: [usize; 3]) -> Vec<bool> {
     let near = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
-    (0..cells.len())
-        .into_par_iter()
-        .map(|i| {
-            let [x, y, z] = [i / (ny * nz), i / nz % ny, i % nz];
-            near(x, nx).any(|x| near(y, ny).any(|y| near(z, nz).any(|z| cells[(x * ny + y) * nz + z])))
-        })
-        .collect()
+    parallel::map(0..cells.len(), |_, i| {
+        let [x, y, z] = [i / (ny * nz), i / nz % ny, i % nz];
+        near(x, nx).any(|x| near(y, ny).any(|y| near(z, nz).any(|z| cells[(x * ny + y) * nz + z])))
+    })
 }

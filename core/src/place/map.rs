@@ -1,8 +1,8 @@
 //! Elementwise maps and reductions: each with one text in Rust and one in WGSL.
 
 use crate::allowance;
+use crate::parallel;
 use ndarray::{Array3, CowArray, Ix3};
-use rayon::prelude::*;
 
 /// Numbers per task of a map: few enough for the first-level cache.
 const PART: usize = 1 << 12;
@@ -98,7 +98,7 @@ impl Map {
     pub fn run(&self, factors: [f64; 2], out: &mut Array3<f32>, inputs: &[CowArray<'_, f32, Ix3>]) {
         let inputs: Vec<&[f32]> = inputs.iter().filter_map(|x| x.as_slice()).collect();
         let out = out.as_slice_mut().unwrap_or_default();
-        out.par_chunks_mut(PART).enumerate().for_each(|(n, out)| {
+        parallel::over(out.chunks_mut(PART), |n, out| {
             let part = n * PART..n * PART + out.len();
             let input = |i: usize| inputs.get(i).map_or(&[][..], |x| &x[part.clone()]);
             (self.host)(factors, out, [input(0), input(1)]);
@@ -142,7 +142,7 @@ impl Reduction {
             Self::Differences => {
                 let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
                 let part = |(x, y): (&[f32], &[f32])| x.iter().zip(y).map(square).sum::<f64>();
-                ordered(x.par_chunks(SUMMED).zip(y.par_chunks(SUMMED)).map(part))
+                ordered(x.chunks(SUMMED).zip(y.chunks(SUMMED)), part)
             }
             Self::Maximum => f64::from(x.iter().fold(0.0f32, |m, &v| m.max(v))),
             Self::Nonzero => x.iter().filter(|x| **x != 0.0).count() as f64,
@@ -153,10 +153,13 @@ impl Reduction {
 /// `Σ x²`, independent of the number of threads.
 pub fn squares(x: &[f32]) -> f64 {
     let part = |part: &[f32]| part.iter().map(|&v| f64::from(v) * f64::from(v)).sum::<f64>();
-    ordered(x.par_chunks(SUMMED).map(part))
+    ordered(x.chunks(SUMMED), part)
 }
 
-fn ordered(parts: impl IndexedParallelIterator<Item = f64>) -> f64 {
-    let parts: Vec<f64> = parts.inspect(|_| allowance::trim()).collect();
-    parts.iter().sum()
+fn ordered<T: Send>(parts: impl Iterator<Item = T>, sum: impl Fn(T) -> f64 + Sync) -> f64 {
+    let sums = parallel::map(parts, |_, part| {
+        allowance::trim();
+        sum(part)
+    });
+    sums.iter().sum()
 }

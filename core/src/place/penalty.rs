@@ -4,9 +4,9 @@ use super::{Array, StatePart};
 use crate::allowance;
 use crate::error::{Error, Result};
 use crate::geometry::Vec3;
+use crate::parallel;
 use crate::wgsl::Fragment;
 use ndarray::ArrayView3;
-use rayon::prelude::*;
 
 /// Bounds of coefficients: none is below `low` or above `high`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -228,7 +228,7 @@ impl<'a> Update<'a> {
 
     /// Writes the argument of the proximal map into `gradient`.
     fn step(&mut self) {
-        self.parts().into_par_iter().for_each(|part| {
+        parallel::over(self.parts(), |_, part| {
             let mut v = [0.0; PART];
             let v = &mut v[..part.x.len()];
             part.read(0, v);
@@ -239,7 +239,7 @@ impl<'a> Update<'a> {
 
     /// Reads the result of the proximal map from `ahead`.
     fn momentum(&mut self) {
-        self.parts().into_par_iter().for_each(|mut part| {
+        parallel::over(self.parts(), |_, mut part| {
             let mut u = [0.0; PART];
             let u = &mut u[..part.x.len()];
             u.copy_from_slice(part.ahead);

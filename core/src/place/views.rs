@@ -4,9 +4,9 @@ use super::map::squares;
 use super::{Array, Mask, Place};
 use crate::data_term::Misfit;
 use crate::error::Result;
+use crate::parallel;
 use crate::voxel::VoxelView;
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, Zip, s};
-use rayon::prelude::*;
 
 /// Measured line integrals, `[view, row, column]`.
 pub struct MeasuredViews<'a> {
@@ -92,17 +92,14 @@ impl Weighing<'_> {
         images: &mut Array3<f32>,
         work: impl Fn(usize, &[f32], &mut [f32]) -> T + Sync,
     ) -> Vec<T> {
-        let images = images.axis_iter_mut(Axis(0)).into_par_iter().zip(views);
-        images
-            .map(|(image, &view)| {
-                let measured = self.views.measured.index_axis(Axis(0), view);
-                let measured = measured.as_standard_layout();
-                match (measured.as_slice(), image.into_slice()) {
-                    (Some(measured), Some(image)) => work(view, measured, image),
-                    _ => unreachable!("images are contiguous"),
-                }
-            })
-            .collect()
+        parallel::map(images.axis_iter_mut(Axis(0)).zip(views), |_, (image, &view)| {
+            let measured = self.views.measured.index_axis(Axis(0), view);
+            let measured = measured.as_standard_layout();
+            match (measured.as_slice(), image.into_slice()) {
+                (Some(measured), Some(image)) => work(view, measured, image),
+                _ => unreachable!("images are contiguous"),
+            }
+        })
     }
 }
 

@@ -2,8 +2,8 @@
 
 use crate::metrics::check;
 use conefield_core::Result;
+use conefield_core::parallel;
 use ndarray::{ArrayView3, Axis as Along};
-use rayon::prelude::*;
 use serde::Serialize;
 
 /// The axis perpendicular to a slice.
@@ -61,21 +61,18 @@ impl SquaredError {
     /// One pass over both volumes, which must have the same shape.
     pub(crate) fn of(result: ArrayView3<f32>, reference: ArrayView3<f32>) -> Self {
         let (nx, ny, nz) = result.dim();
-        let planes: Vec<[Vec<f64>; 2]> = (0..nx)
-            .into_par_iter()
-            .map(|i| {
-                let (a, b) = (result.index_axis(Along(0), i), reference.index_axis(Along(0), i));
-                let (mut y, mut z) = (vec![0.0; ny], vec![0.0; nz]);
-                for ((a, b), y) in a.rows().into_iter().zip(b.rows()).zip(&mut y) {
-                    for ((&a, &b), z) in a.iter().zip(b).zip(&mut z) {
-                        let d = f64::from(a) - f64::from(b);
-                        *z += d * d;
-                        *y += d * d;
-                    }
+        let planes: Vec<[Vec<f64>; 2]> = parallel::map(0..nx, |_, i| {
+            let (a, b) = (result.index_axis(Along(0), i), reference.index_axis(Along(0), i));
+            let (mut y, mut z) = (vec![0.0; ny], vec![0.0; nz]);
+            for ((a, b), y) in a.rows().into_iter().zip(b.rows()).zip(&mut y) {
+                for ((&a, &b), z) in a.iter().zip(b).zip(&mut z) {
+                    let d = f64::from(a) - f64::from(b);
+                    *z += d * d;
+                    *y += d * d;
                 }
-                [y, z]
-            })
-            .collect();
+            }
+            [y, z]
+        });
         // Planes are added in order, whichever thread finishes first.
         let mut slices = [Vec::with_capacity(nx), vec![0.0; ny], vec![0.0; nz]];
         for [y, z] in &planes {

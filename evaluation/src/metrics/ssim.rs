@@ -11,8 +11,8 @@
 use crate::metrics::check;
 use crate::metrics::window::{FIELDS, SsimWindow, products};
 use conefield_core::error::{Result, ensure};
+use conefield_core::parallel;
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, Slice, s};
-use rayon::prelude::*;
 
 /// SSIM as reported by R2-Gaussian: per slice, 11×11 Gaussian, zero padding; slices without a positive reference value
 /// are skipped; mean over slices, then over the three axes. Refuses a reference without a positive value.
@@ -65,14 +65,11 @@ fn over_axes(
     let mut means = 0.0;
     for axis in 0..3 {
         let n = result.shape()[axis];
-        let scores: Vec<Vec<Option<f64>>> = (0..n.div_ceil(BLOCK))
-            .into_par_iter()
-            .map(|block| {
-                let range = block * BLOCK..n.min((block + 1) * BLOCK);
-                let (x, y) = (slices(result, axis, range.clone()), slices(reference, axis, range));
-                x.outer_iter().zip(y.outer_iter()).map(|(x, y)| score(x, y)).collect()
-            })
-            .collect();
+        let scores: Vec<Vec<Option<f64>>> = parallel::map(0..n.div_ceil(BLOCK), |_, block| {
+            let range = block * BLOCK..n.min((block + 1) * BLOCK);
+            let (x, y) = (slices(result, axis, range.clone()), slices(reference, axis, range));
+            x.outer_iter().zip(y.outer_iter()).map(|(x, y)| score(x, y)).collect()
+        });
         let (mut sum, mut count) = (0.0, 0usize);
         for score in scores.into_iter().flatten().flatten() {
             sum += score;
@@ -141,14 +138,11 @@ pub(crate) fn gaussian_volume(result: ArrayView3<f32>, reference: ArrayView3<f32
     let places = [nx - border, ny - border];
     let tiles: Vec<[usize; 2]> =
         (0..places[0]).step_by(TILE[0]).flat_map(|x| (0..places[1]).step_by(TILE[1]).map(move |y| [x, y])).collect();
-    let sums: Vec<f64> = tiles
-        .into_par_iter()
-        .map(|[x0, y0]| {
-            let (x1, y1) = ((x0 + TILE[0]).min(places[0]) + border, (y0 + TILE[1]).min(places[1]) + border);
-            let part = s![x0..x1, y0..y1, ..];
-            tile_sum(result.slice(part), reference.slice(part), &window, peak)
-        })
-        .collect();
+    let sums: Vec<f64> = parallel::map(tiles, |_, [x0, y0]| {
+        let (x1, y1) = ((x0 + TILE[0]).min(places[0]) + border, (y0 + TILE[1]).min(places[1]) + border);
+        let part = s![x0..x1, y0..y1, ..];
+        tile_sum(result.slice(part), reference.slice(part), &window, peak)
+    });
     Ok(sums.iter().sum::<f64>() / (places[0] * places[1] * (nz - border)) as f64)
 }
 

@@ -1,9 +1,9 @@
 //! Ellipsoids, whose line integrals have a closed form: a reference for projectors and solvers.
 
 use conefield_core::geometry::{Geometry, Ray, Vec3, VoxelGrid, dot};
+use conefield_core::parallel;
 use conefield_core::scan::{Scan, Unit, Volume};
 use ndarray::{Array3, Axis};
-use rayon::prelude::*;
 
 /// A homogeneous ellipsoid with its axes along x, y and z. Where several overlap, their attenuations add up.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -40,7 +40,7 @@ impl Ellipsoid {
 /// The attenuation of `bodies` in the voxels of `grid`, each weighted by the share of 4³ points inside.
 pub fn ellipsoids(bodies: &[Ellipsoid], grid: &VoxelGrid) -> Volume {
     let mut data = Array3::zeros(grid.shape);
-    data.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(x, mut plane)| {
+    parallel::over(data.axis_iter_mut(Axis(0)), |x, mut plane| {
         for ((y, z), out) in plane.indexed_iter_mut() {
             let p = grid.voxel([x, y, z]);
             let mut sum = 0.0;
@@ -60,7 +60,7 @@ pub fn ellipsoids(bodies: &[Ellipsoid], grid: &VoxelGrid) -> Volume {
 pub fn scan_ellipsoids(bodies: &[Ellipsoid], geometry: Geometry) -> Scan {
     let [rows, columns] = geometry.detector;
     let mut projections = Array3::zeros((geometry.views.len(), rows, columns));
-    projections.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(view, mut image)| {
+    parallel::over(projections.axis_iter_mut(Axis(0)), |view, mut image| {
         for ((row, column), out) in image.indexed_iter_mut() {
             let ray = geometry.ray(view, row, column);
             *out = bodies.iter().map(|b| b.value * b.chord(&ray)).sum::<f64>() as f32;

@@ -1,11 +1,11 @@
 //! Photon counting noise of line integrals.
 
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::parallel;
 use ndarray::{Array3, ArrayViewMut2, Axis};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal, Poisson};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -54,7 +54,7 @@ impl DetectorNoise {
             return;
         }
         let detector = Detector { scale, i0, sigma, least };
-        projections.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(view, pixels)| {
+        parallel::over(projections.axis_iter_mut(Axis(0)), |view, pixels| {
             let mut random = ChaCha8Rng::seed_from_u64(seed);
             random.set_stream(view as u64);
             detector.read(pixels, &mut random);

@@ -2,8 +2,8 @@
 
 use super::shape::{Solid, Turn, UPRIGHT, smooth_noise, turn};
 use conefield_core::geometry::{Vec3, dot};
+use conefield_core::parallel;
 use ndarray::Array3;
-use ndarray::parallel::prelude::*;
 
 /// A solid filled with a value.
 #[derive(Debug, Clone)]
@@ -145,7 +145,7 @@ pub(super) fn paint(n: usize, paints: &[Paint]) -> Array3<f32> {
         })
         .collect();
     let mut out = Array3::<f32>::zeros((n, n, n));
-    out.axis_iter_mut(ndarray::Axis(0)).into_par_iter().enumerate().for_each(|(i, mut plane)| {
+    parallel::over(out.axis_iter_mut(ndarray::Axis(0)), |i, mut plane| {
         for (paint, reach) in paints.iter().zip(&reach) {
             if i < reach[0][0] || i >= reach[0][1] {
                 continue;

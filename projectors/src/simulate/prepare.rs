@@ -3,9 +3,9 @@
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::finite::stray;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::parallel;
 use conefield_core::scan::Volume;
 use ndarray::Array3;
-use ndarray::parallel::prelude::*;
 use std::fmt;
 use std::str::FromStr;
 
@@ -29,7 +29,7 @@ pub fn downsample(volume: &Volume, factor: usize) -> Result<Volume> {
     )?;
     let to = shape.map(|n| n / factor);
     let mut data = Array3::<f32>::zeros(to);
-    data.axis_iter_mut(ndarray::Axis(0)).into_par_iter().enumerate().for_each(|(i, mut plane)| {
+    parallel::over(data.axis_iter_mut(ndarray::Axis(0)), |i, mut plane| {
         for ((j, k), mean) in plane.indexed_iter_mut() {
             let block = [i, j, k].map(|n| n * factor..(n + 1) * factor);
             let [x, y, z] = block;

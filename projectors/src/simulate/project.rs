@@ -7,9 +7,9 @@
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::finite::stray;
 use conefield_core::geometry::Geometry;
+use conefield_core::parallel;
 use conefield_core::scan::Volume;
 use ndarray::Array3;
-use rayon::prelude::*;
 
 /// Side of the blocks of cells that are skipped if empty.
 const BLOCK: usize = 8;
@@ -41,8 +41,8 @@ pub fn project(volume: &Volume, geometry: &Geometry, per_voxel_samples: f64) -> 
         return Err(Error::invalid("projection", "detector", found, "projections that fit in memory"));
     }
     pixels.resize(count, 0.0);
-    pixels.par_chunks_mut(rows * columns).enumerate().for_each(|(view, pixels)| {
-        pixels.par_chunks_mut(BAND * columns).enumerate().for_each(|(band, pixels)| {
+    parallel::over(pixels.chunks_mut(rows * columns), |view, pixels| {
+        parallel::over(pixels.chunks_mut(BAND * columns), |band, pixels| {
             for column in 0..columns {
                 for (r, row) in pixels.chunks_mut(columns).enumerate() {
                     row[column] = sampler.integral(geometry, view, band * BAND + r, column);

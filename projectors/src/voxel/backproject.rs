@@ -10,10 +10,10 @@ use super::readers::{Among, Ends, PAD, Path, Stands, places, read};
 use super::upright::{Blend, Upright};
 use conefield_core::allowance;
 use conefield_core::geometry::Geometry;
+use conefield_core::parallel;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, WIDEST, run};
 use conefield_core::voxel::VoxelView;
 use ndarray::{ArrayViewMut3, Axis, s};
-use rayon::prelude::*;
 
 /// Lines of voxels per task, along x and along y. A tile of 512 voxels along z, and the columns of pixels that it meets in
 /// a view, take a quarter of a MiB and stay in a core's cache while all views are added.
@@ -44,7 +44,7 @@ pub fn backproject<R: Real>(
             rest = after;
         }
     }
-    tiles.into_par_iter().for_each(|(first, lines)| {
+    parallel::over(tiles, |_, (first, lines)| {
         run(Tile { detector: geometry.detector, pixels, zeros: &zeros, views: &all, shape, first, lines });
         allowance::trim();
     });

@@ -10,9 +10,9 @@ use super::layout::main_axis;
 use super::walk::VoxelRay;
 use conefield_core::allowance;
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
+use conefield_core::parallel;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// Pixels per bundle.
@@ -164,8 +164,8 @@ pub fn forward<R: Real>(
 ) {
     let volume = volume.as_standard_layout();
     let Some(voxels) = volume.as_slice() else { return };
-    images.into_par_iter().zip(views).for_each(|(mut image, &view)| {
-        image.axis_chunks_iter_mut(Axis(1), BUNDLE).into_par_iter().enumerate().for_each(|(n, mut strip)| {
+    parallel::over(images.into_iter().zip(views), |_, (mut image, &view)| {
+        parallel::over(image.axis_chunks_iter_mut(Axis(1), BUNDLE), |n, mut strip| {
             let mut bundles = vec![];
             (0..strip.nrows()).for_each(|row| Bundle::of(geometry, [view, row, n * BUNDLE], 0, &mut bundles));
             let mut sums = vec![[R::ZERO; BUNDLE]; strip.nrows()];
@@ -242,11 +242,11 @@ pub fn adjoint<R: Real>(
     let (lines, held) = (views.len() * rows, (HELD / bytes.max(1)).max(1));
     for from in (0..lines).step_by(held) {
         let some = from..(from + held).min(lines);
-        let bundles: Vec<Bundle<R>> = some.into_par_iter().flat_map_iter(of_line).collect();
+        let bundles: Vec<Bundle<R>> = parallel::map(some, |_, line| of_line(line)).into_iter().flatten().collect();
         for main in (0..3).filter(|&main| bundles.iter().any(|b| b.main == main)) {
             let [a, b] = across(main);
             let mut turned = volume.view_mut().permuted_axes([main, a, b]);
-            turned.axis_chunks_iter_mut(Axis(0), TILE).into_par_iter().enumerate().for_each(|(n, mut planes)| {
+            parallel::over(turned.axis_chunks_iter_mut(Axis(0), TILE), |n, mut planes| {
                 let of = n * TILE..n * TILE + planes.dim().0;
                 let shape = geometry.volume.shape;
                 let found = run(Adjoint { main, planes: of, shape, bundles: &bundles, projections });

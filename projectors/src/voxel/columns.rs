@@ -5,14 +5,14 @@
 //! of rows at a time. The adjoint goes the same way back: every voxel of a line gathers from the rows that are less
 //! than a voxel away, with the same hat-shaped weights.
 
-use super::layout::{ColumnMajor, batch, column_major_bytes, main_axis, to_voxels};
+use super::layout::{ColumnMajor, ViewColumns, batch, column_major_bytes, main_axis, to_voxels};
 use super::readers::{Among, Ends, PAD, Path, Stands, mix, places, read, read_on};
 use conefield_core::allowance;
 use conefield_core::geometry::{Geometry, Vec3, dot, sub};
+use conefield_core::parallel;
 use conefield_core::scan::ScanHeader;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, WIDEST, run};
 use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// Columns per task of [`forward`].
@@ -209,11 +209,13 @@ pub fn forward<R: Real>(
     let shape = geometry.volume.shape;
     let [nx, ny, nz] = shape;
     let mut lines = vec![0..0; nx * ny];
-    lines.par_iter_mut().zip(voxels.par_chunks(nz)).for_each(|(range, line)| *range = occupied(line));
+    parallel::over(lines.chunks_mut(ny).zip(voxels.chunks(ny * nz)), |_, (ranges, lines)| {
+        ranges.iter_mut().zip(lines.chunks(nz)).for_each(|(range, line)| *range = occupied(line));
+    });
     let rows = geometry.detector[0];
-    projections.into_par_iter().zip(views).for_each(|(mut out, (view, columns))| {
+    parallel::over(projections.into_iter().zip(views), |_, (mut out, (view, columns))| {
         let downwards = geometry.views[*view].v[2] < 0.0;
-        out.axis_chunks_iter_mut(Axis(1), STRIP).into_par_iter().enumerate().for_each(|(n, mut out)| {
+        parallel::over(out.axis_chunks_iter_mut(Axis(1), STRIP), |n, mut out| {
             let first = n * STRIP;
             let at = |number: usize| columns.partition_point(|c| c.number < number);
             let columns = &columns[at(first)..at(first + STRIP)];
@@ -420,7 +422,7 @@ pub fn adjoint<R: Real>(
         let images = projections.slice_axis(Axis(0), part.into());
         let mut pixels = ColumnMajor::new(geometry, &numbers, images, |_, _, _, x| x);
         // The nonzero rows of each column: zeros, as the residual of air in an empty volume, are not gathered.
-        let lengthened = pixels.views_mut().zip(views).map(|(mut view, (_, columns))| {
+        let of_view = |_, (mut view, (_, columns)): (ViewColumns<'_, R>, &(usize, &[Column]))| -> Vec<Range<usize>> {
             let rows = |c: &Column| {
                 let pixels = view.rows(c.number, c.rows.clone());
                 run(Lengthen(c, pixels));
@@ -428,11 +430,11 @@ pub fn adjoint<R: Real>(
                 c.rows.start + found.start..c.rows.start + found.end
             };
             columns.iter().map(rows).collect()
-        });
-        let occupied: Vec<Vec<Range<usize>>> = lengthened.collect();
+        };
+        let occupied = parallel::map(pixels.views_mut().zip(views), of_view);
         for main in 0..2 {
             let mut turned = volume.view_mut().permuted_axes([main, 1 - main, 2]);
-            turned.axis_chunks_iter_mut(Axis(0), TILE).into_par_iter().enumerate().for_each(|(n, mut planes)| {
+            parallel::over(turned.axis_chunks_iter_mut(Axis(0), TILE), |n, mut planes| {
                 let (count, lines, nz) = planes.dim();
                 let stride = nz + 2 * PAD;
                 let mut gathered = vec![R::ZERO; count * (lines + 2) * stride];

@@ -2,10 +2,10 @@
 
 use super::readers::PAD;
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, cross, dot, sub};
+use conefield_core::parallel;
 use conefield_core::simd::Real;
 use conefield_core::voxel::VoxelView;
 use ndarray::{ArrayView3, Axis};
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// A world position in voxel coordinates: integers are voxel centres.
@@ -49,7 +49,7 @@ impl<R: Real> ColumnMajor<R> {
         let stride = rows + 2 * PAD;
         let mut data = vec![R::ZERO; views.len() * columns * stride];
         let downwards: Vec<bool> = views.iter().map(|&v| geometry.views[v].v[2] < 0.0).collect();
-        data.par_chunks_mut(columns * stride).zip(&downwards).enumerate().for_each(|(n, (out, &downwards))| {
+        parallel::over(data.chunks_mut((columns * stride).max(1)).zip(&downwards), |n, (out, &downwards)| {
             let view = projections.index_axis(Axis(0), n);
             // Strips of columns: each row's numbers are read contiguously and written to lines that stay in cache.
             const STRIP: usize = 16;
@@ -73,9 +73,9 @@ impl<R: Real> ColumnMajor<R> {
     }
 
     /// Mutable access to every view.
-    pub fn views_mut(&mut self) -> impl IndexedParallelIterator<Item = ViewColumns<'_, R>> {
+    pub fn views_mut(&mut self) -> impl Iterator<Item = ViewColumns<'_, R>> {
         let (rows, stride) = (self.rows, self.rows + 2 * PAD);
-        self.data.par_chunks_mut((self.columns * stride).max(1)).map(move |data| ViewColumns { data, rows })
+        self.data.chunks_mut((self.columns * stride).max(1)).map(move |data| ViewColumns { data, rows })
     }
 
     /// Whether the first row of a view's projections is its highest.

@@ -3,9 +3,9 @@
 
 use super::walk::{VoxelRay, Walk};
 use conefield_core::geometry::Geometry;
+use conefield_core::parallel;
 use conefield_core::simd::Real;
 use ndarray::{ArrayView3, ArrayViewMut3, Axis};
-use rayon::prelude::*;
 
 /// Planes of voxels along x per task of [`adjoint`].
 const SLAB: usize = 8;
@@ -19,8 +19,8 @@ pub fn forward<R: Real, W: Walk>(
     mut projections: ArrayViewMut3<'_, R>,
 ) {
     let whole = 0..geometry.volume.shape[0];
-    projections.axis_iter_mut(Axis(0)).into_par_iter().zip(views).for_each(|(mut view, &v)| {
-        view.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(row, mut line)| {
+    parallel::over(projections.axis_iter_mut(Axis(0)).zip(views), |_, (mut view, &v)| {
+        parallel::over(view.axis_iter_mut(Axis(0)), |row, mut line| {
             for (column, out) in line.iter_mut().enumerate() {
                 let mut sum = 0.0;
                 let ray = VoxelRay::of(geometry, v, row, column);
@@ -40,7 +40,7 @@ pub fn adjoint<R: Real, W: Walk>(
     projections: ArrayView3<'_, R>,
     mut volume: ArrayViewMut3<'_, R>,
 ) {
-    volume.axis_chunks_iter_mut(Axis(0), SLAB).into_par_iter().enumerate().for_each(|(n, mut planes)| {
+    parallel::over(volume.axis_chunks_iter_mut(Axis(0), SLAB), |n, mut planes| {
         let slab = n * SLAB..n * SLAB + planes.shape()[0];
         for ((i, row, column), &value) in projections.indexed_iter().filter(|(_, v)| **v != R::ZERO) {
             let ray = VoxelRay::of(geometry, views[i], row, column);

@@ -5,12 +5,12 @@ use super::walk::{SiddonWalk, TrilinearWalk};
 use super::{bundles, columns};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::Geometry;
+use conefield_core::parallel;
 use conefield_core::scan::ScanHeader;
 use conefield_core::simd::Real;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};
 use conefield_core::wgsl::Fragment;
 use ndarray::{ArrayView3, ArrayViewMut3, Axis};
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -164,7 +164,7 @@ impl<R: Real> VoxelOperator<R> for Joseph {
 
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, mut out: ArrayViewMut3<'_, R>) {
         let (mut fitting, mut others) = ((vec![], vec![]), (vec![], vec![]));
-        let all: Vec<_> = views.par_iter().map(|&v| columns::of(geometry, v)).collect();
+        let all: Vec<_> = parallel::map(views, |_, &v| columns::of(geometry, v));
         for ((&v, columns), image) in views.iter().zip(all).zip(out.outer_iter_mut()) {
             match columns {
                 Some(columns) => {
@@ -187,7 +187,7 @@ impl<R: Real> VoxelOperator<R> for Joseph {
     }
 
     fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, mut volume: ArrayViewMut3<'_, R>) {
-        let all: Vec<_> = views.par_iter().map(|&v| (v, columns::of(geometry, v))).collect();
+        let all: Vec<_> = parallel::map(views, |_, &v| (v, columns::of(geometry, v)));
         // Runs of views of the same kind, in order.
         let mut from = 0;
         for run in all.chunk_by(|a, b| a.1.is_some() == b.1.is_some()) {

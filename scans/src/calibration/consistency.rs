@@ -15,6 +15,7 @@
 use crate::calibration::criterion::{bin, spread};
 use crate::calibration::parameters::{Correction, Parameter};
 use conefield_core::geometry::{Geometry, Vec3, View, cross, dot, norm, sub};
+use conefield_core::parallel;
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use ndarray::{Array3, ArrayView2, s};
@@ -96,10 +97,10 @@ impl Consistency {
             let expected = "line integrals of an object, positive where it absorbs";
             return Err(Error::invalid("scan", "projections", "no positive line integral", expected));
         }
-        let around: Vec<Vec<f32>> = p.outer_iter().into_par_iter().map(|view| means(view, 2)).collect();
+        let around: Vec<Vec<f32>> = parallel::map(p.outer_iter(), |_, view| means(view, 2));
         let noise = Noise::of(p, AIR * top);
         let [rows, columns] = binned.geometry.detector;
-        let view = |(v, mean): (usize, &Vec<f32>)| -> Vec<Pixel> {
+        let view = |v: usize, mean: &Vec<f32>| -> Vec<Pixel> {
             // Pixels within two pixels of one that is not air.
             let shows = |r: usize, c: usize| {
                 let near = |i: usize, n: usize| i.saturating_sub(2)..(i + 3).min(n);
@@ -115,7 +116,7 @@ impl Consistency {
                 })
                 .collect()
         };
-        let pixels = around.par_iter().enumerate().map(view).collect();
+        let pixels = parallel::map(&around, view);
         let side = |v: usize, x: &Pixel| {
             let (r, c) = (x.row as usize, x.column as usize);
             (r == 0 || c == 0 || r + 1 == rows || c + 1 == columns) && around[v][r * columns + c] > CUT * top
@@ -126,7 +127,7 @@ impl Consistency {
         let n = views.len();
         let all: Vec<[usize; 2]> = (0..n).flat_map(|i| (i + 1..n).map(move |j| [i, j])).collect();
         let some: Vec<[usize; 2]> = all.iter().step_by(all.len().div_ceil(MOST_PAIRS).max(1)).copied().collect();
-        new.pairs = some.into_par_iter().filter_map(|pair| new.pair(&views, pair, &side)).collect();
+        new.pairs = parallel::map(some, |_, pair| new.pair(&views, pair, &side)).into_iter().flatten().collect();
         new.planes = new.pairs.iter().map(|p| p.whole.iter().filter(|w| **w).count()).sum();
         if new.planes > 0 {
             new.measure(known)?;
@@ -166,14 +167,14 @@ impl Consistency {
     fn both(&self, correction: &Correction) -> Vec<Vec<[(f64, f64); 2]>> {
         let views = correction.views(&self.geometry.views);
         let seen: Vec<Vec<Seen>> =
-            self.pixels.par_iter().zip(&views).map(|(pixels, view)| self.seen(view, pixels)).collect();
+            parallel::map(self.pixels.iter().zip(&views), |_, (pixels, view)| self.seen(view, pixels));
         let of = |pair: &Pair| {
             let Some(frame) = self.frame(&views, pair.views) else { return vec![] };
             let [a, b] = pair.views.map(|v| planes(&seen[v], frame, pair));
             let whole = a.into_iter().zip(b).zip(&pair.whole).filter(|(_, whole)| **whole);
             whole.map(|((a, b), _)| [a, b]).collect()
         };
-        self.pairs.par_iter().map(of).collect()
+        parallel::map(&self.pairs, |_, pair| of(pair))
     }
 
     /// Measures the signal of the views and the increase of their difference with a shift along u.
@@ -321,7 +322,7 @@ impl Noise {
             };
             view.outer_iter().flat_map(row).filter(|(mean, _)| *mean > air).collect()
         };
-        let mut all: Vec<(f32, f32)> = p.outer_iter().into_par_iter().flat_map_iter(triples).collect();
+        let mut all = parallel::map(p.outer_iter(), |_, view| triples(view)).concat();
         all.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
         let step = |part: &[(f32, f32)]| {
             let mut bends: Vec<f32> = part.iter().map(|x| x.1).collect();

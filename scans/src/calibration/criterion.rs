@@ -5,6 +5,7 @@ use crate::diagnosis::setup;
 use conefield_core::backend::Backend;
 use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, norm};
 use conefield_core::method::{Context, Job, Method, Observer, Reconstruction, Record};
+use conefield_core::parallel;
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use conefield_projectors::voxel::Joseph;
@@ -12,7 +13,6 @@ use conefield_solvers::iterative::Stop;
 use conefield_solvers::iterative::order::Subsets;
 use conefield_solvers::iterative::sart::Sart;
 use ndarray::{Array3, ArrayView2, s};
-use rayon::prelude::*;
 
 /// One in this many views is held out.
 const EVERY: usize = 4;
@@ -158,7 +158,7 @@ impl Level {
             residual.zip_mut_with(&fold.test.projections, |a, p| *a = p - *a);
             Ok(residual)
         };
-        self.folds.par_iter().map(of).collect()
+        parallel::map(&self.folds, |_, fold| of(fold)).into_iter().collect()
     }
 
     /// The residuals of each held-out view, and their size.

@@ -14,7 +14,7 @@ use crate::calibration::parameters::{Correction, Parameter};
 use crate::calibration::search::{Evidence, LONGEST, Meter, REACH, SMALL, damped};
 use conefield_core::Result;
 use conefield_core::matrix::{inner, inverse};
-use rayon::prelude::*;
+use conefield_core::parallel;
 
 /// How often a step that does not reduce the criterion is cut to a third.
 const CUTS: usize = 3;
@@ -56,7 +56,7 @@ impl Newton<'_> {
     /// The errors for `values` of one parameter, with the others as in `at`.
     pub fn along(&self, parameter: Parameter, at: Correction, values: &[f64]) -> Result<Vec<(f64, f64)>> {
         let error = |&x: &f64| Ok((x, self.pairs.error(&self.misfits(&at.with(parameter, x))?)));
-        values.par_iter().map(error).collect()
+        parallel::map(values, |_, x| error(x)).into_iter().collect()
     }
 
     /// At most `rounds` steps from `start` in the parameters `active`.
@@ -113,7 +113,7 @@ impl Newton<'_> {
         let ends = (0..n).flat_map(|k| [REACH, -REACH].map(|side| moved(&[(k, side)])));
         let corners = (0..n).flat_map(|k| (0..k).map(move |l| [(k, REACH), (l, REACH)]));
         let places: Vec<Correction> = ends.chain(corners.map(|sides| moved(&sides))).collect();
-        let found: Vec<Vec<f64>> = places.par_iter().map(|c| self.misfits(c)).collect::<Result<_>>()?;
+        let found = parallel::map(&places, |_, c| self.misfits(c)).into_iter().collect::<Result<Vec<_>>>()?;
         let (ends, corners) = found.split_at(2 * n);
         let pairs = 0..here.1.len();
         let [up, down] = [0, 1].map(|side| (0..n).map(|k| &ends[2 * k + side]).collect::<Vec<_>>());

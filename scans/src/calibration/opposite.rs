@@ -7,9 +7,9 @@
 
 use crate::calibration::parameters::{Correction, Parameter};
 use conefield_core::geometry::{Geometry, View, dot, sub};
+use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use ndarray::ArrayView2;
-use rayon::prelude::*;
 
 /// Fewest shared rays that say something.
 const FEWEST: usize = 16;
@@ -38,8 +38,9 @@ impl Opposite {
     pub fn of(scan: Scan) -> Self {
         let views = &scan.geometry.views;
         let n = views.len();
-        let pairs = (0..n).into_par_iter().flat_map_iter(|a| (a + 1..n).map(move |b| [a, b]));
-        let pairs = pairs.filter(|&[a, b]| near(&scan.geometry, a, b) && near(&scan.geometry, b, a)).collect();
+        let both = |a: usize, b: usize| near(&scan.geometry, a, b) && near(&scan.geometry, b, a);
+        let pairs = parallel::map(0..n, |_, a| (a + 1..n).filter(|b| both(a, *b)).map(|b| [a, b]).collect::<Vec<_>>());
+        let pairs = pairs.concat();
         Self { scan, pairs }
     }
 
@@ -48,7 +49,7 @@ impl Opposite {
     fn differences(&self, correction: &Correction) -> Vec<Option<f64>> {
         let views = correction.views(&self.scan.geometry.views);
         let value = |a: usize, b: usize| self.value(a, &views[a], &views[b]);
-        self.pairs.par_iter().map(|&[a, b]| Some(value(a, b)? - value(b, a)?)).collect()
+        parallel::map(&self.pairs, |_, &[a, b]| Some(value(a, b)? - value(b, a)?))
     }
 
     /// The measured value of `view` (number `i`) on its ray through the source of `other`, interpolated.

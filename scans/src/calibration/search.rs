@@ -11,8 +11,8 @@ use crate::calibration::criterion::{Level, Prediction};
 use crate::calibration::parameters::{Correction, Parameter};
 use conefield_core::backend::Backend;
 use conefield_core::matrix::{inner, inverse, product};
+use conefield_core::parallel;
 use conefield_core::{Error, Result};
-use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
 
 /// Half the distance of central differences, in pixels of a level.
@@ -92,13 +92,13 @@ impl Search<'_> {
     }
 
     fn all(&self, corrections: &[Correction]) -> Result<Vec<Prediction>> {
-        corrections.par_iter().map(|c| self.predict(c)).collect()
+        parallel::map(corrections, |_, c| self.predict(c)).into_iter().collect()
     }
 
     /// The errors for `values` of one parameter, with the others as in `at`.
     pub fn along(&self, parameter: Parameter, at: Correction, values: &[f64]) -> Result<Vec<(f64, f64)>> {
         let corrections: Vec<Correction> = values.iter().map(|&x| at.with(parameter, x)).collect();
-        let errors = corrections.par_iter().map(|c| self.predict(c).map(|p| p.error)).collect::<Result<Vec<f64>>>()?;
+        let errors = self.all(&corrections)?.into_iter().map(|p| p.error);
         Ok(values.iter().copied().zip(errors).collect())
     }
 

@@ -3,9 +3,9 @@
 use crate::corrections::Correct;
 use crate::corrections::smooth::Sums;
 use conefield_core::error::{Result, ensure};
+use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use ndarray::{Array2, ArrayViewMut2, Axis};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Largest distance of averaged neighbours, in pixels.
@@ -40,8 +40,7 @@ impl Correct for LowCounts {
     }
 
     fn correct(&self, scan: &mut Scan) -> Result<String> {
-        let views = scan.projections.axis_iter_mut(Axis(0)).into_par_iter();
-        let changed: usize = views.map(|v| self.view(v)).collect::<Vec<_>>().iter().sum();
+        let changed: usize = parallel::map(scan.projections.axis_iter_mut(Axis(0)), |_, v| self.view(v)).iter().sum();
         let share = 100.0 * changed as f64 / scan.projections.len() as f64;
         Ok(format!("{share:.2} % of the values come from fewer than {} photons and include neighbours", self.enough))
     }

@@ -5,9 +5,9 @@ use crate::corrections::filling::Filling;
 use crate::diagnosis::bad_pixels::outliers;
 use crate::diagnosis::quantiles::{median, quantile};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Least number of views for judging a pixel over the views.
@@ -70,10 +70,9 @@ impl Correct for Pixels {
         let whole = bad.iter().filter(|b| **b).count();
         few(whole, rows * columns, "pixels")?;
         if let Some(filling) = Filling::new(&bad) {
-            values.axis_iter_mut(Axis(0)).into_par_iter().for_each(|v| filling.fill(v));
+            parallel::over(values.axis_iter_mut(Axis(0)), |_, v| filling.fill(v));
         }
-        let mend = |view| self.single(view, range);
-        let single: Vec<usize> = values.axis_iter_mut(Axis(0)).into_par_iter().map(mend).collect();
+        let single = parallel::map(values.axis_iter_mut(Axis(0)), |_, view| self.single(view, range));
         let single = single.iter().sum::<usize>();
         few(single, values.len(), "values")?;
         Ok(format!(
@@ -131,7 +130,7 @@ fn range(values: ArrayView3<'_, f32>) -> f32 {
 fn over_time(values: ArrayView3<'_, f32>) -> [Array2<f32>; 2] {
     let (views, rows, columns) = values.dim();
     let mut apart = Array3::<f32>::zeros((rows, columns, views));
-    apart.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(r, mut line)| {
+    parallel::over(apart.axis_iter_mut(Axis(0)), |r, mut line| {
         let mut around = Vec::with_capacity(8);
         for ((c, v), out) in line.indexed_iter_mut() {
             let view = values.index_axis(Axis(0), v);

@@ -6,9 +6,9 @@
 use crate::corrections::Correct;
 use crate::diagnosis::quantiles::median;
 use conefield_core::error::{Result, ensure};
+use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Offsets within this many standard deviations of the median of sorted values count as chance.
@@ -67,7 +67,7 @@ impl Correct for Rings {
             RingMethod::Sorting => by_sorting(row, self.window),
         };
         let mut squares = 0.0;
-        let lines: Vec<Vec<f32>> = scan.projections.axis_iter(Axis(1)).into_par_iter().map(own).collect();
+        let lines: Vec<Vec<f32>> = parallel::map(scan.projections.axis_iter(Axis(1)), |_, row| own(row));
         for (mut row, line) in scan.projections.axis_iter_mut(Axis(1)).zip(&lines) {
             squares += line.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>();
             for mut view in row.outer_iter_mut() {

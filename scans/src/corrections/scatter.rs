@@ -3,9 +3,9 @@
 use crate::corrections::Correct;
 use crate::corrections::smooth::blurred;
 use conefield_core::error::{Result, ensure};
+use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, Axis, Zip};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Iterations of computing the scatter from the corrected intensity. If a fifth of the light is scattered, each
@@ -42,8 +42,8 @@ impl Correct for Scatter {
 
     fn correct(&self, scan: &mut Scan) -> Result<String> {
         let sigma = self.width * scan.geometry.detector.into_iter().max().unwrap_or(1) as f64;
-        let views = scan.projections.axis_iter_mut(Axis(0)).into_par_iter();
-        let most = views.map(|v| self.view(v, sigma)).collect::<Vec<f32>>().into_iter().fold(0.0, f32::max);
+        let shares = parallel::map(scan.projections.axis_iter_mut(Axis(0)), |_, v| self.view(v, sigma));
+        let most = shares.into_iter().fold(0.0, f32::max);
         Ok(format!("up to {:.1} % of the light of a pixel was scattered", 100.0 * most))
     }
 }

@@ -3,9 +3,9 @@
 use crate::corrections::Correct;
 use conefield_core::Result;
 use conefield_core::error::ensure;
+use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use ndarray::{Array3, ArrayView2, Axis, s};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_2;
 use std::ops::Range;
@@ -56,19 +56,17 @@ impl Correct for Truncation {
         }
         let more = ((self.share * columns as f64).ceil() as usize).min(columns.saturating_sub(1));
         let mut wide = Array3::zeros((views, rows, columns + 2 * more));
-        wide.axis_iter_mut(Axis(0)).into_par_iter().zip(scan.projections.axis_iter(Axis(0))).for_each(
-            |(mut to, from)| {
-                for (mut to, from) in to.rows_mut().into_iter().zip(from.rows()) {
-                    to.slice_mut(s![more..more + columns]).assign(&from);
-                    for k in 1..=more {
-                        let fade = (FRAC_PI_2 * k as f64 / (more + 1) as f64).cos() as f32;
-                        let goes_on = |last: usize, inner: usize| (2.0 * from[last] - from[inner]).max(0.0) * fade;
-                        to[more - k] = goes_on(0, k);
-                        to[more + columns - 1 + k] = goes_on(columns - 1, columns - 1 - k);
-                    }
+        parallel::over(wide.axis_iter_mut(Axis(0)).zip(scan.projections.axis_iter(Axis(0))), |_, (mut to, from)| {
+            for (mut to, from) in to.rows_mut().into_iter().zip(from.rows()) {
+                to.slice_mut(s![more..more + columns]).assign(&from);
+                for k in 1..=more {
+                    let fade = (FRAC_PI_2 * k as f64 / (more + 1) as f64).cos() as f32;
+                    let goes_on = |last: usize, inner: usize| (2.0 * from[last] - from[inner]).max(0.0) * fade;
+                    to[more - k] = goes_on(0, k);
+                    to[more + columns - 1 + k] = goes_on(columns - 1, columns - 1 - k);
                 }
-            },
-        );
+            }
+        });
         scan.projections = wide;
         scan.geometry.detector[1] = columns + 2 * more;
         Ok(format!("the object reaches the sides of {cut} of {views} views: {more} columns are added on either side"))

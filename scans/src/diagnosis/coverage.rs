@@ -3,7 +3,7 @@
 use crate::diagnosis::setup::Setup;
 use crate::diagnosis::shadow::Shadow;
 use conefield_core::geometry::{Geometry, Vec3};
-use rayon::prelude::*;
+use conefield_core::parallel;
 use serde::Serialize;
 
 /// Sample points along each side of the volume, and most views.
@@ -41,7 +41,7 @@ fn share(shadows: &[Shadow], detector: [usize; 2], point: Vec3) -> f64 {
 /// views if there are many.
 pub fn share_of_views(geometry: &Geometry, points: &[Vec3]) -> Vec<f64> {
     let shadows = shadows(geometry);
-    points.par_iter().map(|p| share(&shadows, geometry.detector, *p)).collect()
+    parallel::map(points, |_, p| share(&shadows, geometry.detector, *p))
 }
 
 /// Computes how many views see each part of the volume.

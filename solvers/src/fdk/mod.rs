@@ -20,6 +20,7 @@ use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, dot, norm, sub};
 use conefield_core::method::{
     Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
 };
+use conefield_core::parallel;
 use conefield_core::place::{Array, CLIP, FilteredViews, Host, Place, RowWeights};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::SurroundRule;
@@ -30,7 +31,6 @@ use conefield_projectors::voxel::backproject::{TILE, backproject};
 use conefield_projectors::voxel::layout::{ColumnMajor, Pinhole, column_major_bytes};
 use filter::{Ramp, Window};
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, s};
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -251,7 +251,7 @@ impl FilteredViews for Backprojection<'_> {
         let (normal, _) = v.normal();
         let ramp = Ramp::new(columns, self.pitch(view), self.settings.window, self.settings.cutoff);
         let counts: Vec<f64> = self.counts(view).collect();
-        pixels.par_chunks_mut(16 * columns).enumerate().for_each(|(n, strip)| {
+        parallel::over(pixels.chunks_mut(16 * columns), |n, strip| {
             for (r, line) in strip.chunks_mut(columns).enumerate() {
                 for (c, x) in line.iter_mut().enumerate() {
                     let d = sub(v.pixel(g.detector, (16 * n + r) as f64, c as f64), v.source);

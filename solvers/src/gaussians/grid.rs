@@ -5,6 +5,7 @@
 
 use super::lists::Lists;
 use super::shape::{M3, Shape, Slope, V3, apply, dot};
+use conefield_core::parallel;
 use conefield_core::simd::{self, Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, store};
 use conefield_core::stage::UnitGrid;
 use rayon::prelude::*;
@@ -61,7 +62,7 @@ impl Grid {
     /// Overwrites `out` (`[x, y, z]`, z fastest) with the values of the shapes found.
     pub fn values<R: Real>(&self, grid: &UnitGrid, shapes: &[Shape], out: &mut [R]) {
         let plane = grid.shape[1] * grid.shape[2];
-        out.par_chunks_mut(PLANES * plane).enumerate().for_each(|(i, out)| {
+        parallel::over(out.chunks_mut(PLANES * plane), |i, out| {
             out.fill(R::ZERO);
             let slab = i * PLANES..i * PLANES + out.len() / plane;
             simd::run(Paint { grid, shapes, reaching: &self.reaching, list: self.slabs.of(i), slab, out });

@@ -1,6 +1,7 @@
 //! Structural similarity of a projected and a measured view, with its gradient (Wang et al., IEEE Trans. Image Process.
 //! 13(4), 2004): a Gaussian window of 11 × 11 pixels with σ 1.5 and zero padding, as in the published code.
 
+use conefield_core::parallel;
 use conefield_core::simd::{self, Op, Simd, SimdBase, SimdFloat, V, load, store};
 use rayon::prelude::*;
 
@@ -74,7 +75,7 @@ impl Ssim {
             blur(&taps, [slope, &[]], map, between, stride);
         }
         let [by_mean, by_square, by_product, ..] = &*maps;
-        gradient.par_chunks_mut(stride).enumerate().for_each(|(row, gradient)| {
+        parallel::over(gradient.chunks_mut(stride), |row, gradient| {
             for i in 0..columns {
                 let at = row * stride + i;
                 gradient[i] += by_mean[at] + 2.0 * found[at] * by_square[at] + wanted[at] * by_product[at];
@@ -103,7 +104,7 @@ fn blur(
     between.resize(image.len(), 0.0);
     blurred.resize(image.len(), 0.0);
     let rows = image.len() / stride;
-    between.par_chunks_mut(stride).enumerate().for_each(|(row, out)| {
+    parallel::over(between.chunks_mut(stride), |row, out| {
         let own = row * stride..(row + 1) * stride;
         let mut padded = vec![0.0; stride + TAPS];
         padded[REACH..REACH + stride].copy_from_slice(&image[own.clone()]);
@@ -114,7 +115,7 @@ fn blur(
         simd::run(Weighted { taps, lines, out });
     });
     let between = &*between;
-    blurred.par_chunks_mut(stride).enumerate().for_each(|(row, out)| {
+    parallel::over(blurred.chunks_mut(stride), |row, out| {
         let lines: [&[f32]; TAPS] = std::array::from_fn(|k| match (row + k).checked_sub(REACH) {
             Some(r) if r < rows => &between[r * stride..(r + 1) * stride],
             _ => &[],

@@ -11,6 +11,7 @@ use super::lists::Lists;
 use super::shape::{CENTRE, DENSITY, NUMBERS, ROTATION, SCALE, V3, before_softplus, dot};
 use super::stage::shapes;
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::parallel;
 use conefield_core::random::stream;
 use conefield_core::scan::Volume;
 use conefield_core::scene::Scene;
@@ -127,7 +128,7 @@ impl Start {
         let mut shapes = shapes(&params[..count * NUMBERS]);
         let cells = Cells::new(&shapes);
         for _ in 0..ROUNDS {
-            let sums: Vec<f64> = begins.par_iter().map(|b| cells.value(&shapes, b.centre)).collect();
+            let sums: Vec<f64> = parallel::map(&begins, |_, b| cells.value(&shapes, b.centre));
             for ((shape, sum), begin) in shapes.iter_mut().zip(sums).zip(&begins) {
                 shape.density *= (begin.value / sum.max(1e-12)).clamp(0.1, 10.0);
             }
@@ -205,7 +206,8 @@ fn cells(volume: &Volume, scene: &Scene, threshold: f32, count: usize) -> Vec<Be
     let firsts: Vec<[usize; 3]> = corners(shape[0])
         .flat_map(|x| corners(shape[1]).flat_map(move |y| corners(shape[2]).map(move |z| [x, y, z])))
         .collect();
-    let mut heap: BinaryHeap<Cell> = firsts.into_par_iter().filter_map(|first| look(first, LARGEST)).collect();
+    let mut heap: BinaryHeap<Cell> =
+        parallel::map(firsts, |_, first| look(first, LARGEST)).into_iter().flatten().collect();
     let mut done = vec![];
     while heap.len() + done.len() + 7 <= count {
         let Some(cell) = heap.pop() else { break };

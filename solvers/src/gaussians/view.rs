@@ -15,6 +15,7 @@
 
 use super::lists::Lists;
 use super::shape::{M3, Shape, Slope, V3, apply, cross, dot};
+use conefield_core::parallel;
 use conefield_core::simd::{self, Op, Real, Select, Simd, SimdBase, SimdFloat, V, WIDEST};
 use rayon::prelude::*;
 use std::f64::consts::TAU;
@@ -88,7 +89,7 @@ impl Beam {
     /// Multiplies every pixel by `|D|`. Exact lengths enter here, once per pixel.
     fn scaled<R: Real>(&self, image: &mut [R]) {
         let (d, u, v) = (self.first, self.u, self.v);
-        image.par_chunks_mut(self.stride()).enumerate().for_each(|(row, line)| {
+        parallel::over(image.chunks_mut(self.stride()), |row, line| {
             let start: V3 = std::array::from_fn(|k| d[k] + row as f64 * v[k]);
             let [c0, c1, c2] = [dot(start, start), 2.0 * dot(start, u), dot(u, u)];
             for (column, x) in line[..self.detector[1]].iter_mut().enumerate() {
@@ -216,7 +217,7 @@ impl<R: Real> Sight<R> {
     pub fn project(&mut self, beam: &Beam, shapes: &[Shape], image: &mut [R]) {
         self.look(beam, shapes);
         let (seen, strips, stride) = (&self.seen, &self.strips, beam.stride());
-        image.par_chunks_mut(STRIP * stride).enumerate().for_each(|(i, lines)| {
+        parallel::over(image.chunks_mut(STRIP * stride), |i, lines| {
             lines.fill(R::ZERO);
             simd::run(Splat { seen, list: strips.of(i), lines, stride, first: i * STRIP, columns: beam.detector[1] });
         });
@@ -229,7 +230,7 @@ impl<R: Real> Sight<R> {
         beam.scaled(image);
         let (seen, stride, normal) = (&self.seen, beam.stride(), cross(beam.u, beam.v));
         let image = &*image;
-        slopes.par_chunks_mut(CHUNK).enumerate().for_each(|(i, slopes)| {
+        parallel::over(slopes.chunks_mut(CHUNK), |i, slopes| {
             let range = i * CHUNK..i * CHUNK + slopes.len();
             simd::run(Gather {
                 beam,

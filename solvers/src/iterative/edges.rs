@@ -1,11 +1,11 @@
 //! Edges of a volume, and their normals.
 
 use conefield_core::error::Result;
+use conefield_core::parallel;
 use conefield_core::place::Array;
 use conefield_core::regularizer::Guide;
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
-use rayon::prelude::*;
 
 /// A vector `n` per voxel, normal to the edge there, with a length from 0 (no edge) to 1 (a clear edge).
 ///
@@ -48,27 +48,24 @@ impl Edges {
         let Some(all) = x.as_slice() else { return };
         let at = |i: usize| &all[i * plane..(i + 1) * plane];
         let [a, b, c] = self.n.each_mut().map(Array::slice_mut);
-        let planes = a.par_chunks_mut(plane).zip(b.par_chunks_mut(plane)).zip(c.par_chunks_mut(plane));
-        let squares: Vec<f64> = planes
-            .enumerate()
-            .map(|(i, ((a, b), c))| {
-                let around = [at(i.saturating_sub(1)), at(i), at((i + 1).min(nx - 1))];
-                slopes(around, nz, g, [&mut *a, &mut *b, &mut *c]);
-                // No difference across the far faces, hence no edge.
-                if i + 1 == nx {
-                    a.fill(0.0);
-                }
-                b[plane - nz..].fill(0.0);
-                c.iter_mut().skip(nz - 1).step_by(nz).for_each(|c| *c = 0.0);
-                let square = |((a, b), c): ((&f32, &f32), &f32)| f64::from(a * a + b * b + c * c);
-                a.iter().zip(&*b).zip(&*c).map(square).sum::<f64>()
-            })
-            .collect();
+        let planes = a.chunks_mut(plane).zip(b.chunks_mut(plane)).zip(c.chunks_mut(plane));
+        let squares: Vec<f64> = parallel::map(planes, |i, ((a, b), c)| {
+            let around = [at(i.saturating_sub(1)), at(i), at((i + 1).min(nx - 1))];
+            slopes(around, nz, g, [&mut *a, &mut *b, &mut *c]);
+            // No difference across the far faces, hence no edge.
+            if i + 1 == nx {
+                a.fill(0.0);
+            }
+            b[plane - nz..].fill(0.0);
+            c.iter_mut().skip(nz - 1).step_by(nz).for_each(|c| *c = 0.0);
+            let square = |((a, b), c): ((&f32, &f32), &f32)| f64::from(a * a + b * b + c * c);
+            a.iter().zip(&*b).zip(&*c).map(square).sum::<f64>()
+        });
         let mean = squares.iter().sum::<f64>() / x.len() as f64;
         let eta2 = (mean * self.scale * self.scale) as f32;
         let strength = self.strength;
-        let planes = a.par_chunks_mut(plane).zip(b.par_chunks_mut(plane)).zip(c.par_chunks_mut(plane));
-        planes.for_each(|((a, b), c)| {
+        let planes = a.chunks_mut(plane).zip(b.chunks_mut(plane)).zip(c.chunks_mut(plane));
+        parallel::over(planes, |_, ((a, b), c)| {
             for ((a, b), c) in a.iter_mut().zip(b).zip(c) {
                 let square = *a * *a + *b * *b + *c * *c;
                 // A slope of 0 has no direction, whatever η is.

@@ -4,12 +4,12 @@ use crate::shadow::{air_level, shadow};
 use conefield_core::data_term::Misfit;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
+use conefield_core::parallel;
 use conefield_core::place::{ADD, Array, Bounds, CLIP, INVERT, Mask, MeasuredViews, Place, Reduction, Weighing};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::space::Space;
 use conefield_core::voxel::VoxelProjector;
 use ndarray::{Array3, Axis};
-use rayon::prelude::*;
 
 /// Pixels by which the object's shadow is dilated; pixels outside count as air.
 const MARGIN: usize = 4;
@@ -42,8 +42,8 @@ impl Problem<'_> {
     pub fn clear_air(&mut self) -> Result<f64> {
         let level = air_level(self.scan);
         let mut inside = Array3::from_elem(self.scan.projections.raw_dim(), false);
-        let views = inside.axis_iter_mut(Axis(0)).into_par_iter().zip(self.scan.projections.outer_iter());
-        views.for_each(|(mut inside, view)| inside.assign(&shadow(view, level, MARGIN)));
+        let views = inside.axis_iter_mut(Axis(0)).zip(self.scan.projections.outer_iter());
+        parallel::over(views, |_, (mut inside, view)| inside.assign(&shadow(view, level, MARGIN)));
         let seen = inside.iter().filter(|x| **x).count();
         let share = 1.0 - seen as f64 / inside.len().max(1) as f64;
         self.shadow = Some(self.place.mask(inside)?);

@@ -11,6 +11,7 @@ use super::edges::Edges;
 use conefield_core::allowance;
 use conefield_core::error::Result;
 use conefield_core::geometry::{Vec3, VoxelGrid};
+use conefield_core::parallel;
 use conefield_core::place::{ADD, Array, Place, VariationSlope};
 use conefield_core::regularizer::{Bounds, Dual, Update};
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
@@ -40,17 +41,13 @@ pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3], edges: Option<&Edges
     let limited = limited.map(|limited| limited.turned([0, y, z]));
     let x = x.as_standard_layout();
     let Some(all) = x.as_slice() else { return 0.0 };
-    let planes: Vec<f64> = all
-        .par_chunks(plane.max(1))
-        .enumerate()
-        .map(|(i, x)| {
-            let n = edges.map(|edges| {
-                let n = edges.vectors();
-                [n[0], n[y], n[z]].map(|n| &n[i * plane..(i + 1) * plane])
-            });
-            run(Variation { x, after: all.get((i + 1) * plane..(i + 2) * plane), n, g, limited, nz })
-        })
-        .collect();
+    let planes: Vec<f64> = parallel::map(all.chunks(plane.max(1)), |i, x| {
+        let n = edges.map(|edges| {
+            let n = edges.vectors();
+            [n[0], n[y], n[z]].map(|n| &n[i * plane..(i + 1) * plane])
+        });
+        run(Variation { x, after: all.get((i + 1) * plane..(i + 2) * plane), n, g, limited, nz })
+    });
     planes.iter().sum()
 }
 
@@ -301,7 +298,7 @@ impl TvProx {
         }
         let limited = self.limited.map(|limited| limited.turned([0, y, z]));
         let scale = Scale { limited, ..Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.bounds) };
-        slabs.into_par_iter().for_each(|slab| run(Sweeping(slab, scale)));
+        parallel::over(slabs, |_, slab| run(Sweeping(slab, scale)));
     }
 }
 
@@ -727,21 +724,17 @@ pub fn descend(
 /// Overwrites `out` with the slope at every voxel; returns the sum of squares.
 fn slopes(x: &[f32], shape: [usize; 3], g: [f32; 3], unit: f32, out: &mut [f32]) -> f64 {
     let [_, ny, nz] = shape;
-    let squares: Vec<f64> = out
-        .par_chunks_mut(ny * nz)
-        .enumerate()
-        .map(|(i, out)| {
-            let mut sum = 0.0;
-            for j in 0..ny {
-                for k in 0..nz {
-                    let grad = slope(x, shape, g, unit, [i, j, k]);
-                    out[j * nz + k] = grad;
-                    sum += f64::from(grad) * f64::from(grad);
-                }
+    let squares: Vec<f64> = parallel::map(out.chunks_mut(ny * nz), |i, out| {
+        let mut sum = 0.0;
+        for j in 0..ny {
+            for k in 0..nz {
+                let grad = slope(x, shape, g, unit, [i, j, k]);
+                out[j * nz + k] = grad;
+                sum += f64::from(grad) * f64::from(grad);
             }
-            sum
-        })
-        .collect();
+        }
+        sum
+    });
     squares.iter().sum()
 }
 

@@ -8,6 +8,7 @@
 use conefield_core::basis::{Basis, BasisOperator, BasisSpec, Expansion};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::parallel;
 use conefield_core::simd::Real;
 use ndarray::{ArrayView3, ArrayViewMut3};
 use rayon::prelude::*;
@@ -160,7 +161,7 @@ impl Prefilter {
         for row in x.chunks_mut(inner) {
             row.chunks_mut(COLUMNS).zip(&mut parts).for_each(|(part, parts)| parts.push(part));
         }
-        parts.into_par_iter().for_each(|part| self.solve_rows(part));
+        parallel::over(parts, |_, part| self.solve_rows(part));
     }
 
     /// Solves `P·y = x` in place.

@@ -18,10 +18,10 @@ use conefield_core::checkpoint::tensors_of;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::loss::Loss;
 use conefield_core::pages::{Pages, copy};
+use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
 use ndarray::{ArrayView2, Axis};
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -273,7 +273,7 @@ fn measured(scan: &Scan, scene: &Scene) -> f64 {
     let view = |v: ArrayView2<'_, f32>| {
         v.iter().fold([0.0; 2], |[s, t], p| [s + f64::from(*p).powi(2), t + f64::from(p.abs())])
     };
-    let sums: Vec<[f64; 2]> = scan.projections.axis_iter(Axis(0)).into_par_iter().map(view).collect();
+    let sums: Vec<[f64; 2]> = parallel::map(scan.projections.axis_iter(Axis(0)), |_, v| view(v));
     let [squares, sum] = sums.iter().fold([0.0; 2], |[s, t], [u, v]| [s + u, t + v]);
     squares / sum.max(f64::MIN_POSITIVE) / scene.line_scale()
 }
