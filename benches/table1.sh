@@ -3,7 +3,7 @@
 #   bash benches/table1.sh DATA_FOLDER OUT_FOLDER [SEEDS [VOLUMES]]
 # DATA_FOLDER holds volumes/*.nii.gz. 50 noisy views of 512² pixels, the published protocol. Neural methods have the published
 # sizes and rate (1e-3) and 192 samples a ray inside the volume. They end after the numbers of steps below, in about half a minute each
-# on two cores, not at convergence. MCI weights are those of abdomen_128, and of chest_128 where the abdomen is the scan.
+# on two cores, not at convergence. MCI weights are those of abdomen_128, and of chest_128 where an abdomen is the scan.
 # Steps are counted, not timed: other work on the machine changes the seconds only. OUT_FOLDER/ct/table.md and
 # OUT_FOLDER/abdomen/table.md have PSNR and ssim_2d, mean ± standard deviation over SEEDS ("0 1 2"). What is there is not run again.
 set -euo pipefail
@@ -13,7 +13,7 @@ mkdir -p "$2"
 out=$(realpath "$2")
 seeds=${3:-0 1 2}
 volumes=${4:-chest_128 head_256 engine_256 abdomen_128}
-cargo build --release --quiet -p conefield-cli
+[[ -x ${CARGO_TARGET_DIR:-target}/release/conefield ]] || cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 published='"optimizer.lr=1e-3", "projector.samples=192"'
 steps=600 lines=150 gaussians=600
@@ -51,7 +51,9 @@ method() {
     printf '\n[[specs]]\nname = "%s"\nspec = "%s"\nset = [%s]\n' "$1" "$2" "${3:-}"
 }
 
-others=${volumes/abdomen_128/}
-# shellcheck disable=SC2086
-[[ -z ${others// /} ]] || study ct abdomen_128 $others
-[[ $volumes != *abdomen_128* ]] || study abdomen chest_128 abdomen_128
+abdomens=() others=()
+for volume in $volumes; do
+    case $volume in abdomen*) abdomens+=("$volume") ;; *) others+=("$volume") ;; esac
+done
+[[ -z ${others[*]:-} ]] || study ct abdomen_128 "${others[@]}"
+[[ -z ${abdomens[*]:-} ]] || study abdomen chest_128 "${abdomens[@]}"

@@ -5,7 +5,6 @@
 
 use crate::error::{Error, Result};
 use schemars::Schema;
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::{Value, json};
 use std::any::Any;
@@ -136,14 +135,6 @@ pub fn read<T: Settings + ?Sized + 'static>(mut value: Value) -> Result<Box<T>, 
 /// Reads settings for `serde`.
 pub fn deserialize<'de, T: Settings + ?Sized + 'static, D: Deserializer<'de>>(from: D) -> Result<Box<T>, D::Error> {
     read(Value::deserialize(from)?).map_err(serde::de::Error::custom)
-}
-
-/// Reads settings from the keys of a table except `type`. The error begins with the path to the key.
-pub fn keys<T: DeserializeOwned>(keys: Value) -> Result<T, String> {
-    serde_path_to_error::deserialize(keys).map_err(|e| match e.path().to_string().as_str() {
-        "." => e.inner().to_string(),
-        path => format!("{path}: {}", e.inner()),
-    })
 }
 
 impl Kind {
@@ -354,7 +345,8 @@ macro_rules! stage_type {
                     example: $example,
                     make: || {
                         $crate::registry::Make::new::<dyn $spec>(Box::new(|keys| {
-                            Ok(Box::new($crate::registry::keys::<$settings>(keys)?))
+                            let settings: $settings = $crate::registry::serde_json::from_value(keys).map_err(|e| e.to_string())?;
+                            Ok(Box::new(settings))
                         }))
                     },
                 },

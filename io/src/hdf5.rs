@@ -325,7 +325,7 @@ impl Container {
             let held = chunk.bytes().len() / number.bytes();
             allowance::numbers(&self.place, data.name(), held.saturating_sub(decoded.capacity()))?;
             decoded.clear();
-            number.decode(order, chunk.bytes(), &mut decoded, |x| x as f32);
+            number.singles(order, chunk.bytes(), &mut decoded);
             // Frames, rows and columns of the chunk.
             let [depth, height, width] = match size[..] {
                 [d, h, w] => [d, h, w],
@@ -412,7 +412,7 @@ impl Container {
         let mut raw = vec![0; count * number.bytes()];
         data.read_raw_bytes_into(&mut raw).map_err(|e| self.broken(data, &e))?;
         let mut values = Vec::with_capacity(count);
-        number.decode(order, &raw, &mut values, |x| x);
+        number.doubles(order, &raw, &mut values);
         Ok(values)
     }
 

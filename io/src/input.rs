@@ -139,15 +139,40 @@ impl Input {
         if got < n { Err(self.ended(field, n, got)) } else { Ok(()) }
     }
 
-    /// Reads `count` numbers through `map`, up to the very end of the file. Refuses more numbers than the file can hold
-    /// before it allocates memory, and any byte after the last number.
-    pub fn numbers<T>(
+    /// Reads `count` numbers, up to the very end of the file. Refuses more numbers than the file can hold before it
+    /// allocates memory, and any byte after the last number.
+    pub fn singles(&mut self, field: &str, count: usize, number: Number, order: ByteOrder) -> Result<Vec<f32>> {
+        self.numbers(field, count, number, &mut |raw, out| number.singles(order, raw, out))
+    }
+
+    /// The same in double precision.
+    pub fn doubles(&mut self, field: &str, count: usize, number: Number, order: ByteOrder) -> Result<Vec<f64>> {
+        self.numbers(field, count, number, &mut |raw, out| number.doubles(order, raw, out))
+    }
+
+    /// The same as `slope·x + intercept`.
+    pub fn scaled(
         &mut self,
         field: &str,
         count: usize,
         number: Number,
         order: ByteOrder,
-        map: impl Fn(f64) -> T + Copy,
+        [slope, intercept]: [f64; 2],
+    ) -> Result<Vec<f32>> {
+        let mut part = vec![];
+        self.numbers(field, count, number, &mut |raw, out| {
+            part.clear();
+            number.doubles(order, raw, &mut part);
+            out.extend(part.iter().map(|x| (slope * x + intercept) as f32));
+        })
+    }
+
+    fn numbers<T>(
+        &mut self,
+        field: &str,
+        count: usize,
+        number: Number,
+        append: &mut dyn FnMut(&[u8], &mut Vec<T>),
     ) -> Result<Vec<T>> {
         let want = (count as u64)
             .checked_mul(number.bytes() as u64)
@@ -176,7 +201,7 @@ impl Input {
             let raw = self.exactly(n * number.bytes(), field)?;
             let more = if self.packed.is_none() { left } else { n };
             memory::grow(&mut out, more, count, &self.place(), field)?;
-            number.decode(order, &raw, &mut out, map);
+            append(&raw, &mut out);
             left -= n;
         }
         // Reading to the end also makes gzip verify its checksum.

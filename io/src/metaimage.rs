@@ -270,7 +270,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
         }
         data = data.inflate();
     }
-    let values = data.numbers("data", count, number, order, |x| x as f32)?;
+    let values = data.singles("data", count, number, order)?;
     file_order::read(&data.place(), grid, Some(affine), values)
 }
 

@@ -58,7 +58,7 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
         Endianness::Big => ByteOrder::Big,
     };
     input.skip(offset - HEADER as u64, "vox_offset")?;
-    let values = input.numbers("data", count, number, order, |x| (slope * x + inter) as f32)?;
+    let values = input.scaled("data", count, number, order, [slope, inter])?;
     file_order::read(&input.place(), grid, Some(affine), values)
 }
 

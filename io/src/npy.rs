@@ -65,7 +65,7 @@ pub(crate) fn array(input: &mut Input, header: &Header, sets: &[&[&str]]) -> Res
         .try_fold(1usize, |n, &s| n.checked_mul(s))
         .filter(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize))
         .ok_or_else(|| input.invalid("shape", shape_text(&header.shape), "a size that can be addressed"))?;
-    let values = input.numbers("data", count, header.number, header.order, |x| x as f32)?;
+    let values = input.singles("data", count, header.number, header.order)?;
     let array = ArrayD::from_shape_vec(IxDyn(&header.shape).set_f(header.fortran), values)
         .map_err(|e| input.invalid("shape", e, expected()))?;
     let array = memory::in_order(&input.place(), "data", array)?;
@@ -89,7 +89,7 @@ pub(crate) fn exact(input: &mut Input, header: &Header) -> Result<(Vec<usize>, V
     let count = fits.ok_or_else(|| {
         input.invalid("shape", shape_text(&header.shape), "one or two axes with at least one element along each")
     })?;
-    let values = input.numbers("data", count, header.number, header.order, |x| x)?;
+    let values = input.doubles("data", count, header.number, header.order)?;
     let values = match (header.fortran, &header.shape[..]) {
         (true, &[rows, columns]) => in_c_order(&values, [rows, columns]),
         _ => values,

@@ -48,8 +48,17 @@ impl Number {
         }
     }
 
-    /// Appends the numbers in `raw` (a whole number of them) to `out`, through `map`.
-    pub fn decode<T>(self, order: ByteOrder, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
+    /// Appends the numbers in `raw` (a whole number of them) to `out`.
+    pub fn singles(self, order: ByteOrder, raw: &[u8], out: &mut Vec<f32>) {
+        self.decode(order, raw, out, |x| x as f32);
+    }
+
+    /// Appends the numbers in `raw` (a whole number of them) to `out`.
+    pub fn doubles(self, order: ByteOrder, raw: &[u8], out: &mut Vec<f64>) {
+        self.decode(order, raw, out, |x| x);
+    }
+
+    fn decode<T>(self, order: ByteOrder, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
         macro_rules! each {
             ($t:ty) => {{
                 let (raw, _) = raw.as_chunks::<{ size_of::<$t>() }>();
@@ -93,10 +102,10 @@ mod tests {
     #[test]
     fn both_byte_orders_are_read() {
         let mut out = Vec::new();
-        Number::I16.decode(ByteOrder::Little, &(-2i16).to_le_bytes(), &mut out, |x| x as f32);
-        Number::I16.decode(ByteOrder::Big, &(-2i16).to_be_bytes(), &mut out, |x| x as f32);
-        Number::F64.decode(ByteOrder::Big, &1.5f64.to_be_bytes(), &mut out, |x| x as f32);
-        Number::U64.decode(ByteOrder::Little, &u64::MAX.to_le_bytes(), &mut out, |x| x as f32);
+        Number::I16.singles(ByteOrder::Little, &(-2i16).to_le_bytes(), &mut out);
+        Number::I16.singles(ByteOrder::Big, &(-2i16).to_be_bytes(), &mut out);
+        Number::F64.singles(ByteOrder::Big, &1.5f64.to_be_bytes(), &mut out);
+        Number::U64.singles(ByteOrder::Little, &u64::MAX.to_le_bytes(), &mut out);
         assert_eq!(out, [-2.0, -2.0, 1.5, u64::MAX as f32]);
     }
 }

@@ -357,7 +357,7 @@ impl Rest {
         file.seek(SeekFrom::Start(self.at)).map_err(io)?;
         for _ in 0..self.images {
             file.read_exact(&mut raw).map_err(io)?;
-            self.number.decode(self.order, &raw, values, |x| x as f32);
+            self.number.singles(self.order, &raw, values);
         }
         Ok(())
     }

@@ -276,7 +276,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
         data = data.gunzip();
     }
     skip_bytes(&header, &mut data, count as u64 * number.bytes() as u64)?;
-    let values = data.numbers("data", count, number, order, |x| x as f32)?;
+    let values = data.singles("data", count, number, order)?;
     file_order::read(&data.place(), grid, affine, values)
 }
 

@@ -125,14 +125,14 @@ impl<'a> Array<'a> {
         let mut out = Vec::new();
         out.try_reserve_exact(self.count).ok()?;
         let raw = heap.bytes(self.data).unwrap_or_default();
-        self.dtype.number.decode(self.dtype.order, raw, &mut out, |x| x as f32);
+        self.dtype.number.singles(self.dtype.order, raw, &mut out);
         Some(out)
     }
 
     /// The numbers in storage order.
     pub fn numbers(&self, heap: &Heap<'a>) -> Vec<f64> {
         let mut out = Vec::new();
-        self.dtype.number.decode(self.dtype.order, heap.bytes(self.data).unwrap_or_default(), &mut out, |x| x);
+        self.dtype.number.doubles(self.dtype.order, heap.bytes(self.data).unwrap_or_default(), &mut out);
         out
     }
 
@@ -211,7 +211,7 @@ pub(super) fn scalar<'a>(heap: &Heap<'a>, arguments: Value<'a>) -> Result<Value<
         return Err(Refusal::new(format!("{} bytes", raw.len()), expected));
     }
     let mut out = Vec::new();
-    dtype.number.decode(dtype.order, raw, &mut out, |x| x);
+    dtype.number.doubles(dtype.order, raw, &mut out);
     match (dtype.number, out.first()) {
         (Number::Bool, Some(x)) => Ok(Value::Bool(*x != 0.0)),
         (_, Some(x)) => Ok(Value::Float(*x)),

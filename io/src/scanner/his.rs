@@ -72,7 +72,7 @@ pub(super) fn shape(path: &Path) -> Result<[usize; 3]> {
 pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
     let (shape, mut input) = open(path)?;
     let count = shape.iter().product();
-    let values = input.numbers("pixels", count, Number::U16, ByteOrder::Little, |x| x as f32)?;
+    let values = input.singles("pixels", count, Number::U16, ByteOrder::Little)?;
     Array3::from_shape_vec(shape, values).map_err(|e| input.invalid("pixels", e, "as many as the header says"))
 }
 

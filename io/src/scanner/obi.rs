@@ -108,7 +108,7 @@ pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
         let packed = input.exactly(left - table, "pixels")?;
         differences::unpack(&place, [rows, columns], &codes, &packed)?
     } else {
-        input.numbers("pixels", rows.saturating_mul(columns), Number::U16, ByteOrder::Little, |x| x as f32)?
+        input.singles("pixels", rows.saturating_mul(columns), Number::U16, ByteOrder::Little)?
     };
     Array3::from_shape_vec((1, rows, columns), values)
         .map_err(|e| Error::invalid(place, "pixels", e, "as many as rows and columns say"))

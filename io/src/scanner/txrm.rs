@@ -134,7 +134,7 @@ impl Txrm {
         memory::grow(&mut values, count * pixels, usize::MAX, &self.place, "images")?;
         for i in 0..count {
             let raw = self.bytes(&name(i), bytes)?;
-            number.decode(ByteOrder::Little, &raw, &mut values, |x| x as f32);
+            number.singles(ByteOrder::Little, &raw, &mut values);
         }
         let all = Array3::from_shape_vec((count, rows, columns), values)
             .map_err(|e| self.invalid("images", e, "as many pixels as rows and columns say"))?;

@@ -173,7 +173,7 @@ pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
         let found = length(&mut input, "pixels")?;
         let expected = format!("{} for {rows} x {columns} pixels", count.saturating_mul(bytes));
         ensure(found == count.saturating_mul(bytes), &place, "pixels", format!("{found} bytes"), expected)?;
-        input.part(found as u64).numbers("pixels", count, number, ByteOrder::Little, |x| x as f32)?
+        input.part(found as u64).singles("pixels", count, number, ByteOrder::Little)?
     };
     Array3::from_shape_vec((1, rows, columns), values)
         .map_err(|e| Error::invalid(place, "pixels", e, "as many as rows and columns say"))

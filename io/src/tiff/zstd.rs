@@ -48,7 +48,7 @@ pub(super) fn read(
         values.clear();
         // The float predictor stores the highest byte first.
         let order = if page.predictor == 3 { ByteOrder::Big } else { page.order };
-        page.number.decode(order, &raw, &mut values, |x| x as f32);
+        page.number.singles(order, &raw, &mut values);
         let width = page.chunk[1].min(columns - column);
         for (r, line) in values.chunks_exact(page.chunk[1]).take(rows - row).enumerate() {
             let to = start + (row + r) * columns + column;

@@ -238,7 +238,7 @@ impl Stored {
             Packing::Gzip => plain.gunzip(),
         };
         let count = self.array.chunks.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
-        input.numbers("chunk", count.unwrap_or(usize::MAX), self.number, self.order, |x| x as f32)
+        input.singles("chunk", count.unwrap_or(usize::MAX), self.number, self.order)
     }
 }
 
