@@ -16,7 +16,7 @@ steps=${3:-900}
 seeds=${4:-0 1 2}
 volumes=${5:-chest_128 head_256 engine_256}
 backend=${6:-auto}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 cargo build --release --quiet -p conefield-benches --bin curves
 bin=${CARGO_TARGET_DIR:-target}/release
 mkdir -p "$out"

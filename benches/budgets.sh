@@ -15,7 +15,7 @@ methods=${4:-best fista-tv}
 seeds=${5:-0 1 2}
 volumes=${6:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
 views=${7:-50}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
 for volume in $volumes; do

@@ -13,7 +13,7 @@ seeds=${4:-0}
 errors=${5:-offset-u=0 offset-u=0.1 offset-u=0.5 offset-u=2 offset-u=20 rotation=1 tilt=1 tilt=2 slant=2 distance=2 distance=-2 step=0.1 step=-0.1 step=1 offset-v=2 jitter=0 jitter=0.5 jitter=2}
 python=${PYTHON:-python3}
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet -p conefield-cli
+[[ -x $bin ]] || cargo build --release --quiet --bin conefield
 mkdir -p "$out"
 
 psnr() { # of the scan $1

@@ -12,7 +12,7 @@ folder=${1%/}
 data=${2:-}
 mkdir -p "$folder"
 target=${CARGO_TARGET_DIR:-target}/release
-cargo build --release --quiet -p conefield-cli --bins
+cargo build --release --quiet --bin conefield
 cargo build --release --quiet -p conefield-benches --bin contact
 # Cargo says where it puts the test programs.
 cargo test --release --no-run -p conefield-tests --test stages --test library --message-format=json |

@@ -14,7 +14,7 @@ seeds=${4:-0 1 2}
 passes=${5:-10}
 python=${PYTHON:-python3}
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet -p conefield-cli
+[[ -x $bin ]] || cargo build --release --quiet --bin conefield
 mkdir -p "$out"
 
 # The options of each correction for scans with its fault and, after a bar, without it (if an option is the size of the fault).

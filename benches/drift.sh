@@ -12,7 +12,7 @@ data=$1
 out=$2
 steps=${3:-1000}
 volume=${4:-chest_128}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 cargo build --release --quiet -p conefield-benches --bin curves
 bin=${CARGO_TARGET_DIR:-target}/release
 mkdir -p "$out"

@@ -13,7 +13,7 @@ out=$(realpath "$2")
 seconds=${3:-20}
 seeds=${4:-0, 1, 2}
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet -p conefield-cli
+[[ -x $bin ]] || cargo build --release --quiet --bin conefield
 volume() { # NAME FACTOR
     echo "{ volume = \"$data/volumes/$1.nii.gz\", name = \"$1\", downsample = $2 }"
 }

@@ -10,7 +10,7 @@ source benches/common.sh
 data=$1
 out=$2
 front=${3:-specs/tradeoff/front.toml}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
 volumes="engine_256 head_256 teapot_256 chest_128 abdomen_128"

@@ -13,7 +13,7 @@ out=$2
 python=$3
 inputs=${4:-smooth-tv light fdk}
 steps=${5:-2500}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
 learn="abdomen_128-0 abdomen_128-1 head_256-0 head_256-1"

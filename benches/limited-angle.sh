@@ -10,7 +10,7 @@ out=$2
 specs=${3:-fdk os-sart fista-tv smooth-tv limited-angle}
 python=${PYTHON:-python3}
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet -p conefield-cli
+[[ -x $bin ]] || cargo build --release --quiet --bin conefield
 mkdir -p "$out"
 scans="ta_30 td_30 tb_60 tb_90"
 "$python" benches/limited-angle.py "$data" "$out"

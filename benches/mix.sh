@@ -13,7 +13,7 @@ field=${4:-balanced}
 steps=${5:-2500}
 tv=${6:-smooth-tv}
 volumes=${7:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
 run() { # VOLUME SPEC OPTIONS...

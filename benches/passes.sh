@@ -11,7 +11,7 @@ data=$1
 out=$2
 other=$3
 runs=${4:-5}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
 published_scan "$data" engine_256 "$out/upright"

@@ -15,7 +15,7 @@ seeds=${4:-0}
 volumes=${5:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
 views=${6:-50}
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet -p conefield-cli
+[[ -x $bin ]] || cargo build --release --quiet --bin conefield
 mkdir -p "$out"
 
 level() { # a method of the chain: SAMPLES PASSES

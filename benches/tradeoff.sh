@@ -15,7 +15,7 @@ budgets=${3:-10s,30s,60s,180s,1200s}
 candidates=${4:-9}
 presets=${5:-30 60 1200}
 searches=${6:-engine_256 head_256 tuning}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
 for volume in abdomen_128 engine_256 head_256; do

@@ -12,7 +12,7 @@ budget=${3:-30s}
 seeds=${4:-0 1 2}
 volume=${5:-abdomen_128}
 specs="balanced accurate fast field-tv"
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 (cd plugins/examples && cargo build --release --quiet --locked -p triplane)
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 plugin=${CARGO_TARGET_DIR:-plugins/examples/target}/release/libtriplane.so

@@ -11,7 +11,7 @@ data=$1
 out=$2
 seconds=${3:-60}
 specs=${4:-fdk os-sart fista-tv balanced}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"
 cat >"$out/protocol.toml" <<'T'

@@ -14,7 +14,7 @@ views=${4:-10 25 50 75 100}
 volume=${5:-abdomen_128}
 downsample=${6:-1}
 detector=${7:-512x512}
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 cargo build --release --quiet -p conefield-benches --bin views
 bin=${CARGO_TARGET_DIR:-target}/release
 mkdir -p "$out"

@@ -37,7 +37,7 @@ def find_program():
     for path in named or built:
         if path.is_file():
             return path
-    raise PluginError("the reference needs the program: cargo build --release -p conefield-cli, or set CONEFIELD to its path")
+    raise PluginError("the reference needs the program: cargo build --release --bin conefield, or set CONEFIELD to its path")
 
 
 def run(program, *arguments):

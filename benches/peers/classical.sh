@@ -11,7 +11,7 @@ if [[ ! -x $venv/bin/python ]]; then
     python3 -m venv "$venv"
     "$venv/bin/pip" install --quiet itk-rtk numpy nibabel
 fi
-cargo build --release --quiet -p conefield-cli
+cargo build --release --quiet --bin conefield
 cargo bench --quiet -p conefield-benches --bench projectors --no-run
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 scan=$out/scan

@@ -1,6 +1,6 @@
 """conefield beside ASTRA at the size of a demo and of a laboratory: seconds of the reconstruction alone.
 
-    cargo build --release -p conefield-cli
+    cargo build --release --bin conefield
     python3 benches/peers/laboratory.py [--backend wgpu] [--sizes small,large] [--runs 3] [--folder DIR]
 
 The scan is of two balls about one centre, so that every view is the same and takes no time to make. conefield's times are `train_s` of

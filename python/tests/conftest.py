@@ -44,7 +44,7 @@ def command():
     known = [named] if named else [str(ROOT / "target" / "release" / "conefield")]
     program = next((p for p in known if shutil.which(p)), None)
     if program is None:
-        pytest.skip("the command conefield is not built: cargo build --release -p conefield-cli")
+        pytest.skip("the command conefield is not built: cargo build --release --bin conefield")
 
     def run(*arguments, code=0):
         done = subprocess.run([program, "--quiet", *map(str, arguments)], capture_output=True, text=True)

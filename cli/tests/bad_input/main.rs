@@ -1,7 +1,7 @@
 //! Bad input of every kind through the real command: it ends in time, in bounded memory, with the documented status and
 //! one message that names the place, the problem and the expectation; it leaves nothing behind.
 //!
-//! The outcome is recorded in `cases.md`. `CONEFIELD_BLESS=1 cargo test --release -p conefield-cli --test bad_input` writes it;
+//! The outcome is recorded in `cases.md`. `CONEFIELD_BLESS=1 cargo test --release --workspace --test bad_input` writes it;
 //! without that variable the table must match the current behaviour.
 
 #![cfg(target_os = "linux")]

@@ -4,7 +4,7 @@ use crate::case::Outcome;
 use std::fs;
 use std::path::Path;
 
-const HEAD: &str = "# Bad inputs and what conefield says\n\nWritten by `CONEFIELD_BLESS=1 cargo test --release -p conefield-cli --test bad_input`.\n";
+const HEAD: &str = "# Bad inputs and what conefield says\n\nWritten by `CONEFIELD_BLESS=1 cargo test --release --workspace --test bad_input`.\n";
 
 /// Compares the table with the outcomes, or writes it.
 pub fn check(run: &[(&str, Vec<Outcome>)]) {

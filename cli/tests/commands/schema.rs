@@ -13,7 +13,7 @@ fn the_files_in_specs_are_current() {
         }
         assert!(
             std::fs::read_to_string(&path).unwrap_or_default() == done(line),
-            "write it anew: cargo run --release -p conefield-cli -- {command} > conefield/specs/schema/{file}"
+            "write it anew: cargo run --release --bin conefield -- {command} > conefield/specs/schema/{file}"
         );
     }
 }

@@ -333,7 +333,7 @@ fn shortened(message: &str, want: &str) -> String {
 fn page(rows: &[Row]) {
     let mut text = String::from(
         "# Faulty plugins\n\nWhat happens to plugins with one fault each. `cli/tests/plugins/faulty.rs` makes this table from \
-         `plugins/tests`; `CONEFIELD_BLESS=1 cargo test --release -p conefield-cli --test plugins` writes it.\n\n- *load*: refused by \
+         `plugins/tests`; `CONEFIELD_BLESS=1 cargo test --release --workspace --test plugins` writes it.\n\n- *load*: refused by \
          `plugins list` (which shows the others), `plugins check` and a reconstruction when the library is loaded.\n- *trial*: \
          refused when the stage is made. Each stage is tried on a few rows, between guard zones and with a time limit.\n- \
          *check*: found by `plugins check` only, such as wrong gradients.\n- *run*: an error of the run, which leaves no \
