@@ -24,7 +24,8 @@ NARROWEST = 10.0  # HU
 
 
 def main(conefield, ct, labels, first, study):
-    work = pathlib.Path(tempfile.mkdtemp())
+    temporary = tempfile.TemporaryDirectory()
+    work = pathlib.Path(temporary.name)
 
     def read(path):
         to = work / "read.npy"

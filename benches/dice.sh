@@ -10,7 +10,7 @@ data=$(realpath "$1")
 mkdir -p "$2/data/volumes"
 out=$(realpath "$2")
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet --bin conefield
+cargo build --release --quiet --bin conefield
 ct=$out/data/volumes/abdomen_ct.nii.gz
 [[ -f $ct ]] || "$bin" -q convert "$data/clinical/abdomen_ct_hu.nii.gz" "$ct" --values clip:-1000,2000
 ln -sf "$data/volumes/chest_128.nii.gz" "$out/data/volumes/"

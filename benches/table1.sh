@@ -13,7 +13,7 @@ mkdir -p "$2"
 out=$(realpath "$2")
 seeds=${3:-0 1 2}
 volumes=${4:-chest_128 head_256 engine_256 abdomen_128}
-[[ -x ${CARGO_TARGET_DIR:-target}/release/conefield ]] || cargo build --release --quiet --bin conefield
+cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 published='"optimizer.lr=1e-3", "projector.samples=192"'
 steps=600 lines=150 gaussians=600

@@ -2,7 +2,6 @@
 
 use crate::parallel;
 use ndarray::{ArrayBase, Data, Dimension};
-use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Numbers per task.
 const PART: usize = 1 << 16;
@@ -20,14 +19,8 @@ where
 {
     // Nearly all arrays are fine: a fast pass over the memory says so. Only the slow one knows indices.
     if let Some(values) = array.as_slice_memory_order() {
-        let all = AtomicBool::new(true);
-        parallel::each(values.len().div_ceil(PART), &|n| {
-            let part = &values[n * PART..values.len().min((n + 1) * PART)];
-            if all.load(Ordering::Relaxed) && !part.iter().fold(true, |all, x| all & fine(*x)) {
-                all.store(false, Ordering::Relaxed);
-            }
-        });
-        if all.into_inner() {
+        let all = |part: &[f32]| part.iter().fold(true, |all, x| all & fine(*x));
+        if parallel::map(values.chunks(PART), |_, part| all(part)).into_iter().all(|fine| fine) {
             return None;
         }
     }

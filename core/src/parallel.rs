@@ -1,8 +1,7 @@
 //! Loops over all threads, compiled once.
 //!
-//! A parallel iterator of `rayon` is compiled anew for every closure: some 3000 to 6000 lines of LLVM's language each time. That was
-//! a quarter of what crates with kernels compiled. Loops over chunks that take microseconds or more use these functions; loops
-//! over single numbers use `rayon`.
+//! A parallel iterator of `rayon` is compiled anew for every closure, as some 3000 to 6000 lines of LLVM's language. Loops
+//! over chunks that take microseconds or more use these functions; loops over single numbers use `rayon`.
 
 use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
@@ -17,7 +16,8 @@ pub fn each(count: usize, work: &(dyn Fn(usize) + Sync)) {
 pub fn over<T: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(usize, T) + Sync) {
     let items: Vec<_> = items.into_iter().map(|item| Mutex::new(Some(item))).collect();
     each(items.len(), &|n| {
-        if let Some(item) = taken(&items[n]) {
+        let item = items[n].lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(item) = item {
             work(n, item);
         }
     });
@@ -25,20 +25,11 @@ pub fn over<T: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(usize, T)
 
 /// The result of `work` for every item, in order.
 pub fn map<T: Send, U: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(usize, T) -> U + Sync) -> Vec<U> {
-    let items: Vec<_> = items.into_iter().map(|item| (Mutex::new(Some(item)), Mutex::new(None))).collect();
-    each(items.len(), &|n| {
-        let (item, result) = &items[n];
-        if let Some(item) = taken(item) {
-            let done = work(n, item);
-            *result.lock().unwrap_or_else(PoisonError::into_inner) = Some(done);
-        }
-    });
-    let results = items.into_iter().map(|(_, result)| result.into_inner().unwrap_or_else(PoisonError::into_inner));
-    results.map(|done| done.unwrap_or_else(|| unreachable!("every item is worked on"))).collect()
-}
-
-fn taken<T>(slot: &Mutex<Option<T>>) -> Option<T> {
-    slot.lock().unwrap_or_else(PoisonError::into_inner).take()
+    let items: Vec<T> = items.into_iter().collect();
+    let mut results: Vec<Option<U>> = items.iter().map(|_| None).collect();
+    over(items.into_iter().zip(&mut results), |n, (item, result)| *result = Some(work(n, item)));
+    let done = |result: Option<U>| result.unwrap_or_else(|| unreachable!("every item is worked on"));
+    results.into_iter().map(done).collect()
 }
 
 #[cfg(test)]

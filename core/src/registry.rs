@@ -1,7 +1,7 @@
 //! The stage types that a spec may name.
 //!
-//! Linked types register with [`stage_type!`](crate::stage_type), those of libraries loaded at run time with [`add`]. Editor schemas and the lists in error messages use this
-//! registry.
+//! Linked types register with [`stage_type!`](crate::stage_type), those of libraries loaded at run time with [`add`].
+//! The registry reads and writes the stages of a spec. Editor schemas and the lists in error messages use it too.
 
 use crate::error::{Error, Result};
 use schemars::Schema;
