@@ -240,8 +240,10 @@ fn corners(grid: &VoxelGrid) -> [Vec3; 8] {
 /// Cells and all their neighbours.
 fn widened(cells: &[bool], [nx, ny, nz]: [usize; 3]) -> Vec<bool> {
     let near = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
-    parallel::map(0..cells.len(), |_, i| {
-        let [x, y, z] = [i / (ny * nz), i / nz % ny, i % nz];
-        near(x, nx).any(|x| near(y, ny).any(|y| near(z, nz).any(|z| cells[(x * ny + y) * nz + z])))
-    })
+    let plane = |x: usize| -> Vec<bool> {
+        let near_x = |y: usize, z: usize| near(x, nx).any(|x| cells[(x * ny + y) * nz + z]);
+        let of = |i: usize| near(i / nz, ny).any(|y| near(i % nz, nz).any(|z| near_x(y, z)));
+        (0..ny * nz).map(of).collect()
+    };
+    parallel::map(0..nx, |_, x| plane(x)).concat()
 }
