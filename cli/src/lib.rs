@@ -15,10 +15,11 @@ mod segmenter;
 mod signals;
 
 use clap::Parser;
-use conefield::{memory, plugins};
+use conefield::{memory, plugins, ranks};
 use conefield_core::Error;
 use std::ffi::OsString;
 use std::process::ExitCode;
+use std::time::Duration;
 
 /// Reconstructs CT volumes from few cone-beam X-ray views, with classical methods and neural fields.
 #[derive(Parser)]
@@ -28,6 +29,18 @@ struct Cli {
     command: commands::Command,
     #[command(flatten)]
     general: commands::General,
+}
+
+/// Logs the error that ends the command. That of one process is mostly that of all: the leading one says it first, and
+/// then the others are gone.
+fn complain(e: &Error) {
+    match ranks::rank() {
+        0 => log::error(&e.to_string()),
+        rank => {
+            std::thread::sleep(Duration::from_secs(1));
+            log::error(&format!("process {rank}: {e}"));
+        }
+    }
 }
 
 const SUCCESS: u8 = 0;
@@ -45,11 +58,29 @@ pub fn run(args: impl IntoIterator<Item = OsString>, program: Option<Vec<OsStrin
     let args: Vec<OsString> = args.into_iter().collect();
     program::note(program, args.iter().skip(1).cloned().collect());
     let cli = Cli::parse_from(args);
+    let joined = match ranks::start() {
+        Ok(joined) => joined,
+        Err(e) => {
+            log::error(&e.to_string());
+            return FAILURE;
+        }
+    };
+    let status = obey(cli);
+    if status == FAILURE {
+        // The others wait for what this process does not send: it ends without their leave, which ends them too.
+        std::mem::forget(joined);
+    }
+    status
+}
+
+/// Runs a command. Returns the exit status.
+fn obey(cli: Cli) -> u8 {
     let general = cli.general;
-    if !general.quiet {
+    let quiet = general.quiet || ranks::rank() > 0;
+    if !quiet {
         progress::show_bars();
     }
-    log::start(general.verbose, general.quiet);
+    log::start(general.verbose, quiet);
     if let Err(e) = signals::watch() {
         log::error(&e.to_string());
         return FAILURE;
@@ -69,10 +100,17 @@ pub fn run(args: impl IntoIterator<Item = OsString>, program: Option<Vec<OsStrin
     // `plugins` shows refused plugins itself.
     let listed = matches!(cli.command, commands::Command::Plugins(_));
     let settled = if listed { Ok(()) } else { plugins::settle() };
-    match settled.and_then(|()| commands::run(cli.command, &general)) {
+    let alone = match cli.command {
+        commands::Command::Reconstruct(_) => Ok(()),
+        _ if ranks::count() == 1 => Ok(()),
+        _ => {
+            Err(Error::unsupported("mpirun", "several processes: they share the work of `conefield reconstruct` only"))
+        }
+    };
+    match alone.and(settled).and_then(|()| commands::run(cli.command, &general)) {
         Ok(()) => SUCCESS,
         Err(e) => {
-            log::error(&e.to_string());
+            complain(&e);
             match (&e, signals::caught()) {
                 (
                     Error::Interrupted { .. } | Error::Stopped { .. } | Error::Cancelled { .. } | Error::Aborted { .. },

@@ -1,9 +1,10 @@
 //! Selection of the backend.
 
+use crate::ranks;
 use conefield_backend_cpu::Cpu;
-use conefield_core::Result;
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::pipeline::Pipeline;
+use conefield_core::{Error, Result};
 use serde::{Serialize, Serializer};
 use std::fmt;
 use std::path::Path;
@@ -63,6 +64,14 @@ impl Serialize for BackendChoice {
 impl BackendChoice {
     /// Opens the backend.
     pub fn open(self) -> Result<Box<dyn Backend>> {
+        if let Some(shared) = ranks::backend() {
+            return match self {
+                Self::Auto | Self::Cpu => Ok(shared),
+                Self::Wgpu { .. } => {
+                    Err(Error::invalid("this run", "backend", self, "auto or cpu: several processes share CPUs only"))
+                }
+            };
+        }
         Ok(match self {
             Self::Auto => Box::<Auto>::default(),
             Self::Cpu => Box::new(Cpu::new()),

@@ -20,12 +20,13 @@
 //! - [`backend`]: backends; [`memory`]: a run's memory and the available memory; [`scratch`]: arrays beyond it;
 //!   [`machine`]: the current machine.
 //! - [`session`]: every run, from its inputs ([`input`]) to its [`record`].
+//! - [`ranks`]: several processes for one run.
 //! - [`hounsfield`]: Hounsfield units of a written volume.
 //! - [`explain`]: explanation of a spec; [`score`]: comparison of a volume with its reference.
 //! - [`simulation`], [`pretraining`], [`projection`]: the work of the commands of these names.
 //! - `study`: many runs under one protocol; [`tradeoff`]: time, memory and accuracy of methods.
 //!
-//! The feature `wgpu` adds GPUs; the feature `plots` adds pictures, plots and pages, and the studies and searches that
+//! The feature `wgpu` adds GPUs; the feature `mpi` adds runs of several processes; the feature `plots` adds pictures, plots and pages, and the studies and searches that
 //! draw them.
 
 pub mod backend;
@@ -40,6 +41,7 @@ pub mod parse;
 pub mod plugins;
 pub mod pretraining;
 pub mod projection;
+pub mod ranks;
 pub mod reconstruct;
 pub mod record;
 pub mod score;

@@ -3,7 +3,7 @@
 //! An estimate is the peak over reading, training and export. It omits everything that is always small, except the
 //! program itself.
 
-use crate::scratch;
+use crate::{ranks, scratch};
 use conefield_core::method::{Needs, Plan};
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result, allowance};
@@ -239,7 +239,8 @@ impl Run {
             reference,
             model: needs.model,
             optimizer: needs.optimizer,
-            buffers: needs.backend + needs.working + checkpoint,
+            // Processes share the arrays of a method, but for what each receives of the others.
+            buffers: needs.backend + needs.working / ranks::count() as u64 + checkpoint,
             ..Memory::default()
         };
         // A result is held whole for scoring.

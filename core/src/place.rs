@@ -9,10 +9,12 @@
 
 mod map;
 mod penalty;
+mod ranks;
 mod views;
 
 pub use map::{ADD, CLIP, DIVIDE, INVERT, MULTIPLY, Map, RELAX, Reduction, squares};
 pub use penalty::{Bounds, Dual, Guide, Kernels, Penalty, Update};
+pub use ranks::{Peers, Ranks, Slab};
 pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 
 use crate::allowance;
@@ -39,6 +41,11 @@ pub type Mask = Held<bool>;
 enum Data<T> {
     Host(Array3<T>),
     There(Box<dyn Any + Send + Sync>),
+    /// Planes along the first axis, from plane `first` on.
+    Part {
+        first: usize,
+        planes: Box<Held<T>>,
+    },
 }
 
 impl<T> Held<T> {
@@ -61,6 +68,27 @@ impl<T> Held<T> {
         Self { shape, data: Data::There(Box::new(data)) }
     }
 
+    /// Planes of an array that several processes share, from plane `first` on.
+    pub fn part(shape: [usize; 3], first: usize, planes: Self) -> Self {
+        Self { shape, data: Data::Part { first, planes: Box::new(planes) } }
+    }
+
+    /// The planes at hand of an array that several processes share, and the number of the first one.
+    pub fn planes(&self) -> Option<(usize, &Self)> {
+        match &self.data {
+            Data::Part { first, planes } => Some((*first, planes)),
+            _ => None,
+        }
+    }
+
+    /// Mutable version of [`Held::planes`].
+    pub fn planes_mut(&mut self) -> Option<(usize, &mut Self)> {
+        match &mut self.data {
+            Data::Part { first, planes } => Some((*first, planes)),
+            _ => None,
+        }
+    }
+
     /// Its shape.
     pub fn shape(&self) -> [usize; 3] {
         self.shape
@@ -80,7 +108,7 @@ impl<T> Held<T> {
     pub fn on_host(&self) -> Option<&Array3<T>> {
         match &self.data {
             Data::Host(array) => Some(array),
-            Data::There(_) => None,
+            _ => None,
         }
     }
 
@@ -88,25 +116,32 @@ impl<T> Held<T> {
     pub fn on_host_mut(&mut self) -> Option<&mut Array3<T>> {
         match &mut self.data {
             Data::Host(array) => Some(array),
-            Data::There(_) => None,
+            _ => None,
         }
     }
 
-    /// Its elements in order, if it lives in the host's memory; else none.
+    /// The elements at hand in order, if they live in the host's memory; else none.
     pub fn slice(&self) -> &[T] {
-        self.on_host().and_then(|array| array.as_slice()).unwrap_or_default()
+        match &self.data {
+            Data::Part { planes, .. } => planes.slice(),
+            _ => self.on_host().and_then(|array| array.as_slice()).unwrap_or_default(),
+        }
     }
 
     /// Mutable version of [`Held::slice`].
     pub fn slice_mut(&mut self) -> &mut [T] {
-        self.on_host_mut().and_then(|array| array.as_slice_mut()).unwrap_or_default()
+        match &mut self.data {
+            Data::Part { planes, .. } => planes.slice_mut(),
+            Data::Host(array) => array.as_slice_mut().unwrap_or_default(),
+            Data::There(_) => &mut [],
+        }
     }
 
     /// What a place keeps of it.
     pub fn get<D: Any>(&self) -> Option<&D> {
         match &self.data {
-            Data::Host(_) => None,
             Data::There(data) => data.downcast_ref(),
+            _ => None,
         }
     }
 }
@@ -128,12 +163,12 @@ impl StatePart<'_> {
         }
     }
 
-    /// Its numbers in the host's memory.
+    /// Its numbers in the host's memory. Of several processes, only the leading one needs them.
     pub fn read(&self, place: &dyn Place) -> Result<Cow<'_, [f32]>> {
         match self {
             Self::Host(x) => Ok(Cow::Borrowed(x)),
             Self::Placed(x) if x.on_host().is_some() => Ok(Cow::Borrowed(x.slice())),
-            Self::Placed(x) => Ok(Cow::Owned(place.read(x)?.into_owned().into_raw_vec_and_offset().0)),
+            Self::Placed(x) => Ok(Cow::Owned(place.gather(x)?.into_owned().into_raw_vec_and_offset().0)),
         }
     }
 
@@ -218,6 +253,18 @@ pub trait Place: Send + Sync {
         u64::MAX
     }
 
+    /// Whether `flag` is true in any of the processes that share the arrays. All of them stop, and write, together.
+    fn agree(&self, flag: bool) -> bool {
+        flag
+    }
+
+    /// How a penalty of a volume of this many planes is divided, if several processes share the arrays. Each needs `halo`
+    /// planes of its neighbours.
+    fn slab(&self, planes: usize, halo: usize) -> Option<Slab> {
+        let _ = (planes, halo);
+        None
+    }
+
     /// An array with the numbers of `from`.
     fn adopt(&self, from: Array3<f32>) -> Result<Array> {
         let mut array = self.zeros(from.dim().into())?;
@@ -245,6 +292,11 @@ pub trait Place: Send + Sync {
         Ok(array.into())
     }
 
+    /// Like [`Place::read`], but only in the leading process; an empty array in the others.
+    fn gather<'a>(&self, x: &'a Array) -> Result<CowArray<'a, f32, Ix3>> {
+        self.read(x)
+    }
+
     /// Lets `work` change the numbers of `x` in the host's memory.
     fn change(&self, x: &mut Array, work: &mut dyn FnMut(&mut Array3<f32>)) -> Result<()> {
         on_host(self, x, true, work)
@@ -259,7 +311,7 @@ pub trait Place: Send + Sync {
     fn take(&self, x: Array) -> Result<Array3<f32>> {
         match x.data {
             Data::Host(array) => Ok(array),
-            Data::There(_) => Ok(self.read(&x)?.into_owned()),
+            _ => Ok(self.read(&x)?.into_owned()),
         }
     }
 
@@ -388,15 +440,15 @@ pub trait Place: Send + Sync {
         if let Some(inside) = inside {
             self.keep(gradient, inside, f32::MIN)?;
         }
-        self.change(gradient, &mut |v| {
-            let mut u = Array3::zeros(v.raw_dim());
-            penalty.prox(v.as_slice().unwrap_or_default(), tau, u.as_slice_mut().unwrap_or_default());
-            *v = u;
-        })?;
-        penalty.fault()?;
+        self.prox(gradient, tau, penalty)?;
         self.map(&ADD, [-f64::from(momentum), 0.0], ahead, &[x])?;
         self.map(&ADD, [1.0 + f64::from(momentum), 1.0], ahead, &[gradient])?;
         self.map(&ADD, [1.0, 0.0], x, &[gradient])
+    }
+
+    /// Replaces `v` with the result of [`Penalty::prox`], on the host.
+    fn prox(&self, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+        whole_prox(self, v, tau, penalty)
     }
 
     /// The value of `penalty` at `x`; see [`Penalty::value`].
@@ -467,6 +519,16 @@ impl Place for Host {
         }
         Ok(())
     }
+}
+
+/// [`Place::prox`] of a penalty of the whole volume.
+fn whole_prox<P: Place + ?Sized>(place: &P, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+    place.change(v, &mut |v| {
+        let mut u = Array3::zeros(v.raw_dim());
+        penalty.prox(v.as_slice().unwrap_or_default(), tau, u.as_slice_mut().unwrap_or_default());
+        *v = u;
+    })?;
+    penalty.fault()
 }
 
 /// Lets `work` change an array in the host's memory; its numbers are moved there first if `read`.

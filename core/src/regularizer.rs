@@ -2,12 +2,14 @@
 
 use crate::error::{Result, ensure};
 use crate::geometry::VoxelGrid;
+use crate::place::Host;
 pub use crate::place::{Bounds, Dual, Guide, Kernels, Penalty, Update};
 use crate::registry::Registered;
 use crate::space::Space;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt::{Display, Formatter};
+use std::sync::Arc;
 
 /// Settings of a regularizer.
 pub trait RegularizerSpec: Registered + Send + Sync {
@@ -70,6 +72,27 @@ pub trait Regularizer: Send + Sync {
         Ok(vec![self.weight(grid, noise)?])
     }
 
+    /// Planes on both sides of a slab on which an update of the slab depends, with their own state. `None` if a penalty
+    /// needs the whole volume.
+    fn halo(&self) -> Option<usize> {
+        None
+    }
+
     /// A line for `explain`.
     fn describe(&self) -> String;
+}
+
+/// The penalty of `regularizer` for arrays of `space`. If several processes share them, it is a penalty of a slab, or one
+/// of the whole volume in each process.
+pub fn penalty(regularizer: &dyn Regularizer, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
+    let halo = regularizer.halo();
+    let Some(slab) = space.place().slab(grid.shape[0], halo.unwrap_or(0)) else {
+        return regularizer.on(grid, space);
+    };
+    if halo.is_none() {
+        return regularizer.on(grid, &Space::new(*space.header(), Arc::new(Host)));
+    }
+    let mut penalty = regularizer.on(&grid.slab(slab.planes.clone()), &space.within(&slab))?;
+    penalty.divide(slab);
+    Ok(penalty)
 }

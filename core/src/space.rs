@@ -4,7 +4,7 @@
 //! tally, returns empty arrays and adds up their bytes: the same code allocates and estimates memory.
 
 use crate::error::Result;
-use crate::place::{Array, Host, Place};
+use crate::place::{Array, Host, Place, Slab};
 use crate::scan::ScanHeader;
 use std::cell::Cell;
 use std::sync::Arc;
@@ -14,6 +14,8 @@ pub struct Space {
     header: ScanHeader,
     place: Arc<dyn Place>,
     tally: bool,
+    /// The slab whose arrays it allocates: planes of the whole, and the first one.
+    slab: Option<[usize; 2]>,
     /// Bytes currently held.
     held: Cell<u64>,
     /// Peak of the bytes held.
@@ -23,12 +25,17 @@ pub struct Space {
 impl Space {
     /// A space that allocates in `place`.
     pub fn new(header: ScanHeader, place: Arc<dyn Place>) -> Self {
-        Self { header, place, tally: false, held: Cell::new(0), most: Cell::new(0) }
+        Self { header, place, tally: false, slab: None, held: Cell::new(0), most: Cell::new(0) }
     }
 
     /// A space that returns empty arrays and counts the bytes they would take.
     pub fn tally(header: ScanHeader) -> Self {
         Self { tally: true, ..Self::new(header, Arc::new(Host)) }
+    }
+
+    /// A space in the host's memory for arrays in the shape of a slab.
+    pub fn within(&self, slab: &Slab) -> Self {
+        Self { slab: Some([slab.whole, slab.planes.start]), ..Self::new(self.header, Arc::new(Host)) }
     }
 
     /// Whether it only counts: its arrays are empty.
@@ -60,7 +67,14 @@ impl Space {
     /// Zeros.
     pub fn array(&self, shape: [usize; 3]) -> Result<Array> {
         self.hold(shape.iter().fold(size_of::<f32>() as u64, |n, side| n.saturating_mul(*side as u64)));
-        if self.tally { Host.zeros([0; 3]) } else { self.place.zeros(shape) }
+        if self.tally {
+            return Host.zeros([0; 3]);
+        }
+        let array = self.place.zeros(shape)?;
+        Ok(match self.slab {
+            None => array,
+            Some([whole, first]) => Array::part([whole, shape[1], shape[2]], first, array),
+        })
     }
 
     /// Zeros in the host's memory, for a stage that works there wherever the arrays are.

@@ -19,14 +19,16 @@ use conefield::parse;
 use conefield::record::{RunRecord, ScanRecord, Written};
 use conefield::session::{self, Request, Run, Session, Solved};
 use conefield::tradeoff::front::Front;
-use conefield::{files, specs};
+use conefield::{files, ranks, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
+use conefield_core::method::{Observer, Record};
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::MiddleSlices;
+use conefield_evaluation::report::text::bytes;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::PathBuf;
@@ -90,11 +92,29 @@ fn spec_help() -> String {
 /// Prefix of an error on standard output.
 pub const FAILED: &str = "failed: ";
 
+/// The file for the state of an interrupted run.
+const CHECKPOINT: &str = "checkpoint.safetensors";
+
 /// Seconds between two live pictures for --watch.
 const WATCHED: f64 = 5.0;
 
 /// A held-out error above this may be due to a wrong geometry.
 const DOUBTFUL: f64 = 0.05;
+
+/// The observer of a process that does not lead.
+struct Follower;
+
+impl Observer for Follower {
+    fn progress(&mut self, _: u64, _: f64, _: f64) {}
+
+    fn record(&mut self, _: &Record) {}
+
+    fn note(&mut self, _: &str) {}
+
+    fn cancelled(&self) -> bool {
+        signals::caught().is_some()
+    }
+}
 
 impl ReconstructArgs {
     pub fn run(self) -> Result<()> {
@@ -124,8 +144,38 @@ impl ReconstructArgs {
         command.bin_name("conefield reconstruct").error(ErrorKind::MissingRequiredArgument, what).exit()
     }
 
+    /// The work of a process that does not lead: what the leading one computes, without a file or a word.
+    fn follow(&self, begin: Instant) -> Result<()> {
+        memory::allow_scratch(boundary::folder_of(&self.output));
+        let backend = self.protocol.backend.open()?;
+        let session = self.session(backend.as_ref(), begin)?;
+        let (input, scan) = self.input()?;
+        let resume = match session.requested() {
+            Some(loaded) if self.resume => {
+                let identity = identity(loaded, &self.protocol, &input.held, &scan)?;
+                Some(files::read_checkpoint(&self.output.join(CHECKPOINT), &identity)?)
+            }
+            _ => None,
+        };
+        let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
+        let mut run = session.plan(input, spent, &|| false)?;
+        signals::listen()?;
+        match run.solve(None, resume.as_ref(), &mut Follower) {
+            // The leading process writes the checkpoint and says so.
+            Err(Error::Interrupted { .. }) => Ok(()),
+            done => done.map(drop),
+        }
+    }
+
     fn reconstruct(&self) -> Result<()> {
         let begin = Instant::now();
+        if ranks::count() > 1 && self.protocol.budget.is_some() {
+            let expected = "--spec without --budget: processes that measure their own speed would choose differently";
+            return Err(Error::invalid("mpirun", "--budget", "several processes", expected));
+        }
+        if ranks::rank() > 0 {
+            return self.follow(begin);
+        }
         let mut folder = RunFolder::take(&self.output)?;
         if !self.resume {
             folder.may_begin(self.force)?;
@@ -146,7 +196,8 @@ impl ReconstructArgs {
             _ => inputs,
         };
         inputs.spare_folder(&self.output)?;
-        let (input, scan) = self.input(&folder)?;
+        let (input, scan) = self.input()?;
+        conefield_io::check_shape(folder.file("volume.nii.gz"), input.scan.geometry.volume.shape)?;
         let affine = input.reference.as_ref().and_then(|r| r.affine);
         let (unit, grid) = (&input.scan.unit, &input.scan.geometry.volume);
         let hu = self.units.of_attenuation()?.open(&self.scan, Some(unit), grid, affine.as_ref())?;
@@ -180,6 +231,9 @@ impl ReconstructArgs {
         }
         let mut progress = self.progress(&folder, metrics, identity)?;
         let solved = run.solve(None, resume.as_ref(), &mut progress)?;
+        if ranks::count() > 1 {
+            tracing::info!("{} processes; this one sent {} to the others", ranks::count(), bytes(ranks::sent()));
+        }
         let last = progress.records().last().cloned();
         let board = progress.take_board();
         drop(progress);
@@ -244,9 +298,8 @@ impl ReconstructArgs {
     }
 
     /// Reads all inputs.
-    fn input(&self, folder: &RunFolder) -> Result<(Input, ScanRecord)> {
+    fn input(&self) -> Result<(Input, ScanRecord)> {
         let (whole, reference) = input::read(&self.scan, self.protocol.reference.as_deref())?;
-        conefield_io::check_shape(folder.file("volume.nii.gz"), whole.geometry.volume.shape)?;
         let held = self.protocol.held_out(whole.geometry.views.len())?;
         let record = ScanRecord::of(&self.scan, &whole)?;
         Ok((Input::new(Arc::new(whole), held, reference, self.protocol.peak)?, record))
@@ -261,7 +314,7 @@ impl ReconstructArgs {
     ) -> Result<Progress> {
         let board = self.tensorboard.then(|| Board::new(&folder.file("events.out.tfevents.conefield"), &metrics.0));
         let keeper = Keeper {
-            path: folder.file("checkpoint.safetensors"),
+            path: folder.file(CHECKPOINT),
             every: Duration::from_secs_f64(self.protocol.checkpoint_every),
             run,
             last: Instant::now(),
@@ -284,7 +337,7 @@ impl ReconstructArgs {
 
     /// The file for metrics of an interrupted run, and the checkpoint to continue from.
     fn reopen(&self, folder: &RunFolder, identity: &BTreeMap<String, String>) -> Result<((PathBuf, File), Resume)> {
-        let resume = files::read_checkpoint(&folder.file("checkpoint.safetensors"), identity)?;
+        let resume = files::read_checkpoint(&folder.file(CHECKPOINT), identity)?;
         folder.go_on();
         let metrics = folder.metrics_until(resume.standing.recorded)?;
         Ok((metrics, resume))

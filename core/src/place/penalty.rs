@@ -1,6 +1,6 @@
 //! A penalty of coefficients, as a place works with it: its proximal map, and the update around that.
 
-use super::{Array, StatePart};
+use super::{Array, Slab, StatePart};
 use crate::allowance;
 use crate::error::{Error, Result};
 use crate::geometry::Vec3;
@@ -80,6 +80,18 @@ pub trait Penalty: Send {
     /// Gives the priors of a sum their shares of its weight, which add up to 1. Called before the first update.
     fn share(&mut self, shares: &[f64]) {
         let _ = shares;
+    }
+
+    /// Tells that its grid is a slab of a volume that several processes share. [`Penalty::value`] and
+    /// [`Penalty::adapt`] then return the sums over [`Slab::own`]. Called at once, if
+    /// [`crate::regularizer::Regularizer::halo`] admits slabs.
+    fn divide(&mut self, slab: Slab) {
+        let _ = slab;
+    }
+
+    /// The slab of [`Penalty::divide`].
+    fn slab(&self) -> Option<&Slab> {
+        None
     }
 
     /// The whole update, with [`Penalty::prox`] for `tau`. A penalty whose proximal map is a single pass over the

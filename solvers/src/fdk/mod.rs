@@ -190,7 +190,7 @@ impl Backprojection<'_> {
             let mut slab = space.array([planes.min(nx - first), ny, nz])?;
             for views in all.chunks(at_once) {
                 let share = done as f64 / whole as f64;
-                if observer.cancelled() {
+                if place.agree(observer.cancelled()) {
                     return Err(Error::Interrupted { step: (share * all.len() as f64) as u64 });
                 }
                 self.load(space, views, &mut images)?;

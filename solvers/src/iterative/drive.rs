@@ -81,14 +81,14 @@ pub(super) fn drive(
 ) -> Result<Solution> {
     let mut run = Run::begin(job, stop, begun, problem, best(stop, space)?, method.as_mut(), observer)?;
     loop {
-        let cancelled = observer.cancelled();
-        if run.step > run.started && (cancelled || observer.checkpoint_due()) {
+        let cancelled = problem.place.agree(observer.cancelled());
+        if run.step > run.started && (cancelled || problem.place.agree(observer.checkpoint_due())) {
             run.checkpoint(method.as_mut(), observer)?;
         }
         if cancelled {
             return Err(Error::Interrupted { step: run.step });
         }
-        if run.step > run.started && observer.slices_due() {
+        if run.step > run.started && problem.place.agree(observer.slices_due()) {
             run.slices(method.as_mut(), observer)?;
         }
         if run.over {
@@ -145,7 +145,8 @@ impl<'a> Run<'a> {
         let mut run = Self { job, stop, problem, monitor, clock, kept, best, started, step, residual, empty, over };
         // Time alone does not end a run before its first pass.
         let share = if step == 0 { run.clock.share_of_steps(step) } else { run.clock.done(step) };
-        run.over = share >= 1.0 || run.kept.settled || (step > 0 && !run.clock.allows(0.0));
+        let over = share >= 1.0 || run.kept.settled || (step > 0 && !run.clock.allows(0.0));
+        run.over = problem.place.agree(over);
         if run.over {
             observer.progress(step, 1.0, 0.0);
         }
@@ -164,7 +165,8 @@ impl<'a> Run<'a> {
         observer.record(&record);
         self.clock.resume();
         let share = self.clock.done(self.step);
-        self.over = share >= 1.0 || self.kept.settled || !self.clock.allows(begun.elapsed().as_secs_f64());
+        let over = share >= 1.0 || self.kept.settled || !self.clock.allows(begun.elapsed().as_secs_f64());
+        self.over = self.problem.place.agree(over);
         let left = self.clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9);
         let (share, left) = if self.over { (1.0, 0.0) } else { (share, left) };
         observer.progress(self.step, share, left);

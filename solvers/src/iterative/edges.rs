@@ -2,7 +2,7 @@
 
 use conefield_core::error::Result;
 use conefield_core::parallel;
-use conefield_core::place::Array;
+use conefield_core::place::{Array, Slab};
 use conefield_core::regularizer::Guide;
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
@@ -36,9 +36,9 @@ impl Edges {
         Guide { vectors: self.n.each_mut(), strength: self.strength, scale: self.scale as f32 }
     }
 
-    /// Finds the edges of `x` on the host, whose differences are weighted by `g` along x, y, z. The result does not depend on the
-    /// number of threads.
-    pub fn find(&mut self, x: ArrayView3<'_, f32>, g: [f32; 3]) {
+    /// Finds the edges of `x` on the host, whose differences are weighted by `g` along x, y, z. `x` is `slab` if several
+    /// processes share the volume. The result does not depend on the number of threads.
+    pub fn find(&mut self, x: ArrayView3<'_, f32>, g: [f32; 3], slab: Option<&Slab>) {
         let (nx, ny, nz) = x.dim();
         let plane = ny * nz;
         if plane == 0 {
@@ -61,7 +61,10 @@ impl Edges {
             let square = |((a, b), c): ((&f32, &f32), &f32)| f64::from(a * a + b * b + c * c);
             a.iter().zip(&*b).zip(&*c).map(square).sum::<f64>()
         });
-        let mean = squares.iter().sum::<f64>() / x.len() as f64;
+        let mean = match slab {
+            None => squares.iter().sum::<f64>() / x.len() as f64,
+            Some(slab) => slab.sum(squares[slab.inner()].iter().sum()) / (slab.whole * plane) as f64,
+        };
         let eta2 = (mean * self.scale * self.scale) as f32;
         let strength = self.strength;
         let planes = a.chunks_mut(plane).zip(b.chunks_mut(plane)).zip(c.chunks_mut(plane));
@@ -135,7 +138,7 @@ mod tests {
         let shape = x.dim().into();
         let space = Space::new(ScanHeader { views: 0, detector: [0; 2], volume: shape }, Arc::new(Host));
         let mut edges = Edges::new(shape, 0.81, scale, &space).unwrap();
-        edges.find(x.view(), g);
+        edges.find(x.view(), g, None);
         edges
     }
 

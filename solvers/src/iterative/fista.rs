@@ -31,7 +31,7 @@ use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solutio
 use conefield_core::orbit::Arcs;
 use conefield_core::place::{Array, Bounds, DIVIDE, ProximalStep, Reduction, StatePart};
 use conefield_core::random::stream;
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
+use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, penalty};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
@@ -310,7 +310,7 @@ impl Arrays {
         let coefficients = || space.array(grid.shape);
         Ok(Self {
             model,
-            penalty: settings.prior.on(&grid, space).map_err(|e| e.within("prior"))?,
+            penalty: penalty(settings.prior.as_ref(), &grid, space).map_err(|e| e.within("prior"))?,
             x,
             ahead: coefficients()?,
             gradient: coefficients()?,

@@ -12,7 +12,7 @@ use conefield_core::allowance;
 use conefield_core::error::Result;
 use conefield_core::geometry::{Vec3, VoxelGrid};
 use conefield_core::parallel;
-use conefield_core::place::{ADD, Array, Place, VariationSlope};
+use conefield_core::place::{ADD, Array, Place, Slab, VariationSlope};
 use conefield_core::regularizer::{Bounds, Dual, Update};
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
 use conefield_core::space::Space;
@@ -35,20 +35,24 @@ fn along([_, ny, nz]: [usize; 3]) -> [usize; 3] {
 
 /// The total variation of `x`, which must be contiguous in standard order.
 pub fn total_variation(x: ArrayView3<'_, f32>, g: [f32; 3], edges: Option<&Edges>, limited: Option<Limited>) -> f64 {
+    variations(x, g, edges, limited).iter().sum()
+}
+
+/// The total variation of each plane of `x`.
+fn variations(x: ArrayView3<'_, f32>, g: [f32; 3], edges: Option<&Edges>, limited: Option<Limited>) -> Vec<f64> {
     let plane = x.dim().1 * x.dim().2;
     let [nz, y, z] = along(x.dim().into());
     let g = [g[0], g[y], g[z]];
     let limited = limited.map(|limited| limited.turned([0, y, z]));
     let x = x.as_standard_layout();
-    let Some(all) = x.as_slice() else { return 0.0 };
-    let planes: Vec<f64> = parallel::map(all.chunks(plane.max(1)), |i, x| {
+    let Some(all) = x.as_slice() else { return vec![] };
+    parallel::map(all.chunks(plane.max(1)), |i, x| {
         let n = edges.map(|edges| {
             let n = edges.vectors();
             [n[0], n[y], n[z]].map(|n| &n[i * plane..(i + 1) * plane])
         });
         run(Variation { x, after: all.get((i + 1) * plane..(i + 2) * plane), n, g, limited, nz })
-    });
-    planes.iter().sum()
+    })
 }
 
 /// The total variation of a plane.
@@ -155,6 +159,8 @@ pub struct TvProx {
     /// Edges across which slopes cost less.
     edges: Option<Edges>,
     limited: Option<Limited>,
+    /// Its part of a volume that several processes share.
+    slab: Option<Slab>,
 }
 
 impl TvProx {
@@ -166,7 +172,8 @@ impl TvProx {
             space.hold((planes * (shape[1] + 1) * (shape[2] + 1) * size_of::<f32>()) as u64);
         });
         let dual = || space.array(shape);
-        Ok(Self { shape, g, bounds: Bounds::default(), dual: [dual()?, dual()?, dual()?], edges: None, limited: None })
+        let dual = [dual()?, dual()?, dual()?];
+        Ok(Self { shape, g, bounds: Bounds::default(), dual, edges: None, limited: None, slab: None })
     }
 
     /// Reduces the cost of slopes across `edges`, which are initially 0.
@@ -186,13 +193,24 @@ impl TvProx {
 
     /// Updates the edges from `x`, if they are in use. Returns the total variation of `x` if that changes it.
     pub fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
-        self.edges.as_mut()?.find(x, self.g);
+        self.edges.as_mut()?.find(x, self.g, self.slab.as_ref());
         Some(self.value(x))
     }
 
-    /// The total variation of `x`.
+    /// The total variation of `x`, or the part of its own planes.
     pub fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
-        total_variation(x, self.g, self.edges.as_ref(), self.limited)
+        let planes = variations(x, self.g, self.edges.as_ref(), self.limited);
+        planes[self.slab.as_ref().map_or(0..planes.len(), Slab::inner)].iter().sum()
+    }
+
+    /// Makes it that of a slab.
+    pub fn divide(&mut self, slab: Slab) {
+        self.slab = Some(slab);
+    }
+
+    /// The slab of [`TvProx::divide`].
+    pub fn slab(&self) -> Option<&Slab> {
+        self.slab.as_ref()
     }
 
     /// Whether there are edges to update.

@@ -18,4 +18,5 @@ mod masks;
 mod patience;
 mod pipeline;
 mod places;
+mod ranks;
 mod wgpu;

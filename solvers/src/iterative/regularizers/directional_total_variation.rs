@@ -4,7 +4,7 @@
 //! the edges come from another image of the object. Here they come from the volume itself and are updated before each
 //! pass.
 
-use super::total_variation::{On, are_equal, is_one, lambda, said, validate, weighted};
+use super::total_variation::{On, are_equal, halo, is_one, lambda, said, validate, weighted};
 use crate::iterative::edges::Edges;
 use crate::iterative::tv::TvProx;
 use conefield_core::error::{Result, ensure};
@@ -69,6 +69,10 @@ impl Regularizer for DirectionalTotalVariation {
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
         Ok(lambda(self.weight, grid, noise))
+    }
+
+    fn halo(&self) -> Option<usize> {
+        Some(halo(self.inner))
     }
 
     fn describe(&self) -> String {

@@ -2,6 +2,7 @@
 
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::place::Slab;
 use conefield_core::regularizer::{Bounds, Kernels, Penalty, Regularizer, RegularizerSpec};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
@@ -24,7 +25,11 @@ impl RegularizerSpec for Nonnegative {
 
 impl Regularizer for Nonnegative {
     fn on(&self, _: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
-        Ok(Box::new(On(Bounds::default())))
+        Ok(Box::new(On { bounds: Bounds::default(), slab: None }))
+    }
+
+    fn halo(&self) -> Option<usize> {
+        Some(0)
     }
 
     fn weight(&self, _: &VoxelGrid, _: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
@@ -37,7 +42,11 @@ impl Regularizer for Nonnegative {
 }
 
 /// The bounds alone.
-struct On(Bounds);
+struct On {
+    bounds: Bounds,
+    /// Its part of a volume that several processes share.
+    slab: Option<Slab>,
+}
 
 impl Penalty for On {
     fn value(&self, _: ArrayView3<'_, f32>) -> f64 {
@@ -45,15 +54,23 @@ impl Penalty for On {
     }
 
     fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
-        u.par_iter_mut().zip(v).for_each(|(u, v)| *u = self.0.clip(*v));
+        u.par_iter_mut().zip(v).for_each(|(u, v)| *u = self.bounds.clip(*v));
+    }
+
+    fn divide(&mut self, slab: Slab) {
+        self.slab = Some(slab);
+    }
+
+    fn slab(&self) -> Option<&Slab> {
+        self.slab.as_ref()
     }
 
     fn confine(&mut self, bounds: Bounds) -> Result<()> {
-        self.0 = bounds;
+        self.bounds = bounds;
         Ok(())
     }
 
     fn kernels(&mut self) -> Option<Kernels<'_>> {
-        Some(Kernels::Clip(self.0))
+        Some(Kernels::Clip(self.bounds))
     }
 }

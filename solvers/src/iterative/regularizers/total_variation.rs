@@ -3,7 +3,7 @@
 use crate::iterative::tv::{Limited, TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Vec3, VoxelGrid};
-use conefield_core::place::StatePart;
+use conefield_core::place::{Slab, StatePart};
 use conefield_core::regularizer::{Bounds, Kernels, Penalty, Regularizer, RegularizerSpec, Update, Weight};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
@@ -86,10 +86,20 @@ impl Regularizer for TotalVariation {
         Ok(lambda(self.weight, grid, noise))
     }
 
+    fn halo(&self) -> Option<usize> {
+        Some(halo(self.inner))
+    }
+
     fn describe(&self) -> String {
         let axes = said(self.weights, self.arc);
         format!("total-variation: weight {}{axes}, {} dual steps per update", self.weight, self.inner)
     }
+}
+
+/// Planes beyond a slab that `inner` dual steps reach, one per step, with the dual's before the first and the slopes by
+/// which edges are found.
+pub(super) fn halo(inner: usize) -> usize {
+    inner + 2
 }
 
 /// The factors for `explain`, if they are not 1.
@@ -126,6 +136,14 @@ impl Penalty for On {
     fn confine(&mut self, bounds: Bounds) -> Result<()> {
         self.prox.confine(bounds);
         Ok(())
+    }
+
+    fn divide(&mut self, slab: Slab) {
+        self.prox.divide(slab);
+    }
+
+    fn slab(&self) -> Option<&Slab> {
+        self.prox.slab()
     }
 
     fn limited(&mut self, middle: Vec3) {

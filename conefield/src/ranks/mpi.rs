@@ -1,0 +1,79 @@
+//! Processes that `mpirun` starts.
+
+use conefield_core::place::Peers;
+use conefield_core::{Error, Result};
+use mpi::Threading;
+use mpi::datatype::{Partition, PartitionMut};
+use mpi::environment::Universe;
+use mpi::topology::SimpleCommunicator;
+use mpi::traits::{Communicator, CommunicatorCollectives};
+use std::sync::Arc;
+
+/// The connection to the other processes. Dropped, it waits for them; a process that ends without ends them all.
+pub struct Joined(#[expect(dead_code, reason = "ends MPI when dropped")] Universe);
+
+/// Joins the processes of this run, if a launcher such as `mpirun` or `srun` has started this one.
+///
+/// # Errors
+/// An MPI library without support for threads.
+pub fn start() -> Result<Option<Joined>> {
+    if !["OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK"].iter().any(|name| std::env::var_os(name).is_some()) {
+        return Ok(None);
+    }
+    let failed = |what: &str| Error::unsupported("mpi", what.to_owned());
+    let Some((universe, threading)) = mpi::initialize_with_threading(Threading::Serialized) else {
+        return Err(failed("it is running already"));
+    };
+    if threading < Threading::Serialized {
+        return Err(failed("this library does not let threads take turns (MPI_THREAD_SERIALIZED)"));
+    }
+    let world = universe.world();
+    let [rank, count] = [world.rank(), world.size()].map(|n| usize::try_from(n).unwrap_or(0));
+    super::join(Arc::new(World { rank, count }));
+    Ok(Some(Joined(universe)))
+}
+
+/// All processes.
+struct World {
+    rank: usize,
+    count: usize,
+}
+
+impl Peers for World {
+    fn rank(&self) -> usize {
+        self.rank
+    }
+
+    fn count(&self) -> usize {
+        self.count
+    }
+
+    fn exchange(&self, out: &[Vec<f32>], into: &mut [Vec<f32>]) {
+        let (counts, starts) = layout(out);
+        let flat = out.concat();
+        let (their_counts, their_starts) = layout(into);
+        let mut found = vec![0.0f32; into.iter().map(Vec::len).sum()];
+        SimpleCommunicator::world().all_to_all_varcount_into(
+            &Partition::new(&flat[..], counts, starts),
+            &mut PartitionMut::new(&mut found[..], their_counts, their_starts),
+        );
+        let mut rest = &found[..];
+        for into in into {
+            let (part, others) = rest.split_at(into.len());
+            into.copy_from_slice(part);
+            rest = others;
+        }
+    }
+}
+
+/// Lengths and starts of parts that follow each other.
+fn layout(parts: &[Vec<f32>]) -> (Vec<i32>, Vec<i32>) {
+    let mut end = 0;
+    let lengths = parts.iter().map(|part| i32::try_from(part.len()).unwrap_or(i32::MAX));
+    lengths
+        .map(|length| {
+            end += length;
+            (length, end - length)
+        })
+        .unzip()
+}

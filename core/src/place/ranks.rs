@@ -1,0 +1,478 @@
+//! A place that several processes share: each keeps a range of planes along the first axis of every array.
+//!
+//! Each process projects its slab of the volume; the partial line integrals are summed where their images are kept.
+//! Images go to every process for the adjoint. A penalty works on a slab with copies of its neighbours' planes, which
+//! are renewed before each proximal map. What has no method of its own here works on whole arrays, in every process.
+//!
+//! Sums over processes are taken in the order of their ranks, so that a number of processes always gives the same bits.
+
+use super::map::{Map, Reduction};
+use super::{Array, FilteredViews, Held, Host, Mask, Penalty, Place, StatePart, Weighing, whole_prox};
+use crate::error::{Error, Result};
+use crate::geometry::Geometry;
+use crate::parallel;
+use crate::voxel::VoxelProjector;
+use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, s};
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Connects the processes of a run. All of them make the same calls in the same order.
+pub trait Peers: Send + Sync {
+    /// The number of this process, from 0.
+    fn rank(&self) -> usize;
+
+    /// Number of processes.
+    fn count(&self) -> usize;
+
+    /// Sends `out[r]` to each process r and overwrites `into[r]` with what that one sends here; sizes match. Bits stay as
+    /// they are. A process that has ended ends this one too.
+    fn exchange(&self, out: &[Vec<f32>], into: &mut [Vec<f32>]);
+}
+
+/// Planes of a volume that several processes share.
+#[derive(Clone)]
+pub struct Slab {
+    /// Number of planes of the whole volume.
+    pub whole: usize,
+    /// The planes at hand: those of this process and copies of its neighbours'.
+    pub planes: Range<usize>,
+    /// The planes of this process.
+    pub own: Range<usize>,
+    /// Planes of its neighbours on each side, but for the volume's ends.
+    halo: usize,
+    wire: Arc<Wire>,
+}
+
+impl Slab {
+    /// The planes of this process among those at hand.
+    pub fn inner(&self) -> Range<usize> {
+        self.own.start - self.planes.start..self.own.end - self.planes.start
+    }
+
+    /// The sum of the processes' numbers `x`.
+    pub fn sum(&self, x: f64) -> f64 {
+        self.wire.all(x).iter().sum()
+    }
+}
+
+/// The processes, and what this one has sent.
+struct Wire {
+    peers: Arc<dyn Peers>,
+    sent: AtomicU64,
+}
+
+impl Wire {
+    fn exchange(&self, out: &[Vec<f32>], into: &mut [Vec<f32>]) {
+        let others = out.iter().enumerate().filter(|(rank, _)| *rank != self.peers.rank());
+        let numbers: usize = others.map(|(_, out)| out.len()).sum();
+        self.sent.fetch_add((numbers * size_of::<f32>()) as u64, Ordering::Relaxed);
+        self.peers.exchange(out, into);
+    }
+
+    /// The number `x` of each process.
+    fn all(&self, x: f64) -> Vec<f64> {
+        let halves: [f32; 2] = bytemuck::cast(x);
+        let out = vec![halves.to_vec(); self.peers.count()];
+        let mut into = vec![vec![0.0; 2]; out.len()];
+        self.exchange(&out, &mut into);
+        into.iter().map(|x| bytemuck::cast([x[0], x[1]])).collect()
+    }
+}
+
+/// Numbers that a process sends or receives at once, about.
+const PIECE: usize = 1 << 25;
+
+/// The place of one of several processes.
+pub struct Ranks {
+    wire: Arc<Wire>,
+}
+
+impl Ranks {
+    /// The place of the process that `peers` connects, in the host's memory.
+    pub fn new(peers: Arc<dyn Peers>) -> Self {
+        Self { wire: Arc::new(Wire { peers, sent: AtomicU64::new(0) }) }
+    }
+
+    /// Bytes that this process has sent to the others.
+    pub fn sent(&self) -> u64 {
+        self.wire.sent.load(Ordering::Relaxed)
+    }
+
+    fn rank(&self) -> usize {
+        self.wire.peers.rank()
+    }
+
+    fn count(&self) -> usize {
+        self.wire.peers.count()
+    }
+
+    /// The planes of process `rank` in an array with this many.
+    fn part(&self, rank: usize, planes: usize) -> Range<usize> {
+        let bound = |rank| rank * planes / self.count();
+        bound(rank)..bound(rank + 1)
+    }
+
+    fn own(&self, planes: usize) -> Range<usize> {
+        self.part(self.rank(), planes)
+    }
+
+    /// The sum of the processes' numbers `x`.
+    fn sum(&self, x: f64) -> f64 {
+        self.wire.all(x).iter().sum()
+    }
+
+    /// The planes of `x` in `wanted` for each process, in order; returns those of this one.
+    fn collect(&self, x: &Array, wanted: &[Vec<usize>]) -> Result<Array3<f32>> {
+        let [planes, rows, columns] = x.shape();
+        let (size, me) = (rows * columns, self.rank());
+        let mut found = Array3::zeros([wanted[me].len(), rows, columns]);
+        let together = self.together(size);
+        let most = wanted.iter().map(Vec::len).max().unwrap_or(0);
+        for first in (0..most).step_by(together) {
+            let now = |rank: usize| {
+                let all = &wanted[rank];
+                &all[first.min(all.len())..(first + together).min(all.len())]
+            };
+            let of = |rank: usize, of: usize| {
+                let part = self.part(of, planes);
+                now(rank).iter().filter(move |plane| part.contains(plane))
+            };
+            let mut out: Vec<Vec<f32>> = vec![];
+            for rank in 0..self.count() {
+                let mut numbers = vec![0.0; of(rank, me).count() * size];
+                for (plane, to) in of(rank, me).zip(numbers.chunks_mut(size.max(1))) {
+                    let (first, here) = at_hand(x)?;
+                    to.copy_from_slice(&here.slice()[(plane - first) * size..(plane - first + 1) * size]);
+                }
+                out.push(numbers);
+            }
+            let mut into: Vec<Vec<f32>> =
+                (0..self.count()).map(|from| vec![0.0; of(me, from).count() * size]).collect();
+            self.wire.exchange(&out, &mut into);
+            let mut next = vec![0; self.count()];
+            for (i, plane) in now(me).iter().enumerate() {
+                let from = (0..self.count()).find(|&rank| self.part(rank, planes).contains(plane)).unwrap_or(0);
+                let numbers = &into[from][next[from]..next[from] + size];
+                next[from] += size;
+                found.index_axis_mut(Axis(0), first + i).iter_mut().zip(numbers).for_each(|(to, x)| *to = *x);
+            }
+        }
+        Ok(found)
+    }
+
+    /// Planes of `size` numbers that each process sends to each other one at once.
+    fn together(&self, size: usize) -> usize {
+        (PIECE / (size * self.count()).max(1)).max(1)
+    }
+
+    /// The same planes for every process.
+    fn to_all(&self, planes: &[usize]) -> Vec<Vec<usize>> {
+        vec![planes.to_vec(); self.count()]
+    }
+
+    /// The planes of a slab of `x`, with its neighbours'.
+    fn near(&self, x: &Array, slab: &Slab) -> Result<Array3<f32>> {
+        let wanted = |rank| around(self.part(rank, slab.whole), slab.halo, slab.whole).collect();
+        self.collect(x, &(0..self.count()).map(wanted).collect::<Vec<_>>())
+    }
+
+    /// Calls `work` with some of the first `count` images of `images` after another, the same in all processes, and with
+    /// their places.
+    fn in_turns(
+        &self,
+        images: &Array,
+        count: usize,
+        mut work: impl FnMut(&[usize], Array3<f32>) -> Result<()>,
+    ) -> Result<()> {
+        for some in self.turns(images.shape(), count) {
+            work(&some, self.collect(images, &self.to_all(&some))?)?;
+        }
+        Ok(())
+    }
+
+    /// The places of the first `count` of some images, in groups with about as many of each process.
+    fn turns(&self, [images, rows, columns]: [usize; 3], count: usize) -> Vec<Vec<usize>> {
+        let used = |rank| self.part(rank, images).start.min(count)..self.part(rank, images).end.min(count);
+        let most = (0..self.count()).map(|rank| used(rank).len()).max().unwrap_or(0);
+        let together = self.together(rows * columns);
+        let some = |first: usize| {
+            let of = |rank: usize| used(rank).skip(first).take(together);
+            (0..self.count()).flat_map(of).collect::<Vec<usize>>()
+        };
+        (0..most).step_by(together).map(some).collect()
+    }
+
+    /// The first `count` of some images that are here.
+    fn used(&self, images: usize, count: usize) -> Range<usize> {
+        let own = self.own(images);
+        own.start.min(count)..own.end.min(count)
+    }
+}
+
+/// The planes at hand of an array of this place.
+fn at_hand<T>(x: &Held<T>) -> Result<(usize, &Held<T>)> {
+    x.planes().ok_or_else(foreign)
+}
+
+fn at_hand_mut<T>(x: &mut Held<T>) -> Result<(usize, &mut Held<T>)> {
+    x.planes_mut().ok_or_else(foreign)
+}
+
+fn foreign() -> Error {
+    Error::unsupported("array", "it belongs to one process, and several share the others")
+}
+
+/// `part` with `halo` planes on both sides.
+fn around(part: Range<usize>, halo: usize, planes: usize) -> Range<usize> {
+    part.start.saturating_sub(halo)..(part.end + halo).min(planes)
+}
+
+/// The flags of some planes.
+fn flags(mask: &Mask, planes: Range<usize>) -> Result<Mask> {
+    let all = mask.on_host().ok_or_else(foreign)?;
+    Ok(Mask::host(all.slice(s![planes, .., ..]).to_owned()))
+}
+
+impl Place for Ranks {
+    fn device(&self) -> Option<String> {
+        None
+    }
+
+    fn zeros(&self, [planes, rows, columns]: [usize; 3]) -> Result<Array> {
+        let own = self.own(planes);
+        let here = Host.zeros([own.len(), rows, columns])?;
+        Ok(Array::part([planes, rows, columns], own.start, here))
+    }
+
+    fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()> {
+        let (start, here) = at_hand_mut(to)?;
+        let low = first.max(start);
+        let high = (first + from.len_of(Axis(0))).min(start + here.shape()[0]);
+        if low < high {
+            Host.load(from.slice(s![low - first..high - first, .., ..]), here, low - start)?;
+        }
+        Ok(())
+    }
+
+    fn store(&self, from: &Array, first: usize, mut to: ArrayViewMut3<'_, f32>) -> Result<()> {
+        let [_, rows, columns] = from.shape();
+        let together = self.together(rows * columns);
+        for (i, mut to) in to.axis_chunks_iter_mut(Axis(0), together).enumerate() {
+            let at = first + i * together;
+            let planes: Vec<usize> = (at..at + to.len_of(Axis(0))).collect();
+            to.assign(&self.collect(from, &self.to_all(&planes))?);
+        }
+        Ok(())
+    }
+
+    fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
+        if projector.operator().is_additive() {
+            return Ok(());
+        }
+        let expected = "one whose line integrals are the sums of those of slabs, as joseph's";
+        Err(Error::invalid("spec", "projector", projector.describe(), expected))
+    }
+
+    fn room(&self) -> u64 {
+        Host.room().saturating_mul(self.count() as u64)
+    }
+
+    fn agree(&self, flag: bool) -> bool {
+        self.sum(f64::from(u8::from(flag))) > 0.0
+    }
+
+    fn slab(&self, planes: usize, halo: usize) -> Option<Slab> {
+        let own = self.own(planes);
+        Some(Slab { whole: planes, planes: around(own.clone(), halo, planes), own, halo, wire: self.wire.clone() })
+    }
+
+    fn gather<'a>(&self, x: &'a Array) -> Result<CowArray<'a, f32, Ix3>> {
+        if let Some(array) = x.on_host() {
+            return Ok(array.into());
+        }
+        let all = |rank| if rank == 0 { (0..x.shape()[0]).collect() } else { vec![] };
+        Ok(self.collect(x, &(0..self.count()).map(all).collect::<Vec<_>>())?.into())
+    }
+
+    fn fill(&self, x: &mut Array, value: f32) -> Result<()> {
+        Host.fill(at_hand_mut(x)?.1, value)
+    }
+
+    fn scatter(&self, from: &Array, out: &mut Array, at: &[usize]) -> Result<()> {
+        let wanted = |rank| {
+            let part = self.part(rank, out.shape()[0]);
+            (0..at.len()).filter(|&i| part.contains(&at[i])).collect::<Vec<usize>>()
+        };
+        let wanted: Vec<_> = (0..self.count()).map(wanted).collect();
+        let found = self.collect(from, &wanted)?;
+        for (plane, &i) in found.outer_iter().zip(&wanted[self.rank()]) {
+            self.load(plane.insert_axis(Axis(0)), out, at[i])?;
+        }
+        Ok(())
+    }
+
+    fn keep(&self, x: &mut Array, inside: &Mask, value: f32) -> Result<()> {
+        let (first, here) = at_hand_mut(x)?;
+        Host.keep(here, &flags(inside, first..first + here.shape()[0])?, value)
+    }
+
+    fn map(&self, map: &Map, factors: [f64; 2], out: &mut Array, inputs: &[&Array]) -> Result<()> {
+        let inputs = inputs.iter().map(|x| Ok(at_hand(x)?.1)).collect::<Result<Vec<_>>>()?;
+        Host.map(map, factors, at_hand_mut(out)?.1, &inputs)
+    }
+
+    fn reduce(&self, kind: Reduction, x: &Array, y: &Array) -> Result<f64> {
+        let here = Host.reduce(kind, at_hand(x)?.1, at_hand(y)?.1)?;
+        let all = self.wire.all(here);
+        Ok(if kind == Reduction::Maximum { all.into_iter().fold(0.0, f64::max) } else { all.iter().sum() })
+    }
+
+    fn forward(
+        &self,
+        projector: &dyn VoxelProjector,
+        geometry: &Geometry,
+        views: &[usize],
+        volume: &Array,
+        images: &mut Array,
+    ) -> Result<()> {
+        let [count, rows, columns] = images.shape();
+        let (own, here) = (self.own(volume.shape()[0]), at_hand(volume)?.1);
+        let slab = Geometry { volume: geometry.volume.slab(own.clone()), ..geometry.clone() };
+        for some in self.turns(images.shape(), views.len()) {
+            let seen: Vec<usize> = some.iter().map(|&i| views[i]).collect();
+            let mut lines = Host.zeros([some.len(), rows, columns])?;
+            if !own.is_empty() {
+                Host.forward(projector, &slab, &seen, here, &mut lines)?;
+            }
+            // Images of one process follow each other.
+            let mut rest = lines.slice();
+            let size = |rank| some.iter().filter(|i| self.part(rank, count).contains(i)).count() * rows * columns;
+            let mut out = vec![];
+            for rank in 0..self.count() {
+                let (part, others) = rest.split_at(size(rank));
+                out.push(part.to_vec());
+                rest = others;
+            }
+            let mut into = vec![vec![0.0; size(self.rank())]; self.count()];
+            self.wire.exchange(&out, &mut into);
+            let first = some.iter().find(|i| self.own(count).contains(i));
+            let (Some(first), Some((sum, others))) = (first, into.split_first_mut()) else { continue };
+            for other in others {
+                sum.iter_mut().zip(other).for_each(|(sum, x)| *sum += *x);
+            }
+            let sum = ArrayView3::from_shape([sum.len() / (rows * columns).max(1), rows, columns], sum);
+            self.load(sum.unwrap_or_else(|e| unreachable!("whole images: {e}")), images, *first)?;
+        }
+        Ok(())
+    }
+
+    fn adjoint(
+        &self,
+        projector: &dyn VoxelProjector,
+        geometry: &Geometry,
+        views: &[usize],
+        images: &Array,
+        volume: &mut Array,
+    ) -> Result<()> {
+        let own = self.own(volume.shape()[0]);
+        let here = at_hand_mut(volume)?.1;
+        let slab = Geometry { volume: geometry.volume.slab(own.clone()), ..geometry.clone() };
+        self.in_turns(images, views.len(), |some, images| {
+            let seen: Vec<usize> = some.iter().map(|&i| views[i]).collect();
+            if own.is_empty() {
+                return Ok(());
+            }
+            Host.adjoint(projector, &slab, &seen, &Array::host(images), here)
+        })
+    }
+
+    fn compare(&self, by: &Weighing<'_>, views: &[usize], images: &mut Array) -> Result<[f64; 2]> {
+        let count = images.shape()[0];
+        let used = self.used(count, views.len());
+        let weights = match by.weights {
+            None => None,
+            Some(weights) => {
+                let wanted = |rank| {
+                    let part = self.part(rank, count);
+                    part.filter_map(|i| views.get(i)).copied().collect::<Vec<usize>>()
+                };
+                Some(self.collect(weights, &(0..self.count()).map(wanted).collect::<Vec<_>>())?)
+            }
+        };
+        let mut sums = [0.0; 2];
+        let here = at_hand_mut(images)?.1;
+        if !used.is_empty() {
+            sums = Host.compare(&Weighing { weights: None, ..*by }, &views[used.clone()], here)?;
+            if let Some(weights) = weights {
+                Host.change(here, &mut |images| {
+                    let both = images.outer_iter_mut().zip(weights.outer_iter());
+                    parallel::over(both, |_, (mut image, weights)| image.zip_mut_with(&weights, |r, w| *r *= w));
+                })?;
+            }
+        }
+        Ok(sums.map(|x| self.sum(x)))
+    }
+
+    fn weigh(&self, by: &Weighing<'_>, spread: bool, views: &[usize], images: &mut Array) -> Result<()> {
+        let used = self.used(images.shape()[0], views.len());
+        let here = at_hand_mut(images)?.1;
+        if used.is_empty() { Ok(()) } else { by.weigh(&Host, spread, &views[used], here) }
+    }
+
+    fn filtered(
+        &self,
+        work: &dyn FilteredViews,
+        views: &[usize],
+        images: &mut Array,
+        slab: &mut Array,
+        first: usize,
+    ) -> Result<()> {
+        let used = self.used(images.shape()[0], views.len());
+        let here = at_hand_mut(images)?.1;
+        Host.change(here, &mut |images| {
+            parallel::over(images.outer_iter_mut().zip(&views[used.clone()]), |_, (image, &view)| {
+                work.filter(view, image.into_slice().unwrap_or_else(|| unreachable!("images are contiguous")));
+            });
+        })?;
+        let (start, here) = at_hand_mut(slab)?;
+        self.in_turns(images, views.len(), |some, images| {
+            let seen: Vec<usize> = some.iter().map(|&i| views[i]).collect();
+            Host.change(here, &mut |slab| work.backproject(&seen, images.view(), slab.view_mut(), first + start))
+        })
+    }
+
+    fn prox(&self, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+        let Some(slab) = penalty.slab().cloned() else {
+            return whole_prox(self, v, tau, penalty);
+        };
+        for (_, part) in penalty.state() {
+            if let StatePart::Placed(state) = part {
+                let near = self.near(state, &slab)?;
+                self.load(near.view(), state, slab.planes.start)?;
+            }
+        }
+        let near = self.near(v, &slab)?;
+        let mut u = Array3::zeros(near.raw_dim());
+        penalty.prox(near.as_slice().unwrap_or_default(), tau, u.as_slice_mut().unwrap_or_default());
+        penalty.fault()?;
+        self.load(u.slice(s![slab.inner(), .., ..]), v, slab.own.start)
+    }
+
+    fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {
+        match penalty.slab().cloned() {
+            None => Ok(penalty.value(self.read(x)?.view())),
+            Some(slab) => Ok(self.sum(penalty.value(self.near(x, &slab)?.view()))),
+        }
+    }
+
+    fn adapt(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<Option<f64>> {
+        if !penalty.adapts() {
+            return Ok(None);
+        }
+        Ok(match penalty.slab().cloned() {
+            None => penalty.adapt(self.read(x)?.view()),
+            Some(slab) => penalty.adapt(self.near(x, &slab)?.view()).map(|value| self.sum(value)),
+        })
+    }
+}

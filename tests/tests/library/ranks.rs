@@ -1,0 +1,220 @@
+//! Several processes share the arrays of a method: threads stand for them here.
+
+use crate::common::{Heard, Stop, plan, scan, solve_on, spec};
+use conefield_backend_cpu::Cpu;
+use conefield_core::arena::Weights;
+use conefield_core::backend::{Backend, Executable, Explain};
+use conefield_core::checkpoint::Resume;
+use conefield_core::method::Job;
+use conefield_core::pipeline::Pipeline;
+use conefield_core::place::{Peers, Place, Ranks};
+use conefield_core::scan::Scan;
+use conefield_core::{Error, Result};
+use ndarray::{Array3, Axis};
+use serde_json::{Value, json};
+use std::sync::{Arc, Barrier, Mutex};
+
+/// A thread among `count`, and what each has sent to each.
+struct Thread {
+    rank: usize,
+    count: usize,
+    post: Arc<(Barrier, Vec<Mutex<Vec<Vec<f32>>>>)>,
+}
+
+impl Peers for Thread {
+    fn rank(&self) -> usize {
+        self.rank
+    }
+
+    fn count(&self) -> usize {
+        self.count
+    }
+
+    fn exchange(&self, out: &[Vec<f32>], into: &mut [Vec<f32>]) {
+        let (barrier, boxes) = &*self.post;
+        *boxes[self.rank].lock().unwrap() = out.to_vec();
+        barrier.wait();
+        for (from, into) in boxes.iter().zip(into) {
+            let sent = &from.lock().unwrap()[self.rank];
+            assert_eq!(sent.len(), into.len(), "rank {}", self.rank);
+            into.copy_from_slice(sent);
+        }
+        barrier.wait();
+    }
+}
+
+/// The backend of a rank.
+struct Shared(Arc<Ranks>);
+
+impl Backend for Shared {
+    fn name(&self) -> &'static str {
+        "shared"
+    }
+
+    fn compile(&self, _: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
+        Err(Error::unsupported("method", "a field"))
+    }
+
+    fn place(&self) -> Arc<dyn Place> {
+        self.0.clone()
+    }
+}
+
+/// The results of `work` in each of `count` ranks. A rank that panics would leave the others waiting: it ends the test.
+fn each<T: Send>(count: usize, work: impl Fn(&Shared) -> T + Sync) -> Vec<T> {
+    let post = Arc::new((Barrier::new(count), (0..count).map(|_| Mutex::default()).collect::<Vec<_>>()));
+    std::thread::scope(|scope| {
+        let rank = |rank| {
+            let (post, work) = (post.clone(), &work);
+            scope.spawn(move || {
+                let run = || work(&Shared(Arc::new(Ranks::new(Arc::new(Thread { rank, count, post })))));
+                std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).unwrap_or_else(|_| std::process::abort())
+            })
+        };
+        let all: Vec<_> = (0..count).map(rank).collect();
+        all.into_iter().map(|thread| thread.join().unwrap()).collect()
+    })
+}
+
+fn volume(method: &Value, scan: &Scan, backend: &dyn Backend) -> Array3<f32> {
+    let (solution, _) = solve_on(backend, method, scan, &Weights::default()).unwrap();
+    solution.result.volume(backend).unwrap().data
+}
+
+/// Largest difference as a share of the largest number.
+fn off(found: &Array3<f32>, want: &Array3<f32>) -> f32 {
+    let top = want.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+    found.iter().zip(want).map(|(a, b)| (a - b).abs() / top).fold(0.0, f32::max)
+}
+
+/// A chain on samples, as `smooth-tv` is one.
+fn smooth() -> Value {
+    let link = |samples: usize, prior: &str| {
+        json!({"type": "fista", "basis": {"type": "cubic", "spacing": 1, "samples": samples}, "subsets": 2,
+            "stop": {"passes": 4}, "prior": prior})
+    };
+    json!({"type": "chain", "mean": 2, "methods": [
+        link(9, "total-variation"), link(13, "directional-total-variation"), link(15, "directional-total-variation"),
+    ]})
+}
+
+#[test]
+fn every_number_of_ranks_ends_where_one_does() {
+    let methods = [
+        json!({"type": "fdk", "window": "hann", "nonnegative": true}),
+        json!({"type": "sart", "subsets": 1, "stop": {"passes": 3}}),
+        json!({"type": "sart", "subsets": 3, "stop": {"passes": 3}, "scene": {"support": "carve"}}),
+        json!({"type": "mlem", "stop": {"passes": 3}}),
+        json!({"type": "cgls", "stop": {"passes": 5}}),
+        json!({"type": "lsqr", "pull": 0.01, "stop": {"passes": 5}}),
+        json!({"type": "asd-pocs", "stop": {"passes": 4}}),
+        json!({"type": "fista", "prior": "total-variation", "stop": {"passes": 5}, "scene": {"surround": "coarse"}}),
+        json!({"type": "fista", "prior": "none", "bin": 2, "air": true, "stop": {"passes": 5}}),
+        json!({"type": "fista", "stop": {"passes": 5}, "scene": {"bounds": {"low": 0.0, "high": 0.015}},
+            "prior": {"type": "directional-total-variation", "arc": 0.5}}),
+        json!({"type": "fista", "stop": {"passes": 4},
+            "prior": {"type": "sum", "priors": ["total-variation", "directional-total-variation"]}}),
+        json!({"type": "fista", "prior": "directional-total-variation", "stop": {"passes": 5},
+            "basis": {"type": "cubic", "spacing": 1.5}, "scene": {"support": "carve"}}),
+        smooth(),
+    ];
+    let scan = scan();
+    for method in &methods {
+        let want = volume(method, &scan, &Cpu::new());
+        for count in [1, 2, 3, 7] {
+            let found = each(count, |backend| volume(method, &scan, backend));
+            let error = off(&found[0], &want);
+            println!("{}, {count} ranks: {error:.1e}", method["type"]);
+            assert!(error < 1e-5, "{method}, {count} ranks: {error}");
+            assert!(found.iter().all(|x| *x == found[0]), "{method}: {count} ranks end at different volumes");
+        }
+        // The limit is far below what a lost plane changes.
+        let mut lost = want.clone();
+        lost.index_axis_mut(Axis(0), 7).fill(0.0);
+        assert!(off(&lost, &want) > 1e-2, "{method}");
+    }
+}
+
+/// More ranks than planes of the volume or images of a subset.
+#[test]
+fn a_rank_without_a_plane_takes_part() {
+    let mut scan = scan();
+    scan.geometry.volume.shape[0] = 3;
+    for prior in ["total-variation", "directional-total-variation"] {
+        let method = json!({"type": "fista", "prior": prior, "stop": {"passes": 3}});
+        let want = volume(&method, &scan, &Cpu::new());
+        let found = each(5, |backend| volume(&method, &scan, backend));
+        assert!(off(&found[4], &want) < 1e-5, "{prior}");
+    }
+}
+
+#[test]
+fn another_number_of_ranks_goes_on_from_a_checkpoint() {
+    let method = json!({"type": "fista", "prior": "directional-total-variation", "stop": {"passes": 6}, "subsets": 4});
+    let scan = scan();
+    let want = volume(&method, &scan, &Cpu::new());
+    let kept = each(3, |backend| {
+        let mut stop = Stop::at(3);
+        let mut plan = plan(&spec(&method).unwrap(), backend, &Weights::default()).unwrap();
+        let ended = plan.run(&Job { seed: 7, ..Job::new(&scan, backend) }, &mut stop);
+        assert!(matches!(ended, Err(Error::Interrupted { step: 3 })));
+        stop.kept.unwrap()
+    });
+    let resumed = |backend: &dyn Backend, resume: &Resume| {
+        let mut plan = plan(&spec(&method).unwrap(), backend, &Weights::default()).unwrap();
+        let job = Job { seed: 7, resume: Some(resume), ..Job::new(&scan, backend) };
+        plan.run(&job, &mut Heard::default()).unwrap().result.volume(backend).unwrap().data
+    };
+    // The leading rank's checkpoint is whole.
+    assert!(off(&resumed(&Cpu::new(), &kept[0]), &want) < 1e-5);
+    for count in [2, 3] {
+        let found = each(count, |backend| resumed(backend, &kept[0]));
+        assert!(off(&found[0], &want) < 1e-5, "{count}");
+    }
+}
+
+/// One rank is asked to stop: all stop after the same pass.
+#[test]
+fn ranks_stop_together() {
+    let method = json!({"type": "sart", "stop": {"passes": 9}});
+    let scan = scan();
+    each(3, |backend| {
+        let mut stop = Stop::at(if backend.0.slab(3, 0).unwrap().own.contains(&1) { 2 } else { 100 });
+        let mut plan = plan(&spec(&method).unwrap(), backend, &Weights::default()).unwrap();
+        let ended = plan.run(&Job::new(&scan, backend), &mut stop);
+        assert!(matches!(ended, Err(Error::Interrupted { step: 2 })));
+    });
+}
+
+/// Line integrals are summed where they are kept, and their images go to all: with n ranks, each sends a share of
+/// (n − 1)/n of all pixels twice in a pass, and besides it sums of a few bytes.
+#[test]
+fn a_pass_sends_all_pixels_twice() {
+    let scan = scan();
+    let pixels = scan.projections.len() as f64;
+    for count in [2, 4] {
+        let sent = |passes: u64| {
+            let method = json!({"type": "sart", "subsets": 1, "stop": {"passes": passes}});
+            each(count, |backend| {
+                volume(&method, &scan, backend);
+                backend.0.sent() as f64
+            })
+        };
+        let (two, five) = (sent(2), sent(5));
+        for (two, five) in two.into_iter().zip(five) {
+            let each = (five - two) / 3.0;
+            let want = 2.0 * 4.0 * pixels * (count - 1) as f64 / count as f64;
+            println!("{count} ranks: {each} bytes in a pass, {want} of them pixels");
+            assert!(each >= want && each < want + 512.0, "{count} ranks: {each} and {want}");
+        }
+    }
+}
+
+#[test]
+fn a_projector_of_samples_is_refused() {
+    let method = json!({"type": "sart", "projector": {"type": "trilinear"}, "stop": {"passes": 1}});
+    let scan = scan();
+    for said in each(2, |backend| solve_on(backend, &method, &scan, &Weights::default()).err().unwrap().to_string()) {
+        assert!(said.contains("projector") && said.contains("sums of those of slabs"), "{said}");
+    }
+}
