@@ -440,15 +440,15 @@ pub trait Place: Send + Sync {
         if let Some(inside) = inside {
             self.keep(gradient, inside, f32::MIN)?;
         }
-        self.prox(gradient, tau, penalty)?;
+        self.change(gradient, &mut |v| {
+            let mut u = Array3::zeros(v.raw_dim());
+            penalty.prox(v.as_slice().unwrap_or_default(), tau, u.as_slice_mut().unwrap_or_default());
+            *v = u;
+        })?;
+        penalty.fault()?;
         self.map(&ADD, [-f64::from(momentum), 0.0], ahead, &[x])?;
         self.map(&ADD, [1.0 + f64::from(momentum), 1.0], ahead, &[gradient])?;
         self.map(&ADD, [1.0, 0.0], x, &[gradient])
-    }
-
-    /// Replaces `v` with the result of [`Penalty::prox`], on the host.
-    fn prox(&self, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
-        whole_prox(self, v, tau, penalty)
     }
 
     /// The value of `penalty` at `x`; see [`Penalty::value`].
@@ -519,16 +519,6 @@ impl Place for Host {
         }
         Ok(())
     }
-}
-
-/// [`Place::prox`] of a penalty of the whole volume.
-fn whole_prox<P: Place + ?Sized>(place: &P, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
-    place.change(v, &mut |v| {
-        let mut u = Array3::zeros(v.raw_dim());
-        penalty.prox(v.as_slice().unwrap_or_default(), tau, u.as_slice_mut().unwrap_or_default());
-        *v = u;
-    })?;
-    penalty.fault()
 }
 
 /// Lets `work` change an array in the host's memory; its numbers are moved there first if `read`.

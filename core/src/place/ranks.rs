@@ -7,7 +7,7 @@
 //! Sums over processes are taken in the order of their ranks, so that a number of processes always gives the same bits.
 
 use super::map::{Map, Reduction};
-use super::{Array, FilteredViews, Held, Host, Mask, Penalty, Place, StatePart, Weighing, whole_prox};
+use super::{Array, FilteredViews, Held, Host, Mask, Penalty, Place, ProximalStep, StatePart, Update, Weighing};
 use crate::error::{Error, Result};
 use crate::geometry::Geometry;
 use crate::parallel;
@@ -122,43 +122,47 @@ impl Ranks {
         self.wire.all(x).iter().sum()
     }
 
-    /// The planes of `x` in `wanted` for each process, in order; returns those of this one.
-    fn collect(&self, x: &Array, wanted: &[Vec<usize>]) -> Result<Array3<f32>> {
-        let [planes, rows, columns] = x.shape();
+    /// Calls `take` with the planes of `x` in `wanted` for this process, one after another and with their number in
+    /// `wanted`. `wanted` says what each process wants.
+    fn collect(&self, x: Here<'_>, wanted: &[Vec<usize>], mut take: impl FnMut(usize, &[f32])) {
+        let Here { shape: [planes, rows, columns], first, numbers } = x;
         let (size, me) = (rows * columns, self.rank());
-        let mut found = Array3::zeros([wanted[me].len(), rows, columns]);
+        let at = |plane: usize| &numbers[(plane - first) * size..(plane - first + 1) * size];
+        let parts: Vec<Range<usize>> = (0..self.count()).map(|rank| self.part(rank, planes)).collect();
         let together = self.together(size);
         let most = wanted.iter().map(Vec::len).max().unwrap_or(0);
-        for first in (0..most).step_by(together) {
-            let now = |rank: usize| {
-                let all = &wanted[rank];
-                &all[first.min(all.len())..(first + together).min(all.len())]
+        for turn in (0..most).step_by(together) {
+            // What process `rank` wants of process `of` in this turn; its own planes it has.
+            let now = |rank: usize, of: usize| {
+                let some = wanted[rank].iter().skip(turn).take(if rank == of { 0 } else { together });
+                let part = &parts[of];
+                some.copied().filter(move |plane| part.contains(plane))
             };
-            let of = |rank: usize, of: usize| {
-                let part = self.part(of, planes);
-                now(rank).iter().filter(move |plane| part.contains(plane))
-            };
-            let mut out: Vec<Vec<f32>> = vec![];
-            for rank in 0..self.count() {
-                let mut numbers = vec![0.0; of(rank, me).count() * size];
-                for (plane, to) in of(rank, me).zip(numbers.chunks_mut(size.max(1))) {
-                    let (first, here) = at_hand(x)?;
-                    to.copy_from_slice(&here.slice()[(plane - first) * size..(plane - first + 1) * size]);
-                }
-                out.push(numbers);
-            }
-            let mut into: Vec<Vec<f32>> =
-                (0..self.count()).map(|from| vec![0.0; of(me, from).count() * size]).collect();
+            let out = |rank| now(rank, me).flat_map(at).copied().collect::<Vec<f32>>();
+            let out: Vec<_> = (0..self.count()).map(out).collect();
+            let mut into: Vec<_> = (0..self.count()).map(|of| vec![0.0; now(me, of).count() * size]).collect();
             self.wire.exchange(&out, &mut into);
             let mut next = vec![0; self.count()];
-            for (i, plane) in now(me).iter().enumerate() {
-                let from = (0..self.count()).find(|&rank| self.part(rank, planes).contains(plane)).unwrap_or(0);
-                let numbers = &into[from][next[from]..next[from] + size];
-                next[from] += size;
-                found.index_axis_mut(Axis(0), first + i).iter_mut().zip(numbers).for_each(|(to, x)| *to = *x);
+            for (i, &plane) in wanted[me].iter().enumerate().skip(turn).take(together) {
+                if parts[me].contains(&plane) {
+                    take(i, at(plane));
+                    continue;
+                }
+                let of = parts.iter().position(|part| part.contains(&plane)).unwrap_or(0);
+                take(i, &into[of][next[of]..next[of] + size]);
+                next[of] += size;
             }
         }
-        Ok(found)
+    }
+
+    /// [`Ranks::collect`] as an array.
+    fn collected(&self, x: Here<'_>, wanted: &[Vec<usize>]) -> Array3<f32> {
+        let [_, rows, columns] = x.shape;
+        let mut found = Array3::zeros([wanted[self.rank()].len(), rows, columns]);
+        let all = found.as_slice_mut().unwrap_or_default();
+        let size = rows * columns;
+        self.collect(x, wanted, |i, plane| all[i * size..(i + 1) * size].copy_from_slice(plane));
+        found
     }
 
     /// Planes of `size` numbers that each process sends to each other one at once.
@@ -172,9 +176,23 @@ impl Ranks {
     }
 
     /// The planes of a slab of `x`, with its neighbours'.
-    fn near(&self, x: &Array, slab: &Slab) -> Result<Array3<f32>> {
+    fn near(&self, x: Here<'_>, slab: &Slab) -> Array3<f32> {
         let wanted = |rank| around(self.part(rank, slab.whole), slab.halo, slab.whole).collect();
-        self.collect(x, &(0..self.count()).map(wanted).collect::<Vec<_>>())
+        self.collected(x, &(0..self.count()).map(wanted).collect::<Vec<_>>())
+    }
+
+    /// Renews the copies of its neighbours' planes in an array of a slab.
+    fn renew(&self, x: &mut Array, slab: &Slab) -> Result<()> {
+        let wanted = |rank| {
+            let own = self.part(rank, slab.whole);
+            around(own.clone(), slab.halo, slab.whole).filter(|plane| !own.contains(plane)).collect()
+        };
+        let wanted: Vec<Vec<usize>> = (0..self.count()).map(wanted).collect();
+        let found = self.collected(here(x)?, &wanted);
+        for (plane, &i) in found.outer_iter().zip(&wanted[self.rank()]) {
+            self.load(plane.insert_axis(Axis(0)), x, i)?;
+        }
+        Ok(())
     }
 
     /// Calls `work` with some of the first `count` images of `images` after another, the same in all processes, and with
@@ -186,7 +204,7 @@ impl Ranks {
         mut work: impl FnMut(&[usize], Array3<f32>) -> Result<()>,
     ) -> Result<()> {
         for some in self.turns(images.shape(), count) {
-            work(&some, self.collect(images, &self.to_all(&some))?)?;
+            work(&some, self.collected(here(images)?, &self.to_all(&some)))?;
         }
         Ok(())
     }
@@ -208,6 +226,18 @@ impl Ranks {
         let own = self.own(images);
         own.start.min(count)..own.end.min(count)
     }
+}
+
+/// The numbers at hand of an array with this shape, from plane `first` on.
+struct Here<'a> {
+    shape: [usize; 3],
+    first: usize,
+    numbers: &'a [f32],
+}
+
+fn here(x: &Array) -> Result<Here<'_>> {
+    let (first, planes) = at_hand(x)?;
+    Ok(Here { shape: x.shape(), first, numbers: planes.slice() })
 }
 
 /// The planes at hand of an array of this place.
@@ -261,7 +291,7 @@ impl Place for Ranks {
         for (i, mut to) in to.axis_chunks_iter_mut(Axis(0), together).enumerate() {
             let at = first + i * together;
             let planes: Vec<usize> = (at..at + to.len_of(Axis(0))).collect();
-            to.assign(&self.collect(from, &self.to_all(&planes))?);
+            to.assign(&self.collected(here(from)?, &self.to_all(&planes)));
         }
         Ok(())
     }
@@ -292,7 +322,7 @@ impl Place for Ranks {
             return Ok(array.into());
         }
         let all = |rank| if rank == 0 { (0..x.shape()[0]).collect() } else { vec![] };
-        Ok(self.collect(x, &(0..self.count()).map(all).collect::<Vec<_>>())?.into())
+        Ok(self.collected(here(x)?, &(0..self.count()).map(all).collect::<Vec<_>>()).into())
     }
 
     fn fill(&self, x: &mut Array, value: f32) -> Result<()> {
@@ -305,7 +335,7 @@ impl Place for Ranks {
             (0..at.len()).filter(|&i| part.contains(&at[i])).collect::<Vec<usize>>()
         };
         let wanted: Vec<_> = (0..self.count()).map(wanted).collect();
-        let found = self.collect(from, &wanted)?;
+        let found = self.collected(here(from)?, &wanted);
         for (plane, &i) in found.outer_iter().zip(&wanted[self.rank()]) {
             self.load(plane.insert_axis(Axis(0)), out, at[i])?;
         }
@@ -346,22 +376,28 @@ impl Place for Ranks {
                 Host.forward(projector, &slab, &seen, here, &mut lines)?;
             }
             // Images of one process follow each other.
+            let of = |rank| some.iter().filter(|i| self.part(rank, count).contains(i)).count() * rows * columns;
             let mut rest = lines.slice();
-            let size = |rank| some.iter().filter(|i| self.part(rank, count).contains(i)).count() * rows * columns;
-            let mut out = vec![];
+            let mut blocks = vec![];
             for rank in 0..self.count() {
-                let (part, others) = rest.split_at(size(rank));
-                out.push(part.to_vec());
+                let (block, others) = rest.split_at(of(rank));
+                blocks.push(block);
                 rest = others;
             }
-            let mut into = vec![vec![0.0; size(self.rank())]; self.count()];
+            let me = self.rank();
+            let out = |rank: usize| if rank == me { vec![] } else { blocks[rank].to_vec() };
+            let out: Vec<_> = (0..self.count()).map(out).collect();
+            let other = |rank| vec![0.0; if rank == me { 0 } else { of(me) }];
+            let mut into: Vec<_> = (0..self.count()).map(other).collect();
             self.wire.exchange(&out, &mut into);
-            let first = some.iter().find(|i| self.own(count).contains(i));
-            let (Some(first), Some((sum, others))) = (first, into.split_first_mut()) else { continue };
-            for other in others {
-                sum.iter_mut().zip(other).for_each(|(sum, x)| *sum += *x);
+            let Some(first) = some.iter().find(|i| self.own(count).contains(i)) else { continue };
+            into[me] = blocks[me].to_vec();
+            let mut all = into.into_iter();
+            let mut sum = all.next().unwrap_or_default();
+            for other in all {
+                sum.iter_mut().zip(&other).for_each(|(sum, x)| *sum += *x);
             }
-            let sum = ArrayView3::from_shape([sum.len() / (rows * columns).max(1), rows, columns], sum);
+            let sum = ArrayView3::from_shape([sum.len() / (rows * columns).max(1), rows, columns], &sum);
             self.load(sum.unwrap_or_else(|e| unreachable!("whole images: {e}")), images, *first)?;
         }
         Ok(())
@@ -397,7 +433,7 @@ impl Place for Ranks {
                     let part = self.part(rank, count);
                     part.filter_map(|i| views.get(i)).copied().collect::<Vec<usize>>()
                 };
-                Some(self.collect(weights, &(0..self.count()).map(wanted).collect::<Vec<_>>())?)
+                Some(self.collected(here(weights)?, &(0..self.count()).map(wanted).collect::<Vec<_>>()))
             }
         };
         let mut sums = [0.0; 2];
@@ -442,27 +478,35 @@ impl Place for Ranks {
         })
     }
 
-    fn prox(&self, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+    fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
         let Some(slab) = penalty.slab().cloned() else {
-            return whole_prox(self, v, tau, penalty);
+            return self.update_around(step, penalty);
         };
         for (_, part) in penalty.state() {
             if let StatePart::Placed(state) = part {
-                let near = self.near(state, &slab)?;
-                self.load(near.view(), state, slab.planes.start)?;
+                self.renew(state, &slab)?;
             }
         }
-        let near = self.near(v, &slab)?;
-        let mut u = Array3::zeros(near.raw_dim());
-        penalty.prox(near.as_slice().unwrap_or_default(), tau, u.as_slice_mut().unwrap_or_default());
-        penalty.fault()?;
-        self.load(u.slice(s![slab.inner(), .., ..]), v, slab.own.start)
+        let ProximalStep { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
+        let shape = gradient.shape();
+        let inside = inside.map(|inside| flags(inside, slab.own.clone())).transpose()?;
+        let [gradient, ahead, x] = [gradient, ahead, x].map(Array::slice_mut);
+        let towards = towards.map(|(to, share)| (to.slice(), share));
+        let update = Update { gradient, ahead, x, step, momentum, towards, inside: inside.as_ref().map(Mask::slice) };
+        update.around(|v, u| {
+            let near = self.near(Here { shape, first: slab.own.start, numbers: v }, &slab);
+            let mut all = vec![0.0; near.len()];
+            penalty.prox(near.as_slice().unwrap_or_default(), tau, &mut all);
+            let size = shape[1] * shape[2];
+            u.copy_from_slice(&all[slab.inner().start * size..slab.inner().end * size]);
+        });
+        penalty.fault()
     }
 
     fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {
         match penalty.slab().cloned() {
             None => Ok(penalty.value(self.read(x)?.view())),
-            Some(slab) => Ok(self.sum(penalty.value(self.near(x, &slab)?.view()))),
+            Some(slab) => Ok(self.sum(penalty.value(self.near(here(x)?, &slab).view()))),
         }
     }
 
@@ -472,7 +516,7 @@ impl Place for Ranks {
         }
         Ok(match penalty.slab().cloned() {
             None => penalty.adapt(self.read(x)?.view()),
-            Some(slab) => penalty.adapt(self.near(x, &slab)?.view()).map(|value| self.sum(value)),
+            Some(slab) => penalty.adapt(self.near(here(x)?, &slab).view()).map(|value| self.sum(value)),
         })
     }
 }

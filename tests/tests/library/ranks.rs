@@ -108,7 +108,7 @@ fn every_number_of_ranks_ends_where_one_does() {
         json!({"type": "cgls", "stop": {"passes": 5}}),
         json!({"type": "lsqr", "pull": 0.01, "stop": {"passes": 5}}),
         json!({"type": "asd-pocs", "stop": {"passes": 4}}),
-        json!({"type": "fista", "prior": "total-variation", "stop": {"passes": 5}, "scene": {"surround": "coarse"}}),
+        json!({"type": "fista", "prior": "total-variation", "stop": {"passes": 5}, "scene": {"surround": {"coarse": {}}}}),
         json!({"type": "fista", "prior": "none", "bin": 2, "air": true, "stop": {"passes": 5}}),
         json!({"type": "fista", "stop": {"passes": 5}, "scene": {"bounds": {"low": 0.0, "high": 0.015}},
             "prior": {"type": "directional-total-variation", "arc": 0.5}}),
