@@ -143,3 +143,19 @@ fn views_that_are_not_there_are_refused() {
     assert!(said.contains("no.safetensors"), "{said}");
     assert!(!dir.path().join("run").exists(), "nothing is made before the input is known to be good");
 }
+
+/// Each of them would do the whole work and write to the same folder.
+#[test]
+fn several_processes_without_mpi_are_refused() {
+    let dir = tempdir().unwrap();
+    let (scan, run) = (text(&dir.path().join("scan")), text(&dir.path().join("run")));
+    crate::common::done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "4", "--detector", "8x8"]);
+    let of = |count: &str| {
+        let mut command = crate::common::conefield(&["reconstruct", &scan, "--spec", "fdk", "-o", &run]);
+        command.env("OMPI_COMM_WORLD_SIZE", count).assert().get_output().clone()
+    };
+    let said = String::from_utf8(of("4").stderr).unwrap();
+    assert!(said.starts_with("error: ") && said.contains("feature `mpi`"), "{said}");
+    assert!(!dir.path().join("run").exists());
+    assert!(of("1").status.success());
+}

@@ -5,6 +5,13 @@ use conefield_core::{Error, Result};
 /// The connection to the other processes, which a program without the feature `mpi` never has.
 pub enum Joined {}
 
+impl Joined {
+    /// Ends the other processes with this one.
+    pub fn abandon(self) {
+        match self {}
+    }
+}
+
 /// Refuses to be one of several processes, each of which would do all the work.
 ///
 /// # Errors

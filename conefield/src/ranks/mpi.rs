@@ -9,8 +9,15 @@ use mpi::topology::SimpleCommunicator;
 use mpi::traits::{Communicator, CommunicatorCollectives};
 use std::sync::Arc;
 
-/// The connection to the other processes. Dropped, it waits for them; a process that ends without ends them all.
+/// The connection to the other processes. Dropped, it waits for them.
 pub struct Joined(#[expect(dead_code, reason = "ends MPI when dropped")] Universe);
+
+impl Joined {
+    /// Ends the other processes with this one: the launcher does, when one ends without leave.
+    pub fn abandon(self) {
+        std::mem::forget(self);
+    }
+}
 
 /// Joins the processes of this run, if a launcher such as `mpirun` or `srun` has started this one.
 ///

@@ -14,11 +14,18 @@ use ndarray::{Array3, Axis};
 use serde_json::{Value, json};
 use std::sync::{Arc, Barrier, Mutex};
 
-/// A thread among `count`, and what each has sent to each.
+/// What threads send to each other.
+struct Post {
+    barrier: Barrier,
+    /// What each sends to each.
+    sent: Vec<Mutex<Vec<Vec<f32>>>>,
+}
+
+/// A thread among `count`.
 struct Thread {
     rank: usize,
     count: usize,
-    post: Arc<(Barrier, Vec<Mutex<Vec<Vec<f32>>>>)>,
+    post: Arc<Post>,
 }
 
 impl Peers for Thread {
@@ -31,10 +38,10 @@ impl Peers for Thread {
     }
 
     fn exchange(&self, out: &[Vec<f32>], into: &mut [Vec<f32>]) {
-        let (barrier, boxes) = &*self.post;
-        *boxes[self.rank].lock().unwrap() = out.to_vec();
+        let Post { barrier, sent } = &*self.post;
+        *sent[self.rank].lock().unwrap() = out.to_vec();
         barrier.wait();
-        for (from, into) in boxes.iter().zip(into) {
+        for (from, into) in sent.iter().zip(into) {
             let sent = &from.lock().unwrap()[self.rank];
             assert_eq!(sent.len(), into.len(), "rank {}", self.rank);
             into.copy_from_slice(sent);
@@ -62,7 +69,8 @@ impl Backend for Shared {
 
 /// The results of `work` in each of `count` ranks. A rank that panics would leave the others waiting: it ends the test.
 fn each<T: Send>(count: usize, work: impl Fn(&Shared) -> T + Sync) -> Vec<T> {
-    let post = Arc::new((Barrier::new(count), (0..count).map(|_| Mutex::default()).collect::<Vec<_>>()));
+    let sent = (0..count).map(|_| Mutex::default()).collect();
+    let post = Arc::new(Post { barrier: Barrier::new(count), sent });
     std::thread::scope(|scope| {
         let rank = |rank| {
             let (post, work) = (post.clone(), &work);
