@@ -883,7 +883,7 @@ mod tests {
 
     /// The same steps one after another, voxel by voxel; `dual` is `D·A·p`.
     fn plain(prox: &mut TvProx, v: &Array3<f32>, tau: f32, steps: usize) -> Array3<f32> {
-        let TvProx { shape, g, bounds, dual, edges, limited } = prox;
+        let TvProx { shape, g, bounds, dual, edges, limited, .. } = prox;
         let (shape, g, bounds, dual) = (*shape, *g, *bounds, &mut dual.each_mut().map(|p| p.on_host_mut().unwrap()));
         let moved = |at: [usize; 3], k: usize, by: isize| {
             let mut to = at;
