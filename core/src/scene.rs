@@ -10,8 +10,8 @@ use std::sync::Arc;
 mod settings;
 
 pub use settings::{
-    AttenuationScale, BoundsSettings, CoarseSurround, CuboidSettings, CylinderSettings, LevelRule, SceneSettings,
-    SupportRule, SurroundRule, VoxelScene,
+    AttenuationScale, BoundsSettings, CoarseSurround, CuboidSettings, CylinderSettings, LevelRule, RegionSettings,
+    SceneSettings, SupportRule, SurroundRule, VoxelScene,
 };
 
 /// Maps lengths to cube sides and attenuation to order one, based on the scan only.

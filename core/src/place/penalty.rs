@@ -71,6 +71,15 @@ pub trait Penalty: Send {
         Err(Error::invalid("spec", "scene.bounds", format!("{bounds} (in 1/mm)"), expected))
     }
 
+    /// Gives each coefficient a lower and an upper bound of its own, within those of [`Penalty::confine`].
+    ///
+    /// # Errors
+    /// A penalty without this method knows no bounds by coefficient.
+    fn confine_each(&mut self, bounds: [Vec<f32>; 2]) -> Result<()> {
+        let found = format!("bounds of {} coefficients", bounds[0].len());
+        Err(Error::invalid("spec", "scene.bounds.regions", found, "none: this prior has the same bounds everywhere"))
+    }
+
     /// Tells the unit vector along the middle of an arc of less than half a turn, if the views cover such an arc: edges
     /// across it are the ones that no ray is tangent to. Called before the first update.
     fn limited(&mut self, middle: Vec3) {

@@ -1,6 +1,6 @@
 //! Scene settings of a spec.
 
-use crate::error::{Result, ensure};
+use crate::error::{Error, Result, ensure};
 use crate::geometry::Vec3;
 use crate::input_file::InputFile;
 use crate::place::Bounds;
@@ -227,12 +227,14 @@ impl VoxelScene {
     pub fn validate(&self) -> Result<()> {
         self.surround.validate()?;
         self.support.validate(&self.surround)?;
-        let BoundsSettings { low, high } = self.bounds;
+        let BoundsSettings { low, high, regions } = &self.bounds;
+        let low = *low;
         ensure(low.is_finite(), "spec", "scene.bounds.low", low, "a finite number")?;
-        if let Some(high) = high {
+        if let Some(high) = *high {
             let expected = format!("a finite number above scene.bounds.low, which is {low}");
             ensure(high.is_finite() && high > low, "spec", "scene.bounds.high", high, expected)?;
         }
+        regions.iter().enumerate().try_for_each(|(i, region)| region.validate(i))?;
         // Voxels outside the support are 0.
         let free = low == 0.0 || self.support == SupportRule::Box;
         ensure(free, "spec", "scene.bounds.low", low, "0, because voxels outside scene.support are 0")
@@ -240,7 +242,7 @@ impl VoxelScene {
 }
 
 /// Bounds of attenuation, in 1/unit of the scan.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BoundsSettings {
     /// Lowest attenuation. A method with the key `nonnegative` ignores it if that is false.
@@ -248,6 +250,58 @@ pub struct BoundsSettings {
     /// Highest attenuation: that of the densest material, if it is known. With `scene.support = "solid"` it is fitted.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub high: Option<f64>,
+    /// Regions with other bounds, such as a part of known material. A later one counts where two overlap; voxels outside
+    /// `scene.support` stay 0.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub regions: Vec<RegionSettings>,
+}
+
+/// Bounds of attenuation in a region, in 1/unit of the scan.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RegionSettings {
+    /// The region: a cylinder, a cuboid or a file.
+    pub within: SupportRule,
+    /// Lowest attenuation.
+    #[serde(default)]
+    pub low: f64,
+    /// Highest attenuation. Equal to `low` if the attenuation is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub high: Option<f64>,
+}
+
+impl RegionSettings {
+    /// Its key in a spec.
+    pub fn key(i: usize) -> String {
+        format!("scene.bounds.regions.{i}")
+    }
+
+    /// Makes an error about `scene.support` one about the region.
+    pub fn concern(i: usize, e: Error) -> Error {
+        match e {
+            Error::Invalid { place, field, found, expected } => {
+                let field = field.replacen("scene.support", &format!("{}.within", Self::key(i)), 1);
+                Error::Invalid { place, field, found, expected }
+            }
+            other => other,
+        }
+    }
+
+    fn validate(&self, i: usize) -> Result<()> {
+        let region = matches!(self.within, SupportRule::Cylinder(_) | SupportRule::Cuboid(_) | SupportRule::File(_));
+        let field = format!("{}.within", Self::key(i));
+        ensure(region, "spec", &field, "no region", "a cylinder, a cuboid or a file")?;
+        self.within.validate(&SurroundRule::None).map_err(|e| Self::concern(i, e))?;
+        let (low, high) = (self.low, self.high.unwrap_or(f64::MAX));
+        let found = format!("{low} to {high}");
+        let right = low.is_finite() && high.is_finite() && high >= low;
+        ensure(right, "spec", &Self::key(i), found, "finite numbers low and high, high not below low")
+    }
+
+    /// The bounds in 1/mm, for a scan in units of `mm` millimetres.
+    pub fn in_mm(&self, mm: f64) -> Bounds {
+        BoundsSettings { low: self.low, high: self.high, regions: vec![] }.in_mm(mm)
+    }
 }
 
 impl BoundsSettings {
@@ -257,7 +311,7 @@ impl BoundsSettings {
     }
 
     /// The bounds in 1/mm, for a scan in units of `mm` millimetres.
-    pub fn in_mm(self, mm: f64) -> Bounds {
+    pub fn in_mm(&self, mm: f64) -> Bounds {
         let of = |x: f64| (x / mm) as f32;
         Bounds { low: of(self.low), high: self.high.map_or(f32::INFINITY, of) }
     }

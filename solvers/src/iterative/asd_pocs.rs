@@ -178,6 +178,7 @@ impl Iteration for Iterate {
             descend(place, &mut self.sweep.x, anisotropy(grid), self.length, 1e-3 * mean as f32, &mut self.sweep.work)?;
             problem.outside(&mut self.sweep.x, 0.0)?;
         }
+        self.sweep.confine(problem)?;
         let prior = distance(place, &self.sweep.x, &self.fitted)?;
         if prior > RATIO * data && residual.sqrt() > self.target {
             self.length *= ALPHA_DECAY;

@@ -110,10 +110,10 @@ pub(super) fn least_squares<I: Iteration + 'static>(
     prepare(&mut iterate, &problem)?;
     let mut solution = drive(job, &shared.stop, begun, &problem, &space, Box::new(iterate), observer)?;
     if let Reconstruction::Volume(volume) = &mut solution.result {
+        let bounds = Bounds { low: if nonnegative { problem.bounds.low } else { f32::MIN }, ..problem.bounds };
         // The volume is in the scan's unit.
-        let [low, high] = [problem.bounds.low, problem.bounds.high].map(|x| x * job.scan.unit.mm as f32);
-        let bounds = Bounds { low: if nonnegative { low } else { f32::NEG_INFINITY }, high };
-        volume.data.par_mapv_inplace(|x| bounds.clip(x));
+        let factor = job.scan.unit.mm as f32;
+        problem.regions.clip(&mut volume.data, &volume.grid, bounds, factor);
     }
     Ok(solution)
 }

@@ -29,7 +29,7 @@ use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
 use conefield_core::orbit::Arcs;
-use conefield_core::place::{Array, Bounds, DIVIDE, ProximalStep, Reduction, StatePart};
+use conefield_core::place::{Array, Bounds, DIVIDE, Host, ProximalStep, Reduction, StatePart};
 use conefield_core::random::stream;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, penalty};
 use conefield_core::scan::{Scan, ScanHeader};
@@ -43,6 +43,7 @@ use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Settings of `fista`.
@@ -203,11 +204,11 @@ impl Iterative for Built {
         let data = self.data.of(problem.scan.projections.view()).map_err(|e| e.within("data"))?;
         let space = opened.space(job.scan.header().binned(self.bin));
         let start = self.shared.known(job, &space)?;
-        let mut arrays = Arrays::new(self, expansion, &voxels, &space, start)?;
+        // A device's proximal maps have the same bounds everywhere.
+        let there = problem.regions.is_empty();
+        let mut arrays = Arrays::new(self, expansion, &voxels, &space, start, there)?;
         arrays.begin(&problem)?;
-        if problem.bounds != Bounds::default() {
-            arrays.penalty.confine(problem.bounds)?;
-        }
+        arrays.confine(&problem)?;
         if let Some(middle) = limited(problem.geometry) {
             arrays.penalty.limited(middle);
         }
@@ -257,7 +258,7 @@ impl Iterative for Built {
         space.pass(self.data.scratch(header));
         // If a stage refuses the grid, the run is refused and needs no memory.
         if let Some((expansion, grid)) = self.expansion(header.volume) {
-            let _ = space.volume().and_then(|start| Arrays::new(self, expansion, &grid, &space, start));
+            let _ = space.volume().and_then(|start| Arrays::new(self, expansion, &grid, &space, start, true));
         }
         self.shared.price(&space, self.subsets)
     }
@@ -304,13 +305,16 @@ impl Arrays {
         voxels: &VoxelGrid,
         space: &Space,
         start: Array,
+        there: bool,
     ) -> Result<Self> {
         let (model, x) = Model::new(expansion, voxels, space, start)?;
         let grid = model.grid();
+        let host = Space::new(*space.header(), Arc::new(Host));
+        let beside = if there || space.place().device().is_none() { space } else { &host };
         let coefficients = || space.array(grid.shape);
         Ok(Self {
             model,
-            penalty: penalty(settings.prior.as_ref(), &grid, space).map_err(|e| e.within("prior"))?,
+            penalty: penalty(settings.prior.as_ref(), &grid, beside).map_err(|e| e.within("prior"))?,
             x,
             ahead: coefficients()?,
             gradient: coefficients()?,
@@ -332,6 +336,20 @@ impl Arrays {
         });
         self.ahead = ahead;
         done.map(|()| sums)
+    }
+
+    /// Gives the penalty the bounds of its coefficients.
+    fn confine(&mut self, problem: &Problem<'_>) -> Result<()> {
+        let bounds = problem.regions.widest(problem.bounds);
+        if bounds != Bounds::default() {
+            self.penalty.confine(bounds)?;
+        }
+        if problem.regions.is_empty() {
+            return Ok(());
+        }
+        let grid = self.model.grid();
+        let grid = self.penalty.slab().map_or(grid, |slab| grid.slab(slab.planes.clone()));
+        self.penalty.confine_each(problem.regions.on(&grid, problem.bounds))
     }
 
     /// Makes an update with the gradient.

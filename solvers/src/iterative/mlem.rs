@@ -15,7 +15,7 @@ use conefield_core::error::Result;
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, CLIP, MULTIPLY, RELAX, Reduction, StatePart};
+use conefield_core::place::{Array, Bounds, CLIP, MULTIPLY, RELAX, Reduction, StatePart};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
@@ -187,11 +187,11 @@ impl Iterate {
         if self.subsets.len() > 1 {
             column_sums(problem, views, &mut self.pixels, &mut self.columns)?;
         }
-        let [low, high] = [problem.bounds.low.max(0.0), problem.bounds.high].map(f64::from);
+        let bounds = Bounds { low: problem.bounds.low.max(0.0), ..problem.bounds };
         place.map(&MULTIPLY, [1.0, 0.0], &mut self.work, &[&self.x])?;
         place.map(&RELAX, [1.0, 0.0], &mut self.x, &[&self.columns, &self.work])?;
-        if low > 0.0 || high < f64::INFINITY {
-            place.map(&CLIP, [low, high], &mut self.x, &[])?;
+        if bounds != Bounds::default() || !problem.regions.is_empty() {
+            problem.clip(&mut self.x, bounds)?;
             problem.outside(&mut self.x, 0.0)?;
         }
         Ok(square)

@@ -23,6 +23,7 @@ pub mod norms;
 pub mod order;
 mod plan;
 pub mod problem;
+pub mod regions;
 pub mod regularizers;
 pub mod sart;
 pub mod shared;

@@ -95,7 +95,7 @@ impl Model {
         let Some(voxels) = &mut self.voxels else { return Ok(x) };
         expand(problem.place, self.expansion.as_ref(), x, voxels)?;
         if self.expansion.are_samples() {
-            problem.clip(voxels)?;
+            problem.clip(voxels, problem.bounds)?;
         } else {
             problem.outside(voxels, 0.0)?;
         }

@@ -1,5 +1,6 @@
 //! A scan with its system matrix, in a place.
 
+use super::regions::Regions;
 use crate::shadow::{air_level, shadow};
 use conefield_core::data_term::Misfit;
 use conefield_core::error::Result;
@@ -29,6 +30,8 @@ pub struct Problem<'a> {
     pub seed: u64,
     /// Bounds of the attenuation, in 1/mm.
     pub bounds: Bounds,
+    /// Regions with other bounds.
+    pub regions: &'a Regions,
     /// The voxels that may be nonzero, if not all.
     pub(super) inside: Option<&'a Mask>,
     /// The object's shadow, if the other pixels count as 0.
@@ -96,10 +99,14 @@ impl Problem<'_> {
         self.inside.map_or(Ok(()), |inside| self.place.keep(x, inside, value))
     }
 
-    /// Clips `x` to the bounds.
-    pub fn clip(&self, x: &mut Array) -> Result<()> {
-        let Bounds { low, high } = self.bounds;
-        self.place.map(&CLIP, [low, high].map(f64::from), x, &[])
+    /// Clips a volume to `bounds`, and regions to theirs.
+    pub fn clip(&self, x: &mut Array, bounds: Bounds) -> Result<()> {
+        if self.regions.is_empty() {
+            let Bounds { low, high } = bounds;
+            return self.place.map(&CLIP, [low, high].map(f64::from), x, &[]);
+        }
+        let grid = &self.scan.geometry.volume;
+        self.place.change(x, &mut |x| self.regions.clip(x, grid, bounds, 1.0))
     }
 
     /// Sets the voxels inside the object's support to 1 and the others to 0.

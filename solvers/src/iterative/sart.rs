@@ -12,7 +12,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, CLIP, RELAX, StatePart};
+use conefield_core::place::{Array, Bounds, RELAX, StatePart};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
@@ -208,10 +208,10 @@ impl Sweep {
 
     /// Makes pass `pass`, counted from 0; returns `‖p − A·x‖²`.
     pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64) -> Result<f64> {
-        let Updates { relaxation, decay, order, nonnegative, .. } = self.updates;
+        let Updates { relaxation, decay, order, .. } = self.updates;
         let relaxation = f64::from((relaxation * decay.powi(pass.min(1 << 20) as i32)) as f32);
-        let floor = f64::from(if nonnegative { problem.bounds.low } else { f32::MIN });
-        let high = f64::from(problem.bounds.high);
+        // A region may admit less.
+        let floor = f64::from(problem.regions.widest(self.bounds(problem)).low);
         let mut square = 0.0;
         for s in order.of(self.subsets.len(), problem.seed, pass) {
             let views = &self.subsets[s];
@@ -221,11 +221,22 @@ impl Sweep {
                 column_sums(problem, views, &mut self.pixels, &mut self.columns)?;
             }
             problem.place.map(&RELAX, [relaxation, floor], &mut self.x, &[&self.columns, &self.work])?;
-            if high < f64::INFINITY {
-                problem.place.map(&CLIP, [floor, high], &mut self.x, &[])?;
-            }
+            self.confine(problem)?;
         }
         Ok(square)
+    }
+
+    fn bounds(&self, problem: &Problem<'_>) -> Bounds {
+        Bounds { low: if self.updates.nonnegative { problem.bounds.low } else { f32::MIN }, ..problem.bounds }
+    }
+
+    /// Clips the volume to what an update does not keep to by itself: the upper bound, and bounds of regions.
+    pub(super) fn confine(&mut self, problem: &Problem<'_>) -> Result<()> {
+        let bounds = self.bounds(problem);
+        if bounds.high < f32::INFINITY || !problem.regions.is_empty() {
+            problem.clip(&mut self.x, bounds)?;
+        }
+        Ok(())
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::order::Subsets;
 use super::problem::Problem;
+use super::regions::Regions;
 use super::stop::Stop;
 use crate::fit::{Object, object};
 use crate::surround::Corrected;
@@ -102,6 +103,7 @@ impl Shared {
         // Uses the views as measured: the attenuation subtracted later is too coarse for carving.
         let Object { support, solid, found } = object(job.scan, &self.scene.support, Some(job.volumes))?;
         found.iter().for_each(|line| observer.note(line));
+        let regions = Regions::of(&self.scene.bounds, support.as_ref(), job)?;
         let inside = support.map(|support| {
             let mut inside = Array3::from_elem(grid.shape, false);
             Zip::indexed(&mut inside).par_for_each(|(x, y, z), i| *i = support.holds(grid.voxel([x, y, z])));
@@ -116,7 +118,7 @@ impl Shared {
         if let (None, Some(solid)) = (self.scene.bounds.high, &solid) {
             bounds.high = solid.attenuation as f32;
         }
-        Ok(Opened { place, projector: self.projector.clone(), bounds, inside, corrected, binned, geometry })
+        Ok(Opened { place, projector: self.projector.clone(), bounds, regions, inside, corrected, binned, geometry })
     }
 
     /// Adds the memory of the driver and of the projector for a subset to the method's own arrays in `space`; returns
@@ -134,6 +136,7 @@ pub(super) struct Opened {
     place: Arc<dyn Place>,
     projector: Arc<dyn VoxelProjector>,
     bounds: Bounds,
+    regions: Regions,
     /// The object's support, if known.
     inside: Option<Mask>,
     /// The scan without beam hardening or attenuation beyond the volume.
@@ -165,6 +168,7 @@ impl Opened {
             projector: self.projector.as_ref(),
             seed: job.seed,
             bounds: self.bounds,
+            regions: &self.regions,
             inside: self.inside.as_ref(),
             shadow: None,
             views: MeasuredViews { measured: &scan.projections, here: None },

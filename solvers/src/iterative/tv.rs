@@ -154,6 +154,8 @@ pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
     bounds: Bounds,
+    /// The bounds of each voxel, if they differ.
+    each: Option<[Vec<f32>; 2]>,
     /// The dual variable along x, y and z; with edges or a limited arc it is `D·A·p`.
     dual: [Array; 3],
     /// Edges across which slopes cost less.
@@ -173,7 +175,7 @@ impl TvProx {
         });
         let dual = || space.array(shape);
         let dual = [dual()?, dual()?, dual()?];
-        Ok(Self { shape, g, bounds: Bounds::default(), dual, edges: None, limited: None, slab: None })
+        Ok(Self { shape, g, bounds: Bounds::default(), each: None, dual, edges: None, limited: None, slab: None })
     }
 
     /// Reduces the cost of slopes across `edges`, which are initially 0.
@@ -184,6 +186,11 @@ impl TvProx {
     /// Replaces the bounds.
     pub fn confine(&mut self, bounds: Bounds) {
         self.bounds = bounds;
+    }
+
+    /// Gives each voxel bounds within those of [`TvProx::confine`].
+    pub fn confine_each(&mut self, bounds: [Vec<f32>; 2]) {
+        self.each = Some(bounds);
     }
 
     /// Reduces the cost of slopes along a direction.
@@ -218,8 +225,11 @@ impl TvProx {
         self.edges.is_some()
     }
 
-    /// The penalty and its proximal map for a place with kernels.
-    pub fn kernels(&mut self, steps: usize) -> Dual<'_> {
+    /// The penalty and its proximal map for a place with kernels; these have the same bounds for all voxels.
+    pub fn kernels(&mut self, steps: usize) -> Option<Dual<'_>> {
+        if self.each.is_some() {
+            return None;
+        }
         let fragment = match self.limited {
             Some(Limited { middle: [x, y, z], factor }) => {
                 let constants =
@@ -229,7 +239,7 @@ impl TvProx {
             None => Fragment::new(&[if self.edges.is_some() { ALONG_EDGES } else { PLAIN }]),
         };
         let guide = self.edges.as_mut().map(Edges::guide);
-        Dual { fragment, weights: self.g, steps, bounds: self.bounds, p: self.dual.each_mut(), guide }
+        Some(Dual { fragment, weights: self.g, steps, bounds: self.bounds, p: self.dual.each_mut(), guide })
     }
 
     /// The dual along x, y and z, for a checkpoint.
@@ -242,7 +252,10 @@ impl TvProx {
     pub fn apply(&mut self, v: &[f32], tau: f32, steps: usize, u: &mut [f32]) {
         if tau < f32::MIN_POSITIVE {
             let bounds = self.bounds;
-            return u.par_iter_mut().zip(v).for_each(|(u, v)| *u = bounds.clip(*v));
+            return match &self.each {
+                None => u.par_iter_mut().zip(v).for_each(|(u, v)| *u = bounds.clip(*v)),
+                Some(each) => clip_each(v, each, u),
+            };
         }
         let mut left = steps;
         loop {
@@ -312,12 +325,20 @@ impl TvProx {
             let own = copied..copied + range.len();
             let first = (range.start - copied) * plane;
             let edges = edges.map(|n| n.map(|n| &n[first..first + planes.0[0].len() * plane]));
-            slabs.push(Sweep { planes, own, lines, v, edges, line: nz, steps: split.reach });
+            let part = first..first + planes.0[0].len() * plane;
+            let each = self.each.as_ref().map(|each| each.each_ref().map(|x| &x[part.clone()]));
+            slabs.push(Sweep { planes, own, lines, v, edges, each, line: nz, steps: split.reach });
         }
         let limited = self.limited.map(|limited| limited.turned([0, y, z]));
         let scale = Scale { limited, ..Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.bounds) };
         parallel::over(slabs, |_, slab| run(Sweeping(slab, scale)));
     }
+}
+
+/// Overwrites each `u` with the number within its bounds that is closest to `v`.
+pub(super) fn clip_each(v: &[f32], [low, high]: &[Vec<f32>; 2], u: &mut [f32]) {
+    let all = u.par_iter_mut().zip(v).zip(low).zip(high);
+    all.for_each(|(((u, v), low), high)| *u = v.max(*low).min(*high));
 }
 
 /// Most dual steps per sweep, so that their part of the volume stays in the last-level cache.
@@ -432,6 +453,8 @@ struct Sweep<'a, L> {
     v: [&'a [f32]; 2],
     /// The edges of all planes.
     edges: Option<[&'a [f32]; 3]>,
+    /// The bounds of each voxel of all planes, if they differ.
+    each: Option<[&'a [f32]; 2]>,
     /// Numbers per line along z.
     line: usize,
     steps: usize,
@@ -482,6 +505,7 @@ impl<L: Lines> Sweep<'_, L> {
                         let v = &given[given_at(i, j)..][..nz];
                         let fresh = &mut kept[at(i, j)..][..stride];
                         primal(s, self.beside(i, j, &zeros, limited.then_some(&mut line)), v, scale, &mut fresh[..nz]);
+                        self.clip(i, j, &mut fresh[..nz]);
                         fresh[nz] = fresh[nz - 1];
                     }
                     if i > 0 && i <= count {
@@ -501,8 +525,20 @@ impl<L: Lines> Sweep<'_, L> {
                     scale,
                     &mut map,
                 );
+                self.clip(i, j, &mut map);
                 self.lines.write((i - self.own.start) * plane + j * nz, &map);
             }
+        }
+    }
+
+    /// Clips line `j` of plane `i` to the bounds of its voxels.
+    #[inline(always)]
+    fn clip(&self, i: usize, j: usize, u: &mut [f32]) {
+        let Some([low, high]) = self.each else { return };
+        let (nz, plane) = (self.line, self.planes.0[0][i].len());
+        let at = i * plane + j * nz;
+        for ((u, low), high) in u.iter_mut().zip(&low[at..at + nz]).zip(&high[at..at + nz]) {
+            *u = u.max(*low).min(*high);
         }
     }
 
@@ -883,7 +919,7 @@ mod tests {
 
     /// The same steps one after another, voxel by voxel; `dual` is `D·A·p`.
     fn plain(prox: &mut TvProx, v: &Array3<f32>, tau: f32, steps: usize) -> Array3<f32> {
-        let TvProx { shape, g, bounds, dual, edges, limited, .. } = prox;
+        let TvProx { shape, g, bounds, each, dual, edges, limited, .. } = prox;
         let (shape, g, bounds, dual) = (*shape, *g, *bounds, &mut dual.each_mut().map(|p| p.on_host_mut().unwrap()));
         let moved = |at: [usize; 3], k: usize, by: isize| {
             let mut to = at;
@@ -897,7 +933,9 @@ mod tests {
                 // No difference across the far faces.
                 let here = |k: usize| if at[k] + 1 < shape[k] { dual[k][at] } else { 0.0 };
                 let turn: f32 = (0..3).map(|k| (behind(k) - here(k)) * g[k] * tau).sum();
-                bounds.clip(v[at] - turn)
+                let here = bounds.clip(v[at] - turn);
+                let index = (at[0] * shape[1] + at[1]) * shape[2] + at[2];
+                each.as_ref().map_or(here, |[low, high]| here.max(low[index]).min(high[index]))
             })
         };
         let bound = 4.0 * g.iter().map(|g| g * g).sum::<f32>();
@@ -946,6 +984,11 @@ mod tests {
                         made.limit(Limited::new([0.6, 0.8, 0.0], 0.3));
                     }
                     made.confine(Bounds { low: 0.02, high: 0.9 });
+                    if directional != limited {
+                        let low: Vec<f32> = (0..v.len()).map(|i| 0.02 + 0.3 * (i % 3) as f32).collect();
+                        let high = low.iter().enumerate().map(|(i, low)| low + 0.1 * (i % 2) as f32).collect();
+                        made.confine_each([low, high]);
+                    }
                     made
                 };
                 let on = |threads: usize| {

@@ -19,4 +19,5 @@ mod patience;
 mod pipeline;
 mod places;
 mod ranks;
+mod regions;
 mod wgpu;

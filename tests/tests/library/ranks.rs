@@ -120,6 +120,9 @@ fn every_number_of_ranks_ends_where_one_does() {
         json!({"type": "fista", "prior": "none", "bin": 2, "air": true, "stop": {"passes": 5}}),
         json!({"type": "fista", "stop": {"passes": 5}, "scene": {"bounds": {"low": 0.0, "high": 0.015}},
             "prior": {"type": "directional-total-variation", "arc": 0.5}}),
+        json!({"type": "fista", "prior": "total-variation", "stop": {"passes": 4}, "scene": {"bounds": {"regions": [
+            {"within": {"cuboid": {"low": [-30, -20, -30], "high": [10, 30, 20]}}, "low": 0.02, "high": 0.02},
+        ]}}}),
         json!({"type": "fista", "stop": {"passes": 4},
             "prior": {"type": "sum", "priors": ["total-variation", "directional-total-variation"]}}),
         json!({"type": "fista", "prior": "directional-total-variation", "stop": {"passes": 5},
@@ -141,6 +144,19 @@ fn every_number_of_ranks_ends_where_one_does() {
         lost.index_axis_mut(Axis(0), 7).fill(0.0);
         assert!(off(&lost, &want) > 1e-2, "{method}");
     }
+}
+
+/// Slopes along the middle of an arc cost less, also beside the planes of another rank.
+#[test]
+fn a_limited_arc_is_the_same_for_ranks() {
+    let mut scan = scan();
+    scan.geometry.views.truncate(3);
+    scan.projections.slice_axis_inplace(Axis(0), (..3).into());
+    let method = |arc: f64| json!({"type": "fista", "stop": {"passes": 4}, "prior": {"type": "directional-total-variation", "arc": arc}});
+    let want = volume(&method(0.3), &scan, &Cpu::new());
+    assert!(off(&volume(&method(1.0), &scan, &Cpu::new()), &want) > 1e-2, "the arc has an effect");
+    let found = each(3, |backend| volume(&method(0.3), &scan, backend));
+    assert!(off(&found[0], &want) < 1e-5);
 }
 
 /// More ranks than planes of the volume or images of a subset.

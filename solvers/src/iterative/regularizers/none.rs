@@ -1,5 +1,6 @@
 //! No regularizer except the bounds of attenuation.
 
+use crate::iterative::tv::clip_each;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::place::Slab;
@@ -25,7 +26,7 @@ impl RegularizerSpec for Nonnegative {
 
 impl Regularizer for Nonnegative {
     fn on(&self, _: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
-        Ok(Box::new(On { bounds: Bounds::default(), slab: None }))
+        Ok(Box::new(On { bounds: Bounds::default(), each: None, slab: None }))
     }
 
     fn halo(&self) -> Option<usize> {
@@ -44,6 +45,8 @@ impl Regularizer for Nonnegative {
 /// The bounds alone.
 struct On {
     bounds: Bounds,
+    /// The bounds of each coefficient, if they differ.
+    each: Option<[Vec<f32>; 2]>,
     /// Its part of a volume that several processes share.
     slab: Option<Slab>,
 }
@@ -54,7 +57,10 @@ impl Penalty for On {
     }
 
     fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
-        u.par_iter_mut().zip(v).for_each(|(u, v)| *u = self.bounds.clip(*v));
+        match &self.each {
+            None => u.par_iter_mut().zip(v).for_each(|(u, v)| *u = self.bounds.clip(*v)),
+            Some(each) => clip_each(v, each, u),
+        }
     }
 
     fn divide(&mut self, slab: Slab) {
@@ -70,7 +76,12 @@ impl Penalty for On {
         Ok(())
     }
 
+    fn confine_each(&mut self, bounds: [Vec<f32>; 2]) -> Result<()> {
+        self.each = Some(bounds);
+        Ok(())
+    }
+
     fn kernels(&mut self) -> Option<Kernels<'_>> {
-        Some(Kernels::Clip(self.bounds))
+        self.each.is_none().then_some(Kernels::Clip(self.bounds))
     }
 }

@@ -155,6 +155,10 @@ impl Penalty for On {
         self.parts.iter_mut().try_for_each(|part| part.penalty.confine(bounds))
     }
 
+    fn confine_each(&mut self, bounds: [Vec<f32>; 2]) -> Result<()> {
+        self.parts.iter_mut().try_for_each(|part| part.penalty.confine_each(bounds.clone()))
+    }
+
     fn limited(&mut self, middle: Vec3) {
         self.parts.iter_mut().for_each(|part| part.penalty.limited(middle));
     }

@@ -138,6 +138,11 @@ impl Penalty for On {
         Ok(())
     }
 
+    fn confine_each(&mut self, bounds: [Vec<f32>; 2]) -> Result<()> {
+        self.prox.confine_each(bounds);
+        Ok(())
+    }
+
     fn divide(&mut self, slab: Slab) {
         self.prox.divide(slab);
     }
@@ -159,7 +164,7 @@ impl Penalty for On {
     }
 
     fn kernels(&mut self) -> Option<Kernels<'_>> {
-        Some(Kernels::Dual(self.prox.kernels(self.inner)))
+        self.prox.kernels(self.inner).map(Kernels::Dual)
     }
 
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
