@@ -66,8 +66,8 @@ pub fn run(args: impl IntoIterator<Item = OsString>, program: Option<Vec<OsStrin
         }
     };
     let status = obey(cli);
-    if status == FAILURE {
-        // The others wait for what this process does not send.
+    if status != SUCCESS {
+        // The others may wait for what this process does not send.
         joined.into_iter().for_each(ranks::Joined::abandon);
     }
     status

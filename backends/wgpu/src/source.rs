@@ -8,7 +8,7 @@ use wgpu::naga;
 pub type Check = fn(&naga::Module, &naga::valid::ModuleInfo) -> Result<(), String>;
 
 /// A further check of every kernel. Tests set it, to translate kernels for systems that are not at hand.
-pub static FURTHER: OnceLock<Check> = OnceLock::new();
+pub static EXTRA_CHECK: OnceLock<Check> = OnceLock::new();
 
 /// How a kernel accesses a buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -94,7 +94,7 @@ impl Source {
             }
             self.fault(line, &why)
         })?;
-        FURTHER.get().map_or(Ok(()), |check| check(&module, &info).map_err(|why| self.fault(None, &why)))
+        EXTRA_CHECK.get().map_or(Ok(()), |check| check(&module, &info).map_err(|why| self.fault(None, &why)))
     }
 
     /// An error in line `line` (from 1) of the text.

@@ -304,8 +304,10 @@ impl Place for Ranks {
         Err(Error::invalid("spec", "projector", projector.describe(), expected))
     }
 
+    /// By the process with the least memory, so that all of them divide their work alike.
     fn room(&self) -> u64 {
-        Host.room().saturating_mul(self.count() as u64)
+        let least = self.wire.all(Host.room() as f64).into_iter().fold(f64::INFINITY, f64::min);
+        (least as u64).saturating_mul(self.count() as u64)
     }
 
     fn agree(&self, flag: bool) -> bool {

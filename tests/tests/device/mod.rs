@@ -14,7 +14,7 @@ fn asked() -> Option<usize> {
 
 fn open(limits: Limits) -> Option<Wgpu> {
     let index = asked();
-    let _ = source::FURTHER.set(translations::check);
+    let _ = source::EXTRA_CHECK.set(translations::check);
     match Wgpu::with_limits(index, limits) {
         Ok(opened) => Some(opened),
         Err(e) if index.is_some() => panic!("CONEFIELD_ADAPTER: {e}"),
