@@ -413,9 +413,7 @@ pub trait Place: Send + Sync {
         first: usize,
     ) -> Result<()> {
         self.change(images, &mut |images| {
-            parallel::over(images.axis_iter_mut(Axis(0)).zip(views), |_, (image, &view)| {
-                work.filter(view, image.into_slice().unwrap_or_else(|| unreachable!("images are contiguous")));
-            });
+            views::filter(work, views, images);
         })?;
         let images = self.read(images)?;
         self.change(slab, &mut |slab| {

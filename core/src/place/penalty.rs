@@ -7,6 +7,7 @@ use crate::geometry::Vec3;
 use crate::parallel;
 use crate::wgsl::Fragment;
 use ndarray::ArrayView3;
+use std::sync::Arc;
 
 /// Bounds of coefficients: none is below `low` or above `high`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -75,7 +76,7 @@ pub trait Penalty: Send {
     ///
     /// # Errors
     /// A penalty without this method knows no bounds by coefficient.
-    fn confine_each(&mut self, bounds: [Vec<f32>; 2]) -> Result<()> {
+    fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
         let found = format!("bounds of {} coefficients", bounds[0].len());
         Err(Error::invalid("spec", "scene.bounds.regions", found, "none: this prior has the same bounds everywhere"))
     }

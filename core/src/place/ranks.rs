@@ -7,6 +7,7 @@
 //! Sums over processes are taken in the order of their ranks, so that a number of processes always gives the same bits.
 
 use super::map::{Map, Reduction};
+use super::views::filter;
 use super::{Array, FilteredViews, Held, Host, Mask, Penalty, Place, ProximalStep, StatePart, Update, Weighing};
 use crate::error::{Error, Result};
 use crate::geometry::Geometry;
@@ -469,9 +470,7 @@ impl Place for Ranks {
         let used = self.used(images.shape()[0], views.len());
         let here = at_hand_mut(images)?.1;
         Host.change(here, &mut |images| {
-            parallel::over(images.outer_iter_mut().zip(&views[used.clone()]), |_, (image, &view)| {
-                work.filter(view, image.into_slice().unwrap_or_else(|| unreachable!("images are contiguous")));
-            });
+            filter(work, &views[used.clone()], images);
         })?;
         let (start, here) = at_hand_mut(slab)?;
         self.in_turns(images, views.len(), |some, images| {

@@ -122,6 +122,13 @@ pub trait FilteredViews: Sync {
     fn seen(&self, view: usize) -> VoxelView;
 }
 
+/// Weights and filters the first of `images`, those of some views.
+pub(super) fn filter(work: &dyn FilteredViews, views: &[usize], images: &mut Array3<f32>) {
+    parallel::over(images.axis_iter_mut(Axis(0)).zip(views), |_, (image, &view)| {
+        work.filter(view, image.into_slice().unwrap_or_else(|| unreachable!("images are contiguous")));
+    });
+}
+
 /// The weights of a view's pixels before the ramp filter: `columns[c]·(corner + c·u + r·v)·normal/|corner + c·u + r·v|`.
 pub struct RowWeights {
     /// Factor of each column.

@@ -258,7 +258,11 @@ impl Iterative for Built {
         space.pass(self.data.scratch(header));
         // If a stage refuses the grid, the run is refused and needs no memory.
         if let Some((expansion, grid)) = self.expansion(header.volume) {
+            let coefficients: u64 = expansion.coefficients().shape.iter().map(|n| *n as u64).product();
             let _ = space.volume().and_then(|start| Arrays::new(self, expansion, &grid, &space, start, true));
+            if !self.shared.scene.bounds.regions.is_empty() {
+                space.hold(coefficients.saturating_mul(2 * size_of::<f32>() as u64));
+            }
         }
         self.shared.price(&space, self.subsets)
     }

@@ -9,6 +9,7 @@ use conefield_core::place::Bounds;
 use conefield_core::scene::{BoundsSettings, RegionSettings};
 use conefield_core::support::Support;
 use ndarray::{Array3, Axis};
+use std::sync::Arc;
 
 /// Regions with bounds of their own, in 1/mm.
 #[derive(Default)]
@@ -30,7 +31,9 @@ impl Regions {
             Ok(support.map(|support| (support, region.in_mm(job.scan.unit.mm))))
         };
         let all = settings.regions.iter().enumerate().filter_map(|region_of| region(region_of).transpose());
-        Ok(Self { all: all.collect::<Result<_>>()?, support: support.cloned() })
+        let all: Vec<_> = all.collect::<Result<_>>()?;
+        let support = support.filter(|_| !all.is_empty()).cloned();
+        Ok(Self { all, support })
     }
 
     /// Whether there are none.
@@ -53,7 +56,7 @@ impl Regions {
     }
 
     /// Lower and upper bounds of all voxels of `grid`, in standard order.
-    pub fn on(&self, grid: &VoxelGrid, bounds: Bounds) -> [Vec<f32>; 2] {
+    pub fn on(&self, grid: &VoxelGrid, bounds: Bounds) -> Arc<[Vec<f32>; 2]> {
         let [low, high] = [bounds.low, bounds.high].map(|x| Array3::from_elem(grid.shape, x));
         let (mut low, mut high) = (low, high);
         let planes = low.axis_iter_mut(Axis(0)).zip(high.axis_iter_mut(Axis(0)));
@@ -63,11 +66,15 @@ impl Regions {
                 (*low, high[[y, z]]) = (here.low, here.high);
             }
         });
-        [low, high].map(|x| x.into_raw_vec_and_offset().0)
+        Arc::new([low, high].map(|x| x.into_raw_vec_and_offset().0))
     }
 
     /// Clips `x`, whose numbers are `factor` times attenuation in 1/mm.
     pub fn clip(&self, x: &mut Array3<f32>, grid: &VoxelGrid, bounds: Bounds, factor: f32) {
+        if self.is_empty() {
+            let bounds = Bounds { low: bounds.low * factor, high: bounds.high * factor };
+            return x.par_mapv_inplace(|x| bounds.clip(x));
+        }
         parallel::over(x.axis_iter_mut(Axis(0)), |i, mut plane| {
             for ((j, k), x) in plane.indexed_iter_mut() {
                 let Bounds { low, high } = self.at(grid.voxel([i, j, k]), bounds);

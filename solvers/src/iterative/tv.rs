@@ -20,6 +20,7 @@ use conefield_core::wgsl::Fragment;
 use ndarray::ArrayView3;
 use rayon::prelude::*;
 use std::ops::Range;
+use std::sync::Arc;
 
 /// Weights of differences along x, y, z.
 pub fn anisotropy(grid: &VoxelGrid) -> [f32; 3] {
@@ -155,7 +156,7 @@ pub struct TvProx {
     g: [f32; 3],
     bounds: Bounds,
     /// The bounds of each voxel, if they differ.
-    each: Option<[Vec<f32>; 2]>,
+    each: Option<Arc<[Vec<f32>; 2]>>,
     /// The dual variable along x, y and z; with edges or a limited arc it is `D·A·p`.
     dual: [Array; 3],
     /// Edges across which slopes cost less.
@@ -189,7 +190,7 @@ impl TvProx {
     }
 
     /// Gives each voxel bounds within those of [`TvProx::confine`].
-    pub fn confine_each(&mut self, bounds: [Vec<f32>; 2]) {
+    pub fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) {
         self.each = Some(bounds);
     }
 
@@ -935,7 +936,7 @@ mod tests {
                 let turn: f32 = (0..3).map(|k| (behind(k) - here(k)) * g[k] * tau).sum();
                 let here = bounds.clip(v[at] - turn);
                 let index = (at[0] * shape[1] + at[1]) * shape[2] + at[2];
-                each.as_ref().map_or(here, |[low, high]| here.max(low[index]).min(high[index]))
+                each.as_ref().map_or(here, |each| here.max(each[0][index]).min(each[1][index]))
             })
         };
         let bound = 4.0 * g.iter().map(|g| g * g).sum::<f32>();
@@ -987,7 +988,7 @@ mod tests {
                     if directional != limited {
                         let low: Vec<f32> = (0..v.len()).map(|i| 0.02 + 0.3 * (i % 3) as f32).collect();
                         let high = low.iter().enumerate().map(|(i, low)| low + 0.1 * (i % 2) as f32).collect();
-                        made.confine_each([low, high]);
+                        made.confine_each(Arc::new([low, high]));
                     }
                     made
                 };

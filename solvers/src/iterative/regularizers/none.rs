@@ -10,6 +10,7 @@ use ndarray::ArrayView3;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Settings of `none`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -46,7 +47,7 @@ impl Regularizer for Nonnegative {
 struct On {
     bounds: Bounds,
     /// The bounds of each coefficient, if they differ.
-    each: Option<[Vec<f32>; 2]>,
+    each: Option<Arc<[Vec<f32>; 2]>>,
     /// Its part of a volume that several processes share.
     slab: Option<Slab>,
 }
@@ -76,7 +77,7 @@ impl Penalty for On {
         Ok(())
     }
 
-    fn confine_each(&mut self, bounds: [Vec<f32>; 2]) -> Result<()> {
+    fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
         self.each = Some(bounds);
         Ok(())
     }

@@ -155,7 +155,7 @@ impl Penalty for On {
         self.parts.iter_mut().try_for_each(|part| part.penalty.confine(bounds))
     }
 
-    fn confine_each(&mut self, bounds: [Vec<f32>; 2]) -> Result<()> {
+    fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
         self.parts.iter_mut().try_for_each(|part| part.penalty.confine_each(bounds.clone()))
     }
 

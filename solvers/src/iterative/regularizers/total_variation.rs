@@ -9,6 +9,7 @@ use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Settings of `total-variation`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -138,7 +139,7 @@ impl Penalty for On {
         Ok(())
     }
 
-    fn confine_each(&mut self, bounds: [Vec<f32>; 2]) -> Result<()> {
+    fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
         self.prox.confine_each(bounds);
         Ok(())
     }
