@@ -57,6 +57,7 @@ fn the_tally_is_what_a_run_takes() {
         with(
             "type = \"fista\"\nprior = { type = \"sum\", priors = [\"total-variation\", \"directional-total-variation\"] }\n",
         ),
+        with("type = \"fista\"\nprior.type = \"patches\"\n"),
         with(&format!("{tv}subsets = 1\nair = false\ndata.type = \"least-squares\"\n")),
     ] {
         let spec = parse(&text, "test.toml", &[], &[]).unwrap().spec;

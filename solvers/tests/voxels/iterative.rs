@@ -11,7 +11,7 @@ use conefield_projectors::simulate::{ellipsoids, scan_ellipsoids};
 use std::sync::Arc;
 
 /// Types with settings that suit 24 views.
-const ALL: [(&str, &str); 11] = [
+const ALL: [(&str, &str); 12] = [
     ("sart", ""),
     ("os-sart", "subsets = 6"),
     ("sirt", ""),
@@ -23,6 +23,7 @@ const ALL: [(&str, &str); 11] = [
     ("fista-tv", "subsets = 6\nprior.weight = { fixed = 0.1 }"),
     ("fista", "subsets = 6\nprior = { type = \"directional-total-variation\", weight = { fixed = 0.1 } }"),
     ("fista", SUM),
+    ("fista", "subsets = 6\nprior = { type = \"patches\", weight = { fixed = 0.1 } }"),
 ];
 
 /// A sum of two priors, one of which adapts.

@@ -37,6 +37,7 @@ fn methods() -> Vec<Value> {
         json!({"type": "asd-pocs", "stop": {"passes": 3}}),
         fista(json!("none")),
         fista(json!("total-variation")),
+        fista(json!("patches")),
         fista(json!({"type": "sum", "priors": ["total-variation", "directional-total-variation"]})),
         samples,
     ]

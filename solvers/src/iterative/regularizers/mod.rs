@@ -2,10 +2,12 @@
 
 pub mod directional_total_variation;
 pub mod none;
+pub mod patches;
 pub mod sum;
 pub mod total_variation;
 
 pub use directional_total_variation::DirectionalTotalVariation;
 pub use none::Nonnegative;
+pub use patches::Patches;
 pub use sum::Sum;
 pub use total_variation::TotalVariation;
