@@ -150,7 +150,7 @@ fn settings_out_of_range_are_named() {
         ("fista-tv", "prior.weight = { noise = -1.0 }", "prior.weight"),
         ("fista-tv", "prior.weight = 3.0", "prior.weight"),
         ("fista", "prior = { type = \"directional-total-variation\", strength = 1.0 }", "prior.strength"),
-        ("fista", "prior = { type = \"patches\", radius = 8 }", "prior.radius"),
+        ("fista", "prior = { type = \"patches\", radius = 7 }", "prior.radius"),
         ("fista", "prior = { type = \"patches\", large = 0.0 }", "prior.large"),
         ("fista", "prior = { type = \"directional-total-variation\", edge = 0.0 }", "prior.edge"),
         ("fista", "prior = { type = \"sum\", priors = [] }", "prior.priors"),
