@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# What each part of smooth-tv is worth, and what Gaussians add to it:
+# What each part of smooth-tv is worth, and what similar patches and Gaussians add to it:
 #   bash benches/smooth-tv.sh DATA_FOLDER OUT_FOLDER [VARIANTS [SEEDS [VOLUMES [VIEWS]]]]
-# VARIANTS: total-variation along-edges merged shipped three-from-144 three-from-128 (the default: all of these), gaussians,
-# smooth-gaussians. Each runs on VIEWS (50) noisy views of each of VOLUMES; each of SEEDS ("0") is another noise. Prints mean and
+# VARIANTS: total-variation along-edges merged shipped three-from-144 three-from-128 (the default: all of these), smooth-patches,
+# gaussians, smooth-gaussians. Each runs on VIEWS (50) noisy views of each of VOLUMES; each of SEEDS ("0") is another noise. Prints mean and
 # half the range of PSNR, the mean of ssim_2d and the longest time. Passes and steps are counted, not timed: other work on the
 # machine changes nothing but the seconds. An interrupted run continues.
 set -euo pipefail
@@ -53,7 +53,7 @@ for volume in $volumes; do
                 shipped) sets=() ;;
                 three-from-144) sets=() && three 144 7 176 8 208 10 ;;
                 three-from-128) sets=() && three 128 8 168 8 208 12 ;;
-                gaussians | smooth-gaussians) sets=() && spec=$variant ;;
+                smooth-patches | gaussians | smooth-gaussians) sets=() && spec=$variant ;;
                 *) echo "$variant: no such variant" >&2 && exit 2 ;;
             esac
             "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --spec "$spec" "${sets[@]/#/--set=}" >/dev/null

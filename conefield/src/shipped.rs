@@ -26,6 +26,7 @@ pub const SHIPPED: &[Shipped] = shipped! {
     "sirt"
     "fista-tv"
     "smooth-tv"
+    "smooth-patches"
     "limited-angle"
     "smooth-gaussians"
     "gaussians"
