@@ -3,6 +3,7 @@
 use conefield_core::place::Peers;
 use conefield_core::{Error, Result};
 use mpi::Threading;
+use mpi::collective::SystemOperation;
 use mpi::datatype::{Partition, PartitionMut};
 use mpi::environment::Universe;
 use mpi::topology::SimpleCommunicator;
@@ -55,30 +56,44 @@ impl Peers for World {
         self.count
     }
 
+    /// In rounds: MPI counts with 32 bits, and a part may be a plane for each of many processes.
     fn exchange(&self, out: &[Vec<f32>], into: &mut [Vec<f32>]) {
-        let (counts, starts) = layout(out);
-        let flat = out.concat();
-        let (their_counts, their_starts) = layout(into);
-        let mut found = vec![0.0f32; into.iter().map(Vec::len).sum()];
-        SimpleCommunicator::world().all_to_all_varcount_into(
-            &Partition::new(&flat[..], counts, starts),
-            &mut PartitionMut::new(&mut found[..], their_counts, their_starts),
-        );
-        let mut rest = &found[..];
-        for into in into {
-            let (part, others) = rest.split_at(into.len());
-            into.copy_from_slice(part);
-            rest = others;
+        let world = SimpleCommunicator::world();
+        let longest = out.iter().chain(&*into).map(Vec::len).max().unwrap_or(0) as u64;
+        let mut rounds = 0u64;
+        world.all_reduce_into(&longest.div_ceil(ROUND as u64), &mut rounds, SystemOperation::max());
+        for round in 0..rounds as usize {
+            let piece = |length: usize| (round * ROUND).min(length)..((round + 1) * ROUND).min(length);
+            let pieces: Vec<&[f32]> = out.iter().map(|part| &part[piece(part.len())]).collect();
+            let (counts, starts) = layout(pieces.iter().map(|piece| piece.len()));
+            let flat = pieces.concat();
+            let (their_counts, their_starts) = layout(into.iter().map(|part| piece(part.len()).len()));
+            let mut found = vec![0.0f32; their_counts.iter().map(|n| *n as usize).sum()];
+            world.all_to_all_varcount_into(
+                &Partition::new(&flat[..], counts, starts),
+                &mut PartitionMut::new(&mut found[..], their_counts, their_starts),
+            );
+            let mut rest = &found[..];
+            for into in &mut *into {
+                let own = piece(into.len());
+                let into = &mut into[own];
+                let (part, others) = rest.split_at(into.len());
+                into.copy_from_slice(part);
+                rest = others;
+            }
         }
     }
 }
 
+/// Numbers of a part in one round: with up to 2000 processes their sum fits into 32 bits.
+const ROUND: usize = 1 << 20;
+
 /// Lengths and starts of parts that follow each other.
-fn layout(parts: &[Vec<f32>]) -> (Vec<i32>, Vec<i32>) {
+fn layout(lengths: impl Iterator<Item = usize>) -> (Vec<i32>, Vec<i32>) {
     let mut end = 0;
-    let lengths = parts.iter().map(|part| i32::try_from(part.len()).unwrap_or(i32::MAX));
     lengths
         .map(|length| {
+            let length = length as i32;
             end += length;
             (length, end - length)
         })
