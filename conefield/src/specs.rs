@@ -82,9 +82,10 @@ mod tests {
         }
     }
 
-    /// A chain cannot contain a chain, so `smooth-gaussians` repeats the methods of `smooth-tv`.
+    /// A chain cannot contain a chain, so `smooth-gaussians` repeats the methods of `smooth-tv`, and `smooth-patches` all but
+    /// two priors.
     #[test]
-    fn smooth_gaussians_starts_with_the_methods_of_smooth_tv() {
+    fn specs_repeat_the_methods_of_smooth_tv() {
         let methods = |name| {
             let spec = serde_json::to_value(&read(name, &[]).unwrap().spec).unwrap();
             spec["methods"].as_array().unwrap().clone()
@@ -92,6 +93,9 @@ mod tests {
         let [tv, all] = ["smooth-tv", "smooth-gaussians"].map(methods);
         assert_eq!((tv.len(), all.len()), (3, 4));
         assert_eq!(tv, all[..3]);
+        let mut patches = methods("smooth-patches");
+        (1..3).for_each(|k| patches[k]["prior"] = tv[k]["prior"].clone());
+        assert_eq!(tv, patches);
     }
 
     #[test]
