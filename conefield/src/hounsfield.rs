@@ -57,7 +57,7 @@ pub fn water(energy: f64) -> Option<f64> {
 #[derive(Debug, Clone, PartialEq)]
 pub enum How {
     /// Water and air, each given or measured.
-    Levels([Level; 2]),
+    Levels([KnownValue; 2]),
     /// Water at this energy in keV; air is 0.
     Energy(f64),
     /// A file with both.
@@ -68,7 +68,7 @@ pub enum How {
 
 /// The attenuation of a material.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Level {
+pub enum KnownValue {
     /// This value, in 1/mm.
     Given(f64),
     /// The median of the voxels in a region.
@@ -125,7 +125,7 @@ impl FromStr for How {
     }
 }
 
-impl FromStr for Level {
+impl FromStr for KnownValue {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -176,7 +176,7 @@ const LONGEST: u64 = 1 << 16;
 #[derive(Debug)]
 pub struct Calibration {
     /// `None`: the values are Hounsfield units already.
-    levels: Option<[Level; 2]>,
+    levels: Option<[KnownValue; 2]>,
     unit: Option<Unit>,
     place: String,
     /// What the header adds, e.g. the energy.
@@ -243,24 +243,24 @@ impl How {
                 remark = format!(" at {energy} keV");
                 let expected = format!("{} to {} keV", WATER[0].0, WATER[20].0);
                 let water = water(*energy).ok_or_else(|| Error::invalid(FIELD, "energy", energy, expected))?;
-                Some([water, 0.0].map(Level::Given))
+                Some([water, 0.0].map(KnownValue::Given))
             }
             Self::File(path) => {
                 let CalibrationFile { water, air, energy_kev } = read(path)?;
                 remark = energy_kev.map_or(String::new(), |e| format!(" at {e} keV"));
-                Some([water, air].map(Level::Given))
+                Some([water, air].map(KnownValue::Given))
             }
         };
         for level in levels.iter().flatten() {
             match level {
-                Level::Given(_) => {
+                KnownValue::Given(_) => {
                     let relative = unit.filter(|u| !u.is_length());
                     let expected =
                         "a unit of length, such as mm (or water and air both measured in regions, which need none)";
                     let found = relative.map_or("", |u| &u.name);
                     ensure(relative.is_none(), place, "unit", format!("\"{found}\""), expected)?;
                 }
-                Level::Median(region) => {
+                KnownValue::Median(region) => {
                     let some = planes(grid).flat_map(|p| voxels_of(&p)).any(|v| region.holds(at(grid, affine, v)));
                     let last = grid.shape.map(|n| n - 1);
                     let [a, b] = [[0; 3], last].map(|v| at(grid, affine, v));
@@ -293,8 +293,8 @@ impl Calibration {
         let mut found = [0.0; 2];
         for (found, level) in found.iter_mut().zip(levels) {
             *found = match level {
-                Level::Given(mu) => mu * mm,
-                Level::Median(region) => median_in(voxels, region)?,
+                KnownValue::Given(mu) => mu * mm,
+                KnownValue::Median(region) => median_in(voxels, region)?,
             };
         }
         let [water, air] = found;
@@ -302,7 +302,7 @@ impl Calibration {
         let expected = "water that attenuates more than air";
         ensure(good, &self.place, FIELD, format!("water {water} and air {air}"), expected)?;
         let unit = self.unit.as_ref().map_or("mm", |u| &u.name);
-        let measured = levels.iter().any(|l| matches!(l, Level::Median(_)));
+        let measured = levels.iter().any(|l| matches!(l, KnownValue::Median(_)));
         let unit = if measured && self.unit.is_none() { String::new() } else { format!(" per {unit}") };
         let (short, remark) = (|x: f64| x as f32, &self.remark);
         Ok(Levels { water, air, note: format!("HU: water {}, air {}{unit}{remark}", short(water), short(air)) })

@@ -45,7 +45,7 @@ conefield_core::stage_type!(
 
 impl EncoderSpec for BSplineGrid {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(Levels::<Level>::new(self)?))
+        Ok(Box::new(Levels::<SplineLevel>::new(self)?))
     }
 }
 
@@ -53,12 +53,12 @@ impl EncoderSpec for BSplineGrid {
 const TAPS: usize = 4;
 
 #[derive(Debug, Clone)]
-struct Level {
+struct SplineLevel {
     /// Cells per side.
     cells: u32,
 }
 
-impl Level {
+impl SplineLevel {
     /// Coefficients per side.
     fn side(&self) -> usize {
         self.cells as usize + TAPS - 1
@@ -142,7 +142,7 @@ fn add<S: Simd, R: Real, const F: usize>(
     }
 }
 
-impl levels::Level for Level {
+impl levels::Level for SplineLevel {
     type Settings = BSplineGrid;
     type Located<R: Real> = Located<R>;
 
@@ -288,7 +288,7 @@ mod tests {
     use super::*;
     use conefield_core::stage::{Kernel, Stage, TileMut};
 
-    type BSplineGridStage = Levels<Level>;
+    type BSplineGridStage = Levels<SplineLevel>;
 
     /// Splines sum to 1 and reproduce a straight line: coefficient `c` is at cell `c − 1`.
     #[test]

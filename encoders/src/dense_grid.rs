@@ -46,18 +46,18 @@ conefield_core::stage_type!(
 
 impl EncoderSpec for DenseGrid {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(Levels::<Level>::new(self)?))
+        Ok(Box::new(Levels::<DenseLevel>::new(self)?))
     }
 }
 
 #[derive(Debug, Clone)]
-struct Level {
+struct DenseLevel {
     grid: Grid,
     /// From the first corner of a cell to the others.
     offsets: [usize; 8],
 }
 
-impl levels::Level for Level {
+impl levels::Level for DenseLevel {
     type Settings = DenseGrid;
     type Located<R: Real> = Located<R>;
 
@@ -161,7 +161,7 @@ mod tests {
     use super::*;
     use conefield_core::stage::{Kernel, Stage, TileMut};
 
-    type DenseGridStage = Levels<Level>;
+    type DenseGridStage = Levels<DenseLevel>;
 
     #[test]
     fn vertices_have_the_stated_shape_and_place() {

@@ -139,13 +139,13 @@ fn sin_cos_turns<S: Simd, R: Real>(s: S, t: V<S, R>) -> (V<S, R>, V<S, R>) {
     (sin, minus.select(zero - cos, cos))
 }
 
-struct Forward<'a, R> {
+struct FrequencyForward<'a, R> {
     stage: &'a FrequencyStage,
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real> Op for Forward<'_, R> {
+impl<R: Real> Op for FrequencyForward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -171,14 +171,14 @@ impl<R: Real> Op for Forward<'_, R> {
     }
 }
 
-struct Backward<'a, R> {
+struct FrequencyBackward<'a, R> {
     stage: &'a FrequencyStage,
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     dx: TileMut<'a, R>,
 }
 
-impl<R: Real> Op for Backward<'_, R> {
+impl<R: Real> Op for FrequencyBackward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -207,7 +207,7 @@ impl<R: Real> Op for Backward<'_, R> {
 
 impl<R: Real> Kernel<R> for FrequencyStage {
     fn forward(&self, _: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, x, y });
+        run(FrequencyForward { stage: self, x, y });
     }
 
     fn backward(
@@ -220,7 +220,7 @@ impl<R: Real> Kernel<R> for FrequencyStage {
         dx: Option<TileMut<'_, R>>,
     ) {
         if let Some(dx) = dx {
-            run(Backward { stage: self, x, dy, dx });
+            run(FrequencyBackward { stage: self, x, dy, dx });
         }
     }
 }

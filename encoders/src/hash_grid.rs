@@ -74,7 +74,7 @@ conefield_core::stage_type!(
 
 impl EncoderSpec for HashGrid {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(Levels::<Level>::new(self)?))
+        Ok(Box::new(Levels::<HashLevel>::new(self)?))
     }
 }
 
@@ -82,7 +82,7 @@ impl EncoderSpec for HashGrid {
 const FINEST: f64 = 8_388_608.0;
 
 #[derive(Debug, Clone)]
-struct Level {
+struct HashLevel {
     /// `pos = x·scale + 0.5`.
     scale: f64,
     /// Vertices per side.
@@ -270,7 +270,7 @@ fn scatter<S: Simd, R: Real, const F: usize, const DENSE: bool>(
     }
 }
 
-impl levels::Level for Level {
+impl levels::Level for HashLevel {
     type Settings = HashGrid;
     type Located<R: Real> = Located<R>;
 
@@ -451,9 +451,9 @@ mod tests {
     use conefield_core::simd::{Op, run};
     use conefield_core::stage::{Grads, Kernel, Stage, TileMut};
 
-    type HashGridStage = Levels<Level>;
+    type HashGridStage = Levels<HashLevel>;
 
-    struct Locate<'a, R>(&'a mut Located<R>, &'a Level, Tile<'a, R>);
+    struct Locate<'a, R>(&'a mut Located<R>, &'a HashLevel, Tile<'a, R>);
     impl<R: Real> Op for Locate<'_, R> {
         type Number = R;
         type Out = ();
@@ -464,7 +464,7 @@ mod tests {
     }
 
     /// The published index, in exact arithmetic.
-    fn index(level: &Level, primes: [u64; 3], c: [u64; 3]) -> u64 {
+    fn index(level: &HashLevel, primes: [u64; 3], c: [u64; 3]) -> u64 {
         if level.dense {
             let s = u64::from(level.side);
             c[0] + s * (c[1] + s * c[2])

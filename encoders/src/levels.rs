@@ -247,7 +247,7 @@ fn by_level<L>(parts: &[Part<L>]) -> impl Iterator<Item = &[Part<L>]> {
     parts.chunk_by(|a, b| a.number == b.number)
 }
 
-struct Forward<'a, L: Level, R> {
+struct LevelsForward<'a, L: Level, R> {
     stage: &'a Levels<L>,
     parts: &'a [Part<L>],
     params: &'a [R],
@@ -255,7 +255,7 @@ struct Forward<'a, L: Level, R> {
     y: TileMut<'a, R>,
 }
 
-impl<L: Level, R: Real> Forward<'_, L, R> {
+impl<L: Level, R: Real> LevelsForward<'_, L, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = L::Located::default();
@@ -275,7 +275,7 @@ impl<L: Level, R: Real> Forward<'_, L, R> {
     }
 }
 
-struct Backward<'a, L: Level, R> {
+struct LevelsBackward<'a, L: Level, R> {
     stage: &'a Levels<L>,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -284,7 +284,7 @@ struct Backward<'a, L: Level, R> {
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<L: Level, R: Real> Backward<'_, L, R> {
+impl<L: Level, R: Real> LevelsBackward<'_, L, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = L::Located::default();
@@ -341,12 +341,12 @@ macro_rules! by_features {
         }
     };
 }
-by_features!(Forward);
-by_features!(Backward);
+by_features!(LevelsForward);
+by_features!(LevelsBackward);
 
 impl<L: Level, R: Real> Kernel<R> for Levels<L> {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, parts: &self.parts, params, x, y });
+        run(LevelsForward { stage: self, parts: &self.parts, params, x, y });
     }
 
     fn passes(&self) -> usize {
@@ -355,7 +355,7 @@ impl<L: Level, R: Real> Kernel<R> for Levels<L> {
 
     fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
         let parts = by_level(&self.parts).nth(pass).unwrap_or_default();
-        run(Forward { stage: self, parts, params, x, y });
+        run(LevelsForward { stage: self, parts, params, x, y });
     }
 
     fn backward(
@@ -367,7 +367,7 @@ impl<L: Level, R: Real> Kernel<R> for Levels<L> {
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(Backward { stage: self, params, x, dy, grads, dx });
+        run(LevelsBackward { stage: self, params, x, dy, grads, dx });
     }
 }
 

@@ -58,7 +58,7 @@ conefield_core::stage_type!(
 
 impl EncoderSpec for Permutohedral {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(Levels::<Level>::new(self)?))
+        Ok(Box::new(Levels::<SimplexLevel>::new(self)?))
     }
 }
 
@@ -69,7 +69,7 @@ const FINEST: f64 = 4_194_304.0;
 const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861];
 
 #[derive(Debug, Clone)]
-struct Level {
+struct SimplexLevel {
     /// Cells along the cube's side, for a cubic grid with the same number of vertices.
     resolution: f64,
     /// `s` in the formula.
@@ -171,7 +171,7 @@ fn scatter<S: Simd, R: Real, const F: usize>(
     }
 }
 
-impl levels::Level for Level {
+impl levels::Level for SimplexLevel {
     type Settings = Permutohedral;
     type Located<R: Real> = Located<R>;
 
@@ -356,9 +356,9 @@ mod tests {
     use crate::levels::Level as _;
     use conefield_core::simd::{Op, run};
 
-    type PermutohedralStage = Levels<Level>;
+    type PermutohedralStage = Levels<SimplexLevel>;
 
-    struct Locate<'a, R>(&'a mut Located<R>, &'a Level, Tile<'a, R>);
+    struct Locate<'a, R>(&'a mut Located<R>, &'a SimplexLevel, Tile<'a, R>);
     impl<R: Real> Op for Locate<'_, R> {
         type Number = R;
         type Out = ();

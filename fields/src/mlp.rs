@@ -114,7 +114,7 @@ impl MlpStage {
     }
 }
 
-struct Forward<'a, R> {
+struct MlpForward<'a, R> {
     stage: &'a MlpStage,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -128,7 +128,7 @@ fn split<R>(data: &mut [R], range: Range<usize>, rows: usize) -> (&[R], &mut [R]
     (before, &mut rest[..range.len() * rows])
 }
 
-impl<R: Real> Op for Forward<'_, R> {
+impl<R: Real> Op for MlpForward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -154,7 +154,7 @@ impl<R: Real> Op for Forward<'_, R> {
     }
 }
 
-struct Backward<'a, R> {
+struct MlpBackward<'a, R> {
     stage: &'a MlpStage,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -164,7 +164,7 @@ struct Backward<'a, R> {
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real> Op for Backward<'_, R> {
+impl<R: Real> Op for MlpBackward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -212,7 +212,7 @@ impl<R: Real> Op for Backward<'_, R> {
 
 impl<R: Real> Kernel<R> for MlpStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        run(Forward { stage: self, params, x, y, tape });
+        run(MlpForward { stage: self, params, x, y, tape });
     }
 
     fn backward(
@@ -224,7 +224,7 @@ impl<R: Real> Kernel<R> for MlpStage {
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(Backward { stage: self, params, x, tape, dy, grads, dx });
+        run(MlpBackward { stage: self, params, x, tape, dy, grads, dx });
     }
 }
 

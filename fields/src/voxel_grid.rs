@@ -103,14 +103,14 @@ impl VoxelGridStage {
     }
 }
 
-struct Forward<'a, R> {
+struct VoxelGridForward<'a, R> {
     stage: &'a VoxelGridStage,
     params: &'a [R],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
 }
 
-impl<R: Real> Op for Forward<'_, R> {
+impl<R: Real> Op for VoxelGridForward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -130,7 +130,7 @@ impl<R: Real> Op for Forward<'_, R> {
     }
 }
 
-struct Backward<'a, R> {
+struct VoxelGridBackward<'a, R> {
     stage: &'a VoxelGridStage,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -139,7 +139,7 @@ struct Backward<'a, R> {
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real> Op for Backward<'_, R> {
+impl<R: Real> Op for VoxelGridBackward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -187,7 +187,7 @@ impl<R: Real> Op for Backward<'_, R> {
 
 impl<R: Real> Kernel<R> for VoxelGridStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(Forward { stage: self, params, x, y });
+        run(VoxelGridForward { stage: self, params, x, y });
     }
 
     fn backward(
@@ -199,7 +199,7 @@ impl<R: Real> Kernel<R> for VoxelGridStage {
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(Backward { stage: self, params, x, dy, grads, dx });
+        run(VoxelGridBackward { stage: self, params, x, dy, grads, dx });
     }
 }
 

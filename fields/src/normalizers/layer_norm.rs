@@ -82,7 +82,7 @@ fn huge<R: Real>() -> [R; 3] {
     powers.map(|p| R::of(f64::powi(2.0, p)))
 }
 
-struct Forward<'a, R> {
+struct LayerNormForward<'a, R> {
     stage: &'a LayerNormStage,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -90,7 +90,7 @@ struct Forward<'a, R> {
     tape: TileMut<'a, R>,
 }
 
-impl<R: Real> Op for Forward<'_, R> {
+impl<R: Real> Op for LayerNormForward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -132,7 +132,7 @@ impl<R: Real> Op for Forward<'_, R> {
     }
 }
 
-struct Backward<'a, R> {
+struct LayerNormBackward<'a, R> {
     stage: &'a LayerNormStage,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -151,7 +151,7 @@ struct RowMoments<T> {
     scale: T,
 }
 
-impl<R: Real> Backward<'_, R> {
+impl<R: Real> LayerNormBackward<'_, R> {
     #[inline(always)]
     fn found<S: Simd>(&self, s: S, i: usize) -> RowMoments<V<S, R>> {
         let mean = load(s, self.tape.channel(0), i);
@@ -167,7 +167,7 @@ impl<R: Real> Backward<'_, R> {
     }
 }
 
-impl<R: Real> Op for Backward<'_, R> {
+impl<R: Real> Op for LayerNormBackward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -217,7 +217,7 @@ impl<R: Real> Op for Backward<'_, R> {
 
 impl<R: Real> Kernel<R> for LayerNormStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        run(Forward { stage: self, params, x, y, tape });
+        run(LayerNormForward { stage: self, params, x, y, tape });
     }
 
     fn backward(
@@ -230,7 +230,7 @@ impl<R: Real> Kernel<R> for LayerNormStage {
         dx: Option<TileMut<'_, R>>,
     ) {
         let tape = Tile::new(tape.data, tape.rows);
-        run(Backward { stage: self, params, x, tape, dy, grads, dx });
+        run(LayerNormBackward { stage: self, params, x, tape, dy, grads, dx });
     }
 }
 

@@ -86,7 +86,7 @@ impl LevelAttentionStage {
     }
 }
 
-struct Forward<'a, R> {
+struct LevelAttentionForward<'a, R> {
     stage: &'a LevelAttentionStage,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -95,7 +95,7 @@ struct Forward<'a, R> {
     tape: TileMut<'a, R>,
 }
 
-impl<R: Real> Op for Forward<'_, R> {
+impl<R: Real> Op for LevelAttentionForward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -130,7 +130,7 @@ impl<R: Real> Op for Forward<'_, R> {
     }
 }
 
-struct Backward<'a, R> {
+struct LevelAttentionBackward<'a, R> {
     stage: &'a LevelAttentionStage,
     params: &'a [R],
     x: Tile<'a, R>,
@@ -140,7 +140,7 @@ struct Backward<'a, R> {
     dx: Option<TileMut<'a, R>>,
 }
 
-impl<R: Real> Op for Backward<'_, R> {
+impl<R: Real> Op for LevelAttentionBackward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -184,7 +184,7 @@ impl<R: Real> Op for Backward<'_, R> {
 
 impl<R: Real> Kernel<R> for LevelAttentionStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        run(Forward { stage: self, params, x, y, tape });
+        run(LevelAttentionForward { stage: self, params, x, y, tape });
     }
 
     fn backward(
@@ -196,7 +196,7 @@ impl<R: Real> Kernel<R> for LevelAttentionStage {
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(Backward { stage: self, params, x, tape, dy, grads, dx });
+        run(LevelAttentionBackward { stage: self, params, x, tape, dy, grads, dx });
     }
 }
 

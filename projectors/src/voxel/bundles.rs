@@ -169,7 +169,7 @@ pub fn forward<R: Real>(
             let mut bundles = vec![];
             (0..strip.nrows()).for_each(|row| Bundle::of(geometry, [view, row, n * BUNDLE], 0, &mut bundles));
             let mut sums = vec![[R::ZERO; BUNDLE]; strip.nrows()];
-            run(Forward { shape: geometry.volume.shape, voxels, bundles: &bundles, sums: &mut sums });
+            run(BundlesForward { shape: geometry.volume.shape, voxels, bundles: &bundles, sums: &mut sums });
             allowance::trim();
             for (mut row, sums) in strip.rows_mut().into_iter().zip(&sums) {
                 row.iter_mut().zip(sums).for_each(|(out, sum)| *out = *sum);
@@ -179,7 +179,7 @@ pub fn forward<R: Real>(
 }
 
 /// The line integrals of a strip of columns.
-struct Forward<'a, R> {
+struct BundlesForward<'a, R> {
     shape: [usize; 3],
     voxels: &'a [R],
     bundles: &'a [Bundle<R>],
@@ -187,7 +187,7 @@ struct Forward<'a, R> {
     sums: &'a mut [[R; BUNDLE]],
 }
 
-impl<R: Real> Op for Forward<'_, R> {
+impl<R: Real> Op for BundlesForward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]

@@ -222,7 +222,7 @@ pub fn forward<R: Real>(
             // The stride is not a power of two: otherwise rows of many columns would share few cache sets.
             let apart = rows.next_multiple_of(WIDEST) + WIDEST;
             let mut sums = vec![R::ZERO; out.ncols() * apart];
-            run(Forward { shape, voxels, occupied: &lines, columns, first, apart, sums: &mut sums });
+            run(ColumnsForward { shape, voxels, occupied: &lines, columns, first, apart, sums: &mut sums });
             allowance::trim();
             for row in 0..rows {
                 let mut line = out.row_mut(if downwards { rows - 1 - row } else { row });
@@ -233,7 +233,7 @@ pub fn forward<R: Real>(
 }
 
 /// Line integrals of a strip of columns.
-struct Forward<'a, R> {
+struct ColumnsForward<'a, R> {
     shape: [usize; 3],
     voxels: &'a [R],
     occupied: &'a [Range<usize>],
@@ -246,7 +246,7 @@ struct Forward<'a, R> {
     sums: &'a mut [R],
 }
 
-/// The lines of a plane of voxels that a strip may read, in a [`Forward`]'s buffer.
+/// The lines of a plane of voxels that a strip may read, in a [`ColumnsForward`]'s buffer.
 struct Plane<R> {
     number: usize,
     /// Position of line −1 in the buffer.
@@ -262,7 +262,7 @@ impl<R> Plane<R> {
     }
 }
 
-impl<R: Real> Op for Forward<'_, R> {
+impl<R: Real> Op for ColumnsForward<'_, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -337,7 +337,7 @@ fn stride(nz: usize) -> usize {
     nz.next_multiple_of(WIDEST) + 2 * PAD
 }
 
-impl<R: Real> Forward<'_, R> {
+impl<R: Real> ColumnsForward<'_, R> {
     /// q of the rows of a column, and of the ends of its vectors.
     #[inline(always)]
     fn readers<S: Simd>(&self, s: S, c: &Column) -> (Vec<R>, Ends<R>) {

@@ -81,23 +81,23 @@ impl Method for AsdPocs {
 }
 
 impl AsdPocs {
-    fn built(&self) -> Result<Built> {
+    fn built(&self) -> Result<AsdPocsMethod> {
         let (subsets, order) = (self.subsets, Order::Golden);
         let updates = Updates { subsets, relaxation: RELAXATION, decay: DECAY, order, nonnegative: true };
         updates.validate()?;
         let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;
-        Ok(Built { shared, updates, descents: self.descents })
+        Ok(AsdPocsMethod { shared, updates, descents: self.descents })
     }
 }
 
 /// The stages that [`AsdPocs`] builds.
-struct Built {
+struct AsdPocsMethod {
     shared: Shared,
     updates: Updates,
     descents: usize,
 }
 
-impl Iterative for Built {
+impl Iterative for AsdPocsMethod {
     fn kind(&self) -> &'static str {
         "asd-pocs"
     }
@@ -113,7 +113,7 @@ impl Iterative for Built {
         let mut problem = opened.problem(job);
         let sigma = Noise::of(job.scan.projections.view(), false).sigma;
         let space = opened.space(job.scan.header());
-        let mut iterate = Iterate::new(self, &space, self.shared.start(job, &problem, &space)?)?;
+        let mut iterate = AsdPocsIterate::new(self, &space, self.shared.start(job, &problem, &space)?)?;
         iterate.target = sigma * (job.scan.projections.len() as f64).sqrt();
         iterate.sweep.prepare(&problem)?;
         problem.settle()?;
@@ -128,7 +128,7 @@ impl Iterative for Built {
     fn bytes(&self, header: &ScanHeader) -> u64 {
         let space = Space::tally(*header);
         space.pass(noise::scratch(header));
-        let _ = space.volume().and_then(|x| Iterate::new(self, &space, x));
+        let _ = space.volume().and_then(|x| AsdPocsIterate::new(self, &space, x));
         self.shared.price(&space, self.updates.subsets)
     }
 
@@ -137,7 +137,7 @@ impl Iterative for Built {
     }
 }
 
-struct Iterate {
+struct AsdPocsIterate {
     descents: usize,
     sweep: Sweep,
     /// Norm of a residual of pure noise.
@@ -150,8 +150,8 @@ struct Iterate {
     fitted: Array,
 }
 
-impl Iterate {
-    fn new(built: &Built, space: &Space, x: Array) -> Result<Self> {
+impl AsdPocsIterate {
+    fn new(built: &AsdPocsMethod, space: &Space, x: Array) -> Result<Self> {
         Ok(Self {
             descents: built.descents,
             sweep: Sweep::new(built.updates, space, x)?,
@@ -163,7 +163,7 @@ impl Iterate {
     }
 }
 
-impl Iteration for Iterate {
+impl Iteration for AsdPocsIterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         let (grid, place) = (&problem.scan.geometry.volume, problem.place);
         copy(place, &self.sweep.x, &mut self.before)?;

@@ -52,7 +52,7 @@ conefield_core::stage_type!(Method, "cgls", Cgls, "conjugate gradients for least
 impl Method for Cgls {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;
-        Ok(Box::new(IterativePlan(Built { shared, nonnegative: self.nonnegative })))
+        Ok(Box::new(IterativePlan(CglsMethod { shared, nonnegative: self.nonnegative })))
     }
 
     fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
@@ -61,12 +61,12 @@ impl Method for Cgls {
 }
 
 /// The stages that [`Cgls`] builds.
-struct Built {
+struct CglsMethod {
     shared: Shared,
     nonnegative: bool,
 }
 
-impl Iterative for Built {
+impl Iterative for CglsMethod {
     fn kind(&self) -> &'static str {
         "cgls"
     }
@@ -76,12 +76,12 @@ impl Iterative for Built {
     }
 
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
-        least_squares(self, self.nonnegative, job, observer, Iterate::new, Iterate::prepare)
+        least_squares(self, self.nonnegative, job, observer, CglsIterate::new, CglsIterate::prepare)
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
         let space = Space::tally(*header);
-        let _ = space.volume().and_then(|x| Iterate::new(&space, x));
+        let _ = space.volume().and_then(|x| CglsIterate::new(&space, x));
         self.shared.price(&space, Subsets::Count(1))
     }
 
@@ -118,7 +118,7 @@ pub(super) fn least_squares<I: Iteration + 'static>(
     Ok(solution)
 }
 
-struct Iterate {
+struct CglsIterate {
     x: Array,
     /// `p − A·x`.
     residual: Array,
@@ -132,7 +132,7 @@ struct Iterate {
     gamma: f64,
 }
 
-impl Iterate {
+impl CglsIterate {
     fn new(space: &Space, x: Array) -> Result<Self> {
         let views = space.header().views;
         Ok(Self {
@@ -155,7 +155,7 @@ impl Iterate {
     }
 }
 
-impl Iteration for Iterate {
+impl Iteration for CglsIterate {
     fn pass(&mut self, problem: &Problem<'_>, _: u64) -> Result<Pass> {
         let (views, place) = (problem.views(), problem.place);
         let Self { x, residual, direction, ahead, gradient, gamma } = self;

@@ -129,12 +129,12 @@ impl Fista {
         self.built()?.solve(job, observer)
     }
 
-    fn built(&self) -> Result<Built> {
+    fn built(&self) -> Result<FistaMethod> {
         self.subsets.validate()?;
         let pull = self.pull;
         ensure(pull.is_finite() && pull >= 0.0, "spec", "pull", pull, "a finite number, 0 or more")?;
         ensure((1..=64).contains(&self.bin), "spec", "bin", self.bin, "1 to 64")?;
-        Ok(Built {
+        Ok(FistaMethod {
             shared: Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?,
             basis: self.basis.build().map_err(|e| e.within("basis"))?,
             data: self.data.build().map_err(|e| e.within("data"))?,
@@ -150,7 +150,7 @@ impl Fista {
 }
 
 /// The stages that [`Fista`] builds.
-struct Built {
+struct FistaMethod {
     shared: Shared,
     basis: Box<dyn Basis>,
     data: Box<dyn DataTerm>,
@@ -164,7 +164,7 @@ struct Built {
     pull: f64,
 }
 
-impl Built {
+impl FistaMethod {
     /// The basis on voxels of any size; `None` if it refuses the grid.
     fn expansion(&self, volume: [usize; 3]) -> Option<(Box<dyn Expansion>, VoxelGrid)> {
         let grid = VoxelGrid { shape: volume, spacing: [1.0; 3], center: [0.0; 3] };
@@ -172,7 +172,7 @@ impl Built {
     }
 }
 
-impl Iterative for Built {
+impl Iterative for FistaMethod {
     fn kind(&self) -> &'static str {
         "fista"
     }
@@ -213,7 +213,7 @@ impl Iterative for Built {
             arrays.penalty.limited(middle);
         }
         problem.settle()?;
-        let mut iterate = Iterate::new(self, &problem, data, arrays)?;
+        let mut iterate = FistaIterate::new(self, &problem, data, arrays)?;
         observer.note(&iterate.description());
         if problem.place.device().is_some() {
             iterate.elsewhere().into_iter().for_each(|what| {
@@ -304,7 +304,7 @@ type Images<'a> = &'a mut dyn FnMut(&mut Model, &[usize], &mut Array) -> Result<
 impl Arrays {
     /// Arrays for a volume on the grid `voxels`, initially `start`.
     fn new(
-        settings: &Built,
+        settings: &FistaMethod,
         expansion: Box<dyn Expansion>,
         voxels: &VoxelGrid,
         space: &Space,
@@ -453,7 +453,7 @@ struct Factors {
 const PROBES: usize = 3;
 const SAFETY: f64 = 1.15;
 
-struct Iterate {
+struct FistaIterate {
     arrays: Arrays,
     data: Box<dyn Misfit>,
     views: usize,
@@ -475,8 +475,8 @@ struct Iterate {
     misfit: f64,
 }
 
-impl Iterate {
-    fn new(settings: &Built, problem: &Problem<'_>, data: Box<dyn Misfit>, mut arrays: Arrays) -> Result<Self> {
+impl FistaIterate {
+    fn new(settings: &FistaMethod, problem: &Problem<'_>, data: Box<dyn Misfit>, mut arrays: Arrays) -> Result<Self> {
         let views = problem.scan.geometry.views.len();
         let subsets = settings.subsets.of(views);
         let grid = arrays.model.grid();
@@ -553,7 +553,7 @@ impl Iterate {
     }
 }
 
-impl Iteration for Iterate {
+impl Iteration for FistaIterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         let place = problem.place;
         copy(place, &self.arrays.x, &mut self.arrays.before)?;

@@ -58,7 +58,7 @@ impl Method for Lsqr {
         let pull = self.pull;
         ensure(pull.is_finite() && pull >= 0.0, "spec", "pull", pull, "a finite number, 0 or more")?;
         let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;
-        Ok(Box::new(IterativePlan(Built { shared, pull, nonnegative: self.nonnegative })))
+        Ok(Box::new(IterativePlan(LsqrMethod { shared, pull, nonnegative: self.nonnegative })))
     }
 
     fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
@@ -67,13 +67,13 @@ impl Method for Lsqr {
 }
 
 /// The stages that [`Lsqr`] builds.
-struct Built {
+struct LsqrMethod {
     shared: Shared,
     pull: f64,
     nonnegative: bool,
 }
 
-impl Iterative for Built {
+impl Iterative for LsqrMethod {
     fn kind(&self) -> &'static str {
         "lsqr"
     }
@@ -83,13 +83,13 @@ impl Iterative for Built {
     }
 
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
-        let make = |space: &Space, x| Iterate::new(space, x, self.pull);
-        least_squares(self, self.nonnegative, job, observer, make, Iterate::prepare)
+        let make = |space: &Space, x| LsqrIterate::new(space, x, self.pull);
+        least_squares(self, self.nonnegative, job, observer, make, LsqrIterate::prepare)
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
         let space = Space::tally(*header);
-        let _ = space.volume().and_then(|x| Iterate::new(&space, x, self.pull));
+        let _ = space.volume().and_then(|x| LsqrIterate::new(&space, x, self.pull));
         self.shared.price(&space, Subsets::Count(1))
     }
 
@@ -100,7 +100,7 @@ impl Iterative for Built {
 }
 
 /// The vectors u and v of the bidiagonalization are kept unnormalized: normalization is a factor of later sums.
-struct Iterate {
+struct LsqrIterate {
     x: Array,
     /// `β·u`.
     left: Array,
@@ -127,7 +127,7 @@ struct Iterate {
     taken: f64,
 }
 
-impl Iterate {
+impl LsqrIterate {
     fn new(space: &Space, x: Array, pull: f64) -> Result<Self> {
         let views = space.header().views;
         Ok(Self {
@@ -195,7 +195,7 @@ impl Iterate {
     }
 }
 
-impl Iteration for Iterate {
+impl Iteration for LsqrIterate {
     fn pass(&mut self, problem: &Problem<'_>, _: u64) -> Result<Pass> {
         let place = problem.place;
         // An α of 0: the volume solves the problem.

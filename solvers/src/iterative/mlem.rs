@@ -67,7 +67,7 @@ impl Method for Mlem {
     fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
         self.subsets.validate()?;
         let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;
-        Ok(Box::new(IterativePlan(Built { shared, subsets: self.subsets, order: self.order })))
+        Ok(Box::new(IterativePlan(MlemMethod { shared, subsets: self.subsets, order: self.order })))
     }
 
     fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
@@ -76,16 +76,16 @@ impl Method for Mlem {
 }
 
 /// The stages that [`Mlem`] builds.
-struct Built {
+struct MlemMethod {
     shared: Shared,
     subsets: Subsets,
     order: Order,
 }
 
-impl Built {
-    fn iterate(&self, space: &Space, x: Array) -> Result<Iterate> {
+impl MlemMethod {
+    fn iterate(&self, space: &Space, x: Array) -> Result<MlemIterate> {
         let views = space.header().views;
-        Ok(Iterate {
+        Ok(MlemIterate {
             subsets: self.subsets.of(views),
             order: self.order,
             likelihood: Likelihood { least: 0.0 },
@@ -98,7 +98,7 @@ impl Built {
     }
 }
 
-impl Iterative for Built {
+impl Iterative for MlemMethod {
     fn kind(&self) -> &'static str {
         "mlem"
     }
@@ -137,7 +137,7 @@ impl Iterative for Built {
 /// Share of the uniform start to which voxels of a known volume are raised.
 const RAISED: f64 = 1e-3;
 
-struct Iterate {
+struct MlemIterate {
     subsets: Vec<Vec<usize>>,
     order: Order,
     likelihood: Likelihood,
@@ -152,7 +152,7 @@ struct Iterate {
     before: Option<Array>,
 }
 
-impl Iterate {
+impl MlemIterate {
     /// Makes the start positive inside the object's support, and computes the sums that do not change.
     fn prepare(&mut self, problem: &Problem<'_>, known: bool) -> Result<()> {
         let place = problem.place;
@@ -198,7 +198,7 @@ impl Iterate {
     }
 }
 
-impl Iteration for Iterate {
+impl Iteration for MlemIterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         if let Some(before) = &mut self.before {
             copy(problem.place, &self.x, before)?;

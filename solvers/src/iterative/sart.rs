@@ -78,7 +78,7 @@ impl Method for Sart {
 }
 
 impl Sart {
-    fn built(&self) -> Result<Built> {
+    fn built(&self) -> Result<SartMethod> {
         let updates = Updates {
             subsets: self.subsets,
             relaxation: self.relaxation,
@@ -87,7 +87,7 @@ impl Sart {
             nonnegative: self.nonnegative,
         };
         updates.validate()?;
-        Ok(Built { shared: Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?, updates })
+        Ok(SartMethod { shared: Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?, updates })
     }
 }
 
@@ -112,19 +112,19 @@ impl Updates {
 }
 
 /// The stages that [`Sart`] builds.
-struct Built {
+struct SartMethod {
     shared: Shared,
     updates: Updates,
 }
 
-impl Built {
-    fn iterate(&self, space: &Space, x: Array) -> Result<Iterate> {
+impl SartMethod {
+    fn iterate(&self, space: &Space, x: Array) -> Result<SartIterate> {
         let before = self.shared.stop.change.map(|_| space.volume()).transpose()?;
-        Ok(Iterate { before, sweep: Sweep::new(self.updates, space, x)? })
+        Ok(SartIterate { before, sweep: Sweep::new(self.updates, space, x)? })
     }
 }
 
-impl Iterative for Built {
+impl Iterative for SartMethod {
     fn kind(&self) -> &'static str {
         "sart"
     }
@@ -247,13 +247,13 @@ pub(super) fn column_sums(problem: &Problem<'_>, views: &[usize], pixels: &mut A
     invert(problem.place, sums)
 }
 
-struct Iterate {
+struct SartIterate {
     sweep: Sweep,
     /// The volume before a pass, if its change is needed.
     before: Option<Array>,
 }
 
-impl Iteration for Iterate {
+impl Iteration for SartIterate {
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         if let Some(before) = &mut self.before {
             copy(problem.place, &self.sweep.x, before)?;

@@ -4,7 +4,7 @@
 //! the edges come from another image of the object. Here they come from the volume itself and are updated before each
 //! pass.
 
-use super::total_variation::{On, are_equal, halo, is_one, lambda, said, validate, weighted};
+use super::total_variation::{TvPenalty, are_equal, halo, is_one, lambda, said, validate, weighted};
 use crate::iterative::edges::Edges;
 use crate::iterative::tv::TvProx;
 use conefield_core::error::{Result, ensure};
@@ -64,7 +64,7 @@ impl Regularizer for DirectionalTotalVariation {
         let g = weighted(grid, self.weights);
         let edges = Edges::new(grid.shape, self.strength as f32, self.edge, space)?;
         let prox = TvProx::new(grid.shape, g, space)?.with_edges(edges);
-        Ok(Box::new(On { prox, inner: self.inner, arc: self.arc }))
+        Ok(Box::new(TvPenalty { prox, inner: self.inner, arc: self.arc }))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {

@@ -27,7 +27,7 @@ impl RegularizerSpec for Nonnegative {
 
 impl Regularizer for Nonnegative {
     fn on(&self, _: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
-        Ok(Box::new(On { bounds: Bounds::default(), each: None, slab: None }))
+        Ok(Box::new(BoundsPenalty { bounds: Bounds::default(), each: None, slab: None }))
     }
 
     fn halo(&self) -> Option<usize> {
@@ -44,7 +44,7 @@ impl Regularizer for Nonnegative {
 }
 
 /// The bounds alone.
-struct On {
+struct BoundsPenalty {
     bounds: Bounds,
     /// The bounds of each coefficient, if they differ.
     each: Option<Arc<[Vec<f32>; 2]>>,
@@ -52,7 +52,7 @@ struct On {
     slab: Option<Slab>,
 }
 
-impl Penalty for On {
+impl Penalty for BoundsPenalty {
     fn value(&self, _: ArrayView3<'_, f32>) -> f64 {
         0.0
     }

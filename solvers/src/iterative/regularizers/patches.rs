@@ -79,7 +79,7 @@ impl RegularizerSpec for Patches {
 }
 
 impl Patches {
-    fn penalty(&self, grid: &VoxelGrid, space: &Space) -> Result<On> {
+    fn penalty(&self, grid: &VoxelGrid, space: &Space) -> Result<PatchesPenalty> {
         let voxels: usize = grid.shape.iter().product();
         let expected = format!("at most {}: `patches` numbers them with 32 bits", u32::MAX);
         ensure(u32::try_from(voxels).is_ok(), "scan", "volume", format!("{voxels} voxels"), expected)?;
@@ -91,8 +91,16 @@ impl Patches {
             true => (vec![], vec![]),
             false => (lattice.all().map(|at| [at; MANY]).collect(), vec![u8::MAX; count * SIZE]),
         };
-        let mut on =
-            On { settings: *self, lattice, groups: vec![], limits, dual, sum, bounds: Bounds::default(), each: None };
+        let mut on = PatchesPenalty {
+            settings: *self,
+            lattice,
+            groups: vec![],
+            limits,
+            dual,
+            sum,
+            bounds: Bounds::default(),
+            each: None,
+        };
         on.regroup(first);
         Ok(on)
     }
@@ -174,7 +182,7 @@ struct Similar {
 }
 
 /// Similar patches on one grid.
-struct On {
+struct PatchesPenalty {
     settings: Patches,
     lattice: Lattice,
     groups: Vec<Similar>,
@@ -189,7 +197,7 @@ struct On {
     each: Option<Arc<[Vec<f32>; 2]>>,
 }
 
-impl On {
+impl PatchesPenalty {
     /// Replaces the groups. The dual starts anew, since it belongs to those of before.
     fn regroup(&mut self, groups: Vec<[u32; MANY]>) {
         let Self { lattice: Lattice { offsets, .. }, sum, .. } = self;
@@ -271,7 +279,7 @@ impl On {
     }
 }
 
-impl Penalty for On {
+impl Penalty for PatchesPenalty {
     fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
         let x = x.as_standard_layout();
         let Some(x) = x.as_slice() else { return f64::NAN };
@@ -552,7 +560,7 @@ mod tests {
     use std::collections::BTreeSet;
     use std::f32::consts::PI;
 
-    fn on(shape: [usize; 3], settings: Patches) -> On {
+    fn on(shape: [usize; 3], settings: Patches) -> PatchesPenalty {
         let grid = VoxelGrid { shape, spacing: [1.0; 3], center: [0.0; 3] };
         let header = ScanHeader { views: 0, detector: [0; 2], volume: shape };
         settings.penalty(&grid, &Space::new(header, Arc::new(Host))).unwrap()
@@ -572,7 +580,7 @@ mod tests {
         Array3::from_shape_fn(shape, |(x, _, _)| f32::from(u8::from(2 * x >= shape[0]))) + 0.3 * noise(shape, 7)
     }
 
-    fn prox(on: &mut On, v: &Array3<f32>, tau: f32) -> Array3<f32> {
+    fn prox(on: &mut PatchesPenalty, v: &Array3<f32>, tau: f32) -> Array3<f32> {
         let mut u = Array3::zeros(v.dim());
         on.prox(v.as_slice().unwrap(), tau, u.as_slice_mut().unwrap());
         u

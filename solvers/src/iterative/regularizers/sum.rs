@@ -51,16 +51,16 @@ impl RegularizerSpec for Sum {
             prior.build().map_err(|e| e.within(&place))
         };
         let parts = self.priors.iter().map(AsRef::as_ref).enumerate().map(build).collect::<Result<_>>()?;
-        Ok(Box::new(Built { parts, turns: self.turns }))
+        Ok(Box::new(SumRegularizer { parts, turns: self.turns }))
     }
 }
 
-struct Built {
+struct SumRegularizer {
     parts: Vec<Box<dyn Regularizer>>,
     turns: usize,
 }
 
-impl Regularizer for Built {
+impl Regularizer for SumRegularizer {
     /// It runs on the host, and so do its parts.
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         let header = *space.header();
@@ -75,7 +75,7 @@ impl Regularizer for Built {
         let parts = self.parts.iter().map(AsRef::as_ref).enumerate().map(part).collect::<Result<_>>()?;
         let work = host.on_host(count);
         space.hold(host.bytes());
-        Ok(Box::new(On { parts, work, turns: self.turns }))
+        Ok(Box::new(SumPenalty { parts, work, turns: self.turns }))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
@@ -106,7 +106,7 @@ struct Part {
     names: Vec<String>,
 }
 
-struct On {
+struct SumPenalty {
     parts: Vec<Part>,
     /// The argument of a part's proximal map.
     work: Vec<f32>,
@@ -118,7 +118,7 @@ fn is_outside(v: f32) -> bool {
     v == f32::MIN
 }
 
-impl Penalty for On {
+impl Penalty for SumPenalty {
     fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
         self.parts.iter().map(|part| part.share * part.penalty.value(x)).sum()
     }
@@ -224,7 +224,8 @@ mod tests {
         let part = || Box::new(Foreign(vec![])) as Box<dyn Regularizer>;
         let grid = VoxelGrid { shape: [2; 3], spacing: [1.0; 3], center: [0.0; 3] };
         let header = ScanHeader { views: 2, detector: [2; 2], volume: [2; 3] };
-        let mut sum = Built { parts: vec![part(), part()], turns: 1 }.on(&grid, &Space::tally(header)).unwrap();
+        let mut sum =
+            SumRegularizer { parts: vec![part(), part()], turns: 1 }.on(&grid, &Space::tally(header)).unwrap();
         let names: BTreeSet<&str> = sum.state().into_iter().map(|(name, _)| name).collect();
         assert_eq!(names, BTreeSet::from(["0.dual", "1.dual", "dual.0", "dual.1"]));
     }

@@ -80,7 +80,7 @@ impl RegularizerSpec for TotalVariation {
 impl Regularizer for TotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         let prox = TvProx::new(grid.shape, weighted(grid, self.weights), space)?;
-        Ok(Box::new(On { prox, inner: self.inner, arc: self.arc }))
+        Ok(Box::new(TvPenalty { prox, inner: self.inner, arc: self.arc }))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
@@ -110,14 +110,14 @@ pub(super) fn said(weights: [f64; 3], arc: f64) -> String {
 }
 
 /// Total variation on one grid.
-pub(super) struct On {
+pub(super) struct TvPenalty {
     pub(super) prox: TvProx,
     pub(super) inner: usize,
     /// Factor along the middle of a limited arc.
     pub(super) arc: f64,
 }
 
-impl Penalty for On {
+impl Penalty for TvPenalty {
     fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
         self.prox.value(x)
     }
