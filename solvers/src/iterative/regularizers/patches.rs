@@ -118,7 +118,10 @@ impl Regularizer for Patches {
 
     fn describe(&self) -> String {
         let Self { weight, inner, radius, large } = self;
-        format!("patches: weight {weight}, {inner} dual steps per update, within {radius} voxels, large {large}")
+        let s = if *inner == 1 { "" } else { "s" };
+        format!(
+            "patches: weight {weight}, {inner} dual step{s} per update, within {radius} voxels, large from {large} rms"
+        )
     }
 }
 
