@@ -126,7 +126,6 @@ impl Regularizer for Patches {
 }
 
 /// Where patches lie in a volume.
-#[derive(Clone)]
 struct Lattice {
     shape: [usize; 3],
     side: [usize; 3],
@@ -497,8 +496,9 @@ struct Matching<'a> {
 
 /// Patches along z whose distances are computed together: at least as many as lie within [`FAR`].
 const WIDE: usize = 16;
+const _: () = assert!(WIDE > 2 * FAR);
 
-/// Squared distances of the patch at `first` to those at `from` and after, or numbers above `most` if all exceed it.
+/// Squared distances of the patch at `first` to those at `from` and after, or numbers of at least `most` if none is below it.
 #[inline(always)]
 fn distances(offsets: &[[usize; SIDE]; SIDE * SIDE], x: &[f32], first: usize, from: usize, most: f32) -> [f32; WIDE] {
     let mut sum = [0.0; WIDE];
