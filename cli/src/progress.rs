@@ -195,9 +195,14 @@ impl Observer for Progress {
 
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
         let Some(keeper) = &mut self.keeper else { return Ok(()) };
-        files::write_checkpoint(&keeper.path, checkpoint, &keeper.run)?;
+        let written = files::write_checkpoint(&keeper.path, checkpoint, &keeper.run);
         keeper.last = Instant::now();
-        debug!("checkpoint after step {}", checkpoint.standing.step);
+        match written {
+            // An interrupted run needs its checkpoint; another one is worth more than a copy of its state.
+            Err(e) if signals::caught().is_none() => warn!("no checkpoint, the run goes on: {e}"),
+            Err(e) => return Err(e),
+            Ok(()) => debug!("checkpoint after step {}", checkpoint.standing.step),
+        }
         Ok(())
     }
 

@@ -121,6 +121,11 @@ pub fn begin(folder: &Path, limit: u64, bytes: u64) -> Result<()> {
     Ok(())
 }
 
+/// Free bytes on the disk of `folder`, if the system says so.
+pub fn free(folder: &Path) -> Option<u64> {
+    files::free(folder).ok()
+}
+
 #[cfg(target_os = "linux")]
 mod files {
     use super::*;
@@ -164,6 +169,10 @@ mod files {
         fallocate(file, FallocateFlags::empty(), 0, bytes)
     }
 
+    pub fn free(folder: &Path) -> rustix::io::Result<u64> {
+        statvfs(folder).map(|disk| disk.f_bavail.saturating_mul(disk.f_frsize))
+    }
+
     pub fn begin(folder: &Path, limit: u64, bytes: u64) -> Result<()> {
         let failed = |e| Error::io(folder, e);
         let mut scratch = scratch();
@@ -182,8 +191,7 @@ mod files {
         let Some(scratch) = scratch.as_mut() else { return Ok(()) };
         // A second estimate extends what the first one reserved.
         let more = bytes.saturating_sub(scratch.reserved);
-        let free = statvfs(&scratch.folder).map_err(|e| failed(e.into()))?;
-        let free = free.f_bavail.saturating_mul(free.f_frsize);
+        let free = free(&scratch.folder).map_err(|e| failed(e.into()))?;
         let short = || {
             let [free, more] = [free, more].map(conefield_evaluation::report::text::bytes);
             let expected = format!("{more} for arrays that do not fit into memory");
@@ -271,6 +279,10 @@ mod files {
 #[cfg(not(target_os = "linux"))]
 mod files {
     use super::*;
+
+    pub fn free(_: &Path) -> std::io::Result<u64> {
+        Err(std::io::ErrorKind::Unsupported.into())
+    }
 
     pub fn begin(folder: &Path, _: u64, _: u64) -> Result<()> {
         let what = format!("scratch files in {}", folder.display());

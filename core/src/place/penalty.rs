@@ -115,7 +115,7 @@ pub trait Penalty: Send {
         None
     }
 
-    /// State for the next call, by name, for checkpoints.
+    /// State for the next pass, by name, for checkpoints; not what [`Penalty::adapt`] sets before it.
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         vec![]
     }

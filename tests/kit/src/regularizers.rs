@@ -8,7 +8,7 @@ use conefield_core::random::{mix, unit};
 use conefield_core::regularizer::{Bounds, Penalty, Regularizer};
 use conefield_core::scan::ScanHeader;
 use conefield_core::space::Space;
-use ndarray::ArrayView3;
+use ndarray::{Array3, ArrayView3};
 use rayon::ThreadPoolBuilder;
 use std::sync::Arc;
 
@@ -234,7 +234,7 @@ fn overwrites(regularizer: &dyn Regularizer) -> Outcome {
     settle(complaint, "over NaN as over 0")
 }
 
-/// A call depends only on the state in [`Penalty::state`].
+/// A pass depends only on the coefficients before it and the state in [`Penalty::state`].
 fn state(regularizer: &dyn Regularizer) -> Outcome {
     let complaint = grids().iter().find_map(|grid| {
         let v = noise(grid, 7);
@@ -252,8 +252,13 @@ fn state(regularizer: &dyn Regularizer) -> Outcome {
             let moved = from.read(&Host).and_then(|from| to.load(&Host, &from));
             moved.unwrap_or_else(|e| panic!("{e}"));
         }
-        first.prox(&v, 0.1, &mut a);
-        second.prox(&v, 0.1, &mut b);
+        let x = Array3::from_shape_vec(grid.shape, v.clone()).unwrap_or_else(|e| panic!("{e}"));
+        for (penalty, u) in [(&mut first, &mut a), (&mut second, &mut b)] {
+            if penalty.adapts() {
+                penalty.adapt(x.view());
+            }
+            penalty.prox(&v, 0.1, u);
+        }
         differing("coefficient after the state was handed over", &b, &a)
     });
     settle(complaint, "handed over, it goes on to the same bits")

@@ -17,7 +17,6 @@ use super::total_variation::lambda;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parallel;
-use conefield_core::place::StatePart;
 use conefield_core::regularizer::{Bounds, Penalty, Regularizer, RegularizerSpec, Weight};
 use conefield_core::simd::{Op, Simd, run};
 use conefield_core::space::Space;
@@ -327,10 +326,6 @@ impl Penalty for PatchesPenalty {
     fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
         self.each = Some(bounds);
         Ok(())
-    }
-
-    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
-        vec![("coefficients", StatePart::Host(&mut self.dual)), ("filtered", StatePart::Host(&mut self.sum))]
     }
 }
 
