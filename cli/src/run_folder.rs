@@ -3,13 +3,16 @@
 //! `weights.safetensors`, `slices.png` and, last
 //! and only for a finished run, `record.json`.
 
+use crate::boundary;
 use conefield::plugins::Used;
 use conefield::record::ScanRecord;
+use conefield::scratch;
 use conefield::tradeoff::json::{LONGEST, read_json};
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::scan::Unit;
 use conefield_core::{Error, Result};
+use conefield_evaluation::report::text::bytes;
 use conefield_io::{Contents, Lease, Progressed};
 use serde::Deserialize;
 use serde_json::Value;
@@ -81,6 +84,15 @@ impl RunFolder {
         }
         let expected = "a new or empty folder, or --force to replace the run";
         ensure(force || self.0.progressed() == Progressed::Nothing, &place, "output", "an earlier run", expected)
+    }
+
+    /// Warns if the disk has less room than a volume of `most` bytes takes.
+    pub fn expect(&self, most: u64) {
+        let path = self.0.path();
+        let place = if path.is_dir() { path } else { boundary::folder_of(path) };
+        if let Some(free) = scratch::free(place).filter(|free| *free < most) {
+            tracing::warn!("{}: {} are free; the volume takes up to {}", place.display(), bytes(free), bytes(most));
+        }
     }
 
     /// Begins a run in the folder, emptying it; an earlier run is set aside until this one is complete.

@@ -19,7 +19,7 @@ use conefield::parse;
 use conefield::record::{RunRecord, ScanRecord, Written};
 use conefield::session::{self, Request, Run, Session, Solved};
 use conefield::tradeoff::front::Front;
-use conefield::{files, ranks, scratch, specs};
+use conefield::{files, ranks, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
@@ -217,12 +217,7 @@ impl ReconstructArgs {
         if signals::caught().is_some() {
             return Err(Error::Aborted { part: "preparation".into() });
         }
-        let volume = 4 * run.input.scan.header().voxels();
-        let place = boundary::folder_of(&self.output);
-        if let Some(free) = scratch::free(place).filter(|free| *free < volume) {
-            let (place, free, volume) = (place.display(), bytes(free), bytes(volume));
-            tracing::warn!("{place}: {free} are free; the volume takes up to {volume}");
-        }
+        folder.expect(4 * run.input.scan.header().voxels());
         let (metrics, resume) = match resumed {
             Some((metrics, resume)) => (metrics, Some(resume)),
             None => {
