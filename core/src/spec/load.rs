@@ -340,8 +340,13 @@ impl Set {
             return Err(Error::invalid(label, "path", format!("{text:?}"), "path=value, such as encoder.levels=8"));
         }
         let at = At::whole(&label);
-        // A TOML value, or else a text without quotes.
-        let parsed = parse_toml("", &format!("value = {value}"), 0).ok().filter(|n| n.entries().len() == 1);
+        // A TOML value, or else a text without quotes; no text begins like a table or a list.
+        let parsed = match parse_toml("", &format!("value = {value}"), 0) {
+            Err(Error::Invalid { field, found, expected, .. }) if value.starts_with(['{', '[']) => {
+                return Err(Error::invalid(label, field, found, expected));
+            }
+            parsed => parsed.ok().filter(|n| n.entries().len() == 1),
+        };
         let kind = match parsed.and_then(|mut n| n.take("value")) {
             Some(e) => e.value.kind,
             None => Is::String(value.to_owned()),
@@ -697,6 +702,8 @@ mod tests {
             ("encoder.levels.deep=3", "a key below encoder.levels, which is 3"),
             ("normalizers.0.type=nothing", "no normalizer type"),
             ("normalizers.0=3", "normalizers.0: found 3, expected a table"),
+            ("normalizers.0={type=x", "--set normalizers.0={type=x: syntax: found"),
+            ("normalizers.0={type='x',eps=inf}", "value: found inf, expected a finite number"),
             ("name=1\nsteps=2", "name"),
         ] {
             match read("extends = 'plain'", &[set]) {
