@@ -233,11 +233,16 @@ impl Node {
         }
     }
 
-    /// For an error message: the value, or its type if it is long.
+    /// For an error message: the value; of a list or a table only the size or the keys.
     pub(super) fn shown(&self) -> String {
         match &self.kind {
             Is::Array(items) => format!("a list of {}", items.len()),
-            Is::Table(_) => "a table".into(),
+            Is::Table(entries) if entries.is_empty() => "an empty table".into(),
+            Is::Table(entries) => {
+                let keys: Vec<&str> = entries.iter().take(4).map(|e| &*e.key).collect();
+                let more = if keys.len() < entries.len() { " and more" } else { "" };
+                format!("a table of {}{more}", keys.join(", "))
+            }
             Is::String(s) => format!("the text {s:?}"),
             _ => self.to_json().to_string(),
         }
