@@ -198,7 +198,7 @@ impl Observer for Progress {
         let written = files::write_checkpoint(&keeper.path, checkpoint, &keeper.run);
         keeper.last = Instant::now();
         match written {
-            // An interrupted run needs its checkpoint; another one is worth more than a copy of its state.
+            // Only an interrupted run needs its checkpoint.
             Err(e) if signals::caught().is_none() => warn!("no checkpoint, the run goes on: {e}"),
             Err(e) => return Err(e),
             Ok(()) => debug!("checkpoint after step {}", checkpoint.standing.step),

@@ -86,12 +86,12 @@ impl RunFolder {
         ensure(force || self.0.progressed() == Progressed::Nothing, &place, "output", "an earlier run", expected)
     }
 
-    /// Warns if the disk has less room than a volume of `most` bytes takes.
-    pub fn expect(&self, most: u64) {
+    /// Warns if the disk has less room than a volume of `volume` bytes may take.
+    pub fn warn_without_room(&self, volume: u64) {
         let path = self.0.path();
         let place = if path.is_dir() { path } else { boundary::folder_of(path) };
-        if let Some(free) = scratch::free(place).filter(|free| *free < most) {
-            tracing::warn!("{}: {} are free; the volume takes up to {}", place.display(), bytes(free), bytes(most));
+        if let Some(free) = scratch::free(place).filter(|free| *free < volume) {
+            tracing::warn!("{}: {} are free; the volume takes up to {}", place.display(), bytes(free), bytes(volume));
         }
     }
 

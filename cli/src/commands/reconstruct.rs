@@ -217,7 +217,7 @@ impl ReconstructArgs {
         if signals::caught().is_some() {
             return Err(Error::Aborted { part: "preparation".into() });
         }
-        folder.expect(4 * run.input.scan.header().voxels());
+        folder.warn_without_room(4 * run.input.scan.header().voxels());
         let (metrics, resume) = match resumed {
             Some((metrics, resume)) => (metrics, Some(resume)),
             None => {

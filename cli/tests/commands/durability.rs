@@ -93,7 +93,7 @@ fn a_run_without_room_says_so() {
         ["reconstruct", &scan, "--spec", "naf", "--set", "encoder.log2_table_size=12", "--steps", "2", "-o", &to];
     failed(&after("trap '' XFSZ; ulimit -f 16", &args), &["run/", "File too large"]);
     assert!(!run.exists(), "what came to nothing leaves nothing");
-    // Room for the volume but not for a checkpoint: an earlier checkpoint is not needed for a result.
+    // Room for the volume but not for a checkpoint: a result needs none.
     let args = ["reconstruct", &scan, "--spec", "fista-tv", "--steps", "3", "--checkpoint-every", "0.001s", "-o", &to];
     let output = after("trap '' XFSZ; ulimit -f 64", &args);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -115,7 +115,7 @@ pub trait Penalty: Send {
         None
     }
 
-    /// State for the next pass, by name, for checkpoints; not what [`Penalty::adapt`] sets before it.
+    /// State for the next pass, by name, for checkpoints. What [`Penalty::adapt`] sets before a pass is not part of it.
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         vec![]
     }
