@@ -5,6 +5,7 @@
 
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::parallel;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Unit};
 use conefield_core::{Error, Result};
@@ -376,7 +377,7 @@ impl Voxels for HounsfieldVoxels<'_> {
 
     fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
         self.voxels.fill(part, out.view_mut())?;
-        out.par_mapv_inplace(|x| self.levels.value(x));
+        parallel::over(out.outer_iter_mut(), |_, mut plane| plane.mapv_inplace(|x| self.levels.value(x)));
         Ok(())
     }
 }

@@ -3,12 +3,13 @@
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
+use conefield_core::parallel;
 use conefield_core::registry::read;
 use conefield_core::registry::{Kind, names};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
 use conefield_evaluation::metrics::rmse;
-use ndarray::{Array3, Axis, Zip};
+use ndarray::{Array3, Axis};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -84,7 +85,7 @@ pub fn predicted(
     operator.fault()?;
     if unit_mm != 1.0 {
         let per_unit = (1.0 / unit_mm) as f32;
-        out.par_mapv_inplace(|a| a * per_unit);
+        parallel::change_all(&mut out, |a| a * per_unit);
     }
     Ok(out)
 }
@@ -110,7 +111,9 @@ pub fn residual(scan: &Scan, views: &mut Array3<f32>) -> Result<Residual> {
     let each: Vec<f64> = pairs.map(of_view).collect::<Result<_>>()?;
     let rms = (each.iter().map(|x| x * x).sum::<f64>() / each.len().max(1) as f64).sqrt();
     let largest = scan.projections.iter().fold(0.0f32, |m, x| m.max(x.abs()));
-    Zip::from(views).and(&scan.projections).par_for_each(|a, p| *a = p - *a);
+    parallel::over(views.outer_iter_mut().zip(scan.projections.outer_iter()), |_, (mut views, measured)| {
+        views.zip_mut_with(&measured, |a, p| *a = p - *a);
+    });
     let relative = if largest > 0.0 { rms / f64::from(largest) } else { 0.0 };
     Ok(Residual { rms, relative, views: each })
 }

@@ -3,7 +3,6 @@
 //! Hash tables are read at random addresses. On pages of 4 KiB most reads miss the translation lookaside buffer (TLB),
 //! and a step takes about twice as long.
 
-use crate::allowance;
 use crate::parallel;
 use bytemuck::Pod;
 use memmap2::MmapMut;
@@ -19,10 +18,7 @@ const PART: usize = 1 << 18;
 /// Copies `from` to `to`, of the same length, on all threads.
 pub fn copy<T: Pod + Send + Sync>(to: &mut [T], from: &[T]) {
     debug_assert_eq!(to.len(), from.len());
-    parallel::over(to.chunks_mut(PART).zip(from.chunks(PART)), |_, (to, from)| {
-        to.copy_from_slice(from);
-        allowance::trim();
-    });
+    parallel::over(to.chunks_mut(PART).zip(from.chunks(PART)), |_, (to, from)| to.copy_from_slice(from));
 }
 
 /// A slice of numbers of fixed length, initially zero.

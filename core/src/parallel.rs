@@ -1,15 +1,24 @@
 //! Loops over all threads, compiled once.
 //!
-//! A parallel iterator of `rayon` is compiled anew for every closure, as some 3000 to 6000 lines of LLVM's language. Loops
-//! over chunks that take microseconds or more use these functions; loops over single numbers use `rayon`.
+//! A parallel iterator of `rayon` is compiled anew for every closure, as some 3000 to 6000 lines of LLVM's language.
+//! These loops also keep arrays on the disk within the memory limit: each item first gives pages back if the process
+//! holds too many. So an item should touch a few megabytes at most.
 
+use crate::allowance;
+use ndarray::Array3;
 use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
+
+/// Numbers per item of a loop over numbers.
+const PART: usize = 1 << 16;
 
 /// Calls `work` for every number below `count`.
 #[inline(never)]
 pub fn each(count: usize, work: &(dyn Fn(usize) + Sync)) {
-    (0..count).into_par_iter().for_each(work);
+    (0..count).into_par_iter().for_each(|n| {
+        allowance::trim();
+        work(n);
+    });
 }
 
 /// Calls `work` for every item, with its number.
@@ -32,9 +41,40 @@ pub fn map<T: Send, U: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(u
     results.into_iter().map(done).collect()
 }
 
+/// Replaces each number of `out` by `f` of it and of the numbers of `with`, which have the same length.
+pub fn change<const N: usize>(out: &mut [f32], with: [&[f32]; N], f: impl Fn(f32, [f32; N]) -> f32 + Sync) {
+    over(out.chunks_mut(PART), |n, out| {
+        let with = with.map(|x| &x[n * PART..][..out.len()]);
+        for (i, x) in out.iter_mut().enumerate() {
+            *x = f(*x, with.map(|with| with[i]));
+        }
+    });
+}
+
+/// Replaces each number of `x` by `f` of it.
+pub fn change_all(x: &mut Array3<f32>, f: impl Fn(f32) -> f32 + Sync) {
+    match x.as_slice_memory_order_mut() {
+        Some(x) => change(x, [], |x, []| f(x)),
+        None => x.mapv_inplace(f),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numbers_change_with_those_at_the_same_place() {
+        let count = 3 * PART + 5;
+        let numbers = |from: usize| (from..from + count).map(|i| i as f32).collect::<Vec<_>>();
+        let mut out = numbers(0);
+        change(&mut out, [&numbers(7), &numbers(1)], |x, [a, b]| x + a - b);
+        assert!(out == numbers(6));
+        let mut array = Array3::from_shape_fn((3, 4, 5), |(i, j, k)| (i * 20 + j * 5 + k) as f32).reversed_axes();
+        let doubled = array.mapv(|x| 2.0 * x);
+        change_all(&mut array, |x| 2.0 * x);
+        assert_eq!(array, doubled);
+    }
 
     #[test]
     fn every_item_comes_once_and_results_in_order() {

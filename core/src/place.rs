@@ -22,7 +22,7 @@ use crate::error::Result;
 use crate::geometry::Geometry;
 use crate::parallel;
 use crate::voxel::{VoxelOperator, VoxelProjector};
-use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, Zip, s};
+use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, s};
 use serde::Serialize;
 use std::any::Any;
 use std::borrow::Cow;
@@ -317,7 +317,7 @@ pub trait Place: Send + Sync {
 
     /// Overwrites `x` with `value`.
     fn fill(&self, x: &mut Array, value: f32) -> Result<()> {
-        self.change(x, &mut |x| x.par_mapv_inplace(|_| value))
+        self.change(x, &mut |x| parallel::change_all(x, |_| value))
     }
 
     /// Overwrites `out` with the first planes of `from`, one for each plane of `out` in `at`.
@@ -334,7 +334,9 @@ pub trait Place: Send + Sync {
     fn keep(&self, x: &mut Array, inside: &Mask, value: f32) -> Result<()> {
         self.change(x, &mut |x| {
             if let Some(inside) = inside.on_host() {
-                Zip::from(x).and(inside).par_for_each(|x, inside| *x = if *inside { *x } else { value });
+                parallel::over(x.outer_iter_mut().zip(inside.outer_iter()), |_, (mut x, inside)| {
+                    x.zip_mut_with(&inside, |x, inside| *x = if *inside { *x } else { value });
+                });
             }
         })
     }

@@ -3,7 +3,8 @@
 use crate::error::{Result, ensure};
 use crate::finite::{first_not, stray};
 use crate::geometry::{Geometry, Vec3, View, VoxelGrid};
-use ndarray::{Array3, ArrayView2, Zip, s};
+use crate::parallel;
+use ndarray::{Array3, ArrayView2, s};
 use serde::{Deserialize, Serialize};
 
 /// The length unit of the scan's data set. The program uses mm and 1/mm; volumes are written in `1/unit`.
@@ -163,10 +164,12 @@ impl Scan {
         };
         let views: Vec<View> = g.views.iter().map(binned).collect();
         let mut projections = Array3::zeros((views.len(), detector[0], detector[1]));
-        Zip::indexed(&mut projections).par_for_each(|(view, row, column), mean| {
-            let (row, column) = (row * tall, column * wide);
-            let block = self.projections.slice(s![view, row..row + tall, column..column + wide]);
-            *mean = block.sum() / (tall * wide) as f32;
+        parallel::over(projections.outer_iter_mut(), |view, mut image| {
+            for ((row, column), mean) in image.indexed_iter_mut() {
+                let (row, column) = (row * tall, column * wide);
+                let block = self.projections.slice(s![view, row..row + tall, column..column + wide]);
+                *mean = block.sum() / (tall * wide) as f32;
+            }
         });
         let geometry = Geometry { detector, views, volume: g.volume };
         Scan { geometry, projections, unit: self.unit.clone(), provenance: self.provenance.clone() }
@@ -208,7 +211,7 @@ impl Volume {
 
     /// Applies `f` to every value.
     pub fn mapped(mut self, f: impl Fn(f32) -> f32 + Sync + Send) -> Self {
-        self.data.par_mapv_inplace(f);
+        parallel::change_all(&mut self.data, f);
         self
     }
 }

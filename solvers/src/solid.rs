@@ -68,7 +68,7 @@ impl Solid {
     /// Corrects the views of a scan.
     pub fn linearize(&self, scan: &Scan) -> Scan {
         let mut scan = scan.clone();
-        scan.projections.par_mapv_inplace(|p| self.linear(p));
+        parallel::change_all(&mut scan.projections, |p| self.linear(p));
         scan
     }
 

@@ -1,6 +1,5 @@
 //! Elementwise maps and reductions: each with one text in Rust and one in WGSL.
 
-use crate::allowance;
 use crate::parallel;
 use ndarray::{Array3, CowArray, Ix3};
 
@@ -102,7 +101,6 @@ impl Map {
             let part = n * PART..n * PART + out.len();
             let input = |i: usize| inputs.get(i).map_or(&[][..], |x| &x[part.clone()]);
             (self.host)(factors, out, [input(0), input(1)]);
-            allowance::trim();
         });
     }
 }
@@ -144,8 +142,12 @@ impl Reduction {
                 let part = |(x, y): (&[f32], &[f32])| x.iter().zip(y).map(square).sum::<f64>();
                 ordered(x.chunks(SUMMED).zip(y.chunks(SUMMED)), part)
             }
-            Self::Maximum => f64::from(x.iter().fold(0.0f32, |m, &v| m.max(v))),
-            Self::Nonzero => x.iter().filter(|x| **x != 0.0).count() as f64,
+            Self::Maximum => {
+                let part = |part: &[f32]| part.iter().fold(0.0f32, |m, &v| m.max(v));
+                let all = parallel::map(x.chunks(SUMMED), |_, x| part(x));
+                f64::from(part(&all))
+            }
+            Self::Nonzero => ordered(x.chunks(SUMMED), |x| x.iter().filter(|x| **x != 0.0).count() as f64),
         }
     }
 }
@@ -157,9 +159,5 @@ pub fn squares(x: &[f32]) -> f64 {
 }
 
 fn ordered<T: Send>(parts: impl Iterator<Item = T>, sum: impl Fn(T) -> f64 + Sync) -> f64 {
-    let sums = parallel::map(parts, |_, part| {
-        allowance::trim();
-        sum(part)
-    });
-    sums.iter().sum()
+    parallel::map(parts, |_, part| sum(part)).iter().sum()
 }

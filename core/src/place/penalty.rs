@@ -1,7 +1,6 @@
 //! A penalty of coefficients, as a place works with it: its proximal map, and the update around that.
 
 use super::{Array, Slab, StatePart};
-use crate::allowance;
 use crate::error::{Error, Result};
 use crate::geometry::Vec3;
 use crate::parallel;
@@ -255,7 +254,6 @@ impl<'a> Update<'a> {
             let v = &mut v[..part.x.len()];
             part.read(0, v);
             part.gradient.copy_from_slice(v);
-            allowance::trim();
         });
     }
 
@@ -266,7 +264,6 @@ impl<'a> Update<'a> {
             let u = &mut u[..part.x.len()];
             u.copy_from_slice(part.ahead);
             part.write(0, u);
-            allowance::trim();
         });
     }
 

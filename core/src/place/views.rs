@@ -44,13 +44,14 @@ impl Weighing<'_> {
     ) -> [f64; 2] {
         let shadow = self.shadow.and_then(Mask::on_host);
         for (mut image, &v) in images.axis_iter_mut(Axis(0)).zip(views) {
-            let both = Zip::from(&mut image).and(self.views.measured.index_axis(Axis(0), v));
-            match shadow {
-                None => both.par_for_each(|a, p| *a = p - *a),
-                Some(shadow) => both
-                    .and(shadow.index_axis(Axis(0), v))
-                    .par_for_each(|a, p, inside| *a = if *inside { p - *a } else { -*a }),
-            }
+            let rows = image.outer_iter_mut().zip(self.views.measured.index_axis(Axis(0), v).into_outer_iter());
+            parallel::over(rows, |row, (mut image, measured)| match shadow {
+                None => image.zip_mut_with(&measured, |a, p| *a = p - *a),
+                Some(shadow) => Zip::from(&mut image)
+                    .and(&measured)
+                    .and(shadow.slice(s![v, row, ..]))
+                    .for_each(|a, p, inside| *a = if *inside { p - *a } else { -*a }),
+            });
         }
         let residual = images.slice(s![..views.len(), .., ..]);
         let residual = residual.as_slice().map_or_else(|| unreachable!("images follow each other"), squares);

@@ -30,6 +30,7 @@ pub use protocol::{Angles, DetectorExtent, Protocol};
 
 use conefield_core::Result;
 use conefield_core::geometry::Geometry;
+use conefield_core::parallel;
 use conefield_core::scan::{Scan, Volume};
 use serde_json::json;
 
@@ -41,7 +42,7 @@ pub fn simulate(volume: &Volume, protocol: &Protocol) -> Result<Scan> {
     let geometry: Geometry = protocol.geometry(&volume.grid)?;
     let mut projections = project(volume, &geometry, protocol.samples_per_voxel)?;
     let units_per_mm = (1.0 / protocol.unit.mm) as f32;
-    projections.par_mapv_inplace(|a| a * units_per_mm);
+    parallel::change_all(&mut projections, |a| a * units_per_mm);
     let largest = projections.iter().copied().fold(0.0, f32::max);
     protocol.noise.add(&mut projections, protocol.seed);
     let provenance = json!({

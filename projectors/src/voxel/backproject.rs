@@ -8,7 +8,6 @@
 use super::layout::{ColumnMajor, Pinhole};
 use super::readers::{Among, Ends, PAD, Path, Stands, places, read};
 use super::upright::{Blend, Upright};
-use conefield_core::allowance;
 use conefield_core::geometry::Geometry;
 use conefield_core::parallel;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, WIDEST, run};
@@ -46,7 +45,6 @@ pub fn backproject<R: Real>(
     }
     parallel::over(tiles, |_, (first, lines)| {
         run(Tile { detector: geometry.detector, pixels, zeros: &zeros, views: &all, shape, first, lines });
-        allowance::trim();
     });
 }
 

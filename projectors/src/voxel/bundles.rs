@@ -8,7 +8,6 @@
 
 use super::layout::main_axis;
 use super::walk::VoxelRay;
-use conefield_core::allowance;
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
 use conefield_core::parallel;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
@@ -170,7 +169,6 @@ pub fn forward<R: Real>(
             (0..strip.nrows()).for_each(|row| Bundle::of(geometry, [view, row, n * BUNDLE], 0, &mut bundles));
             let mut sums = vec![[R::ZERO; BUNDLE]; strip.nrows()];
             run(BundlesForward { shape: geometry.volume.shape, voxels, bundles: &bundles, sums: &mut sums });
-            allowance::trim();
             for (mut row, sums) in strip.rows_mut().into_iter().zip(&sums) {
                 row.iter_mut().zip(sums).for_each(|(out, sum)| *out = *sum);
             }
@@ -250,7 +248,6 @@ pub fn adjoint<R: Real>(
                 let of = n * TILE..n * TILE + planes.dim().0;
                 let shape = geometry.volume.shape;
                 let found = run(Adjoint { main, planes: of, shape, bundles: &bundles, projections });
-                allowance::trim();
                 planes.iter_mut().zip(&found).for_each(|(voxel, x)| *voxel += *x);
             });
         }

@@ -7,7 +7,6 @@
 
 use super::layout::{ColumnMajor, ViewColumns, batch, column_major_bytes, main_axis, to_voxels};
 use super::readers::{Among, Ends, PAD, Path, Stands, mix, places, read, read_on};
-use conefield_core::allowance;
 use conefield_core::geometry::{Geometry, Vec3, dot, sub};
 use conefield_core::parallel;
 use conefield_core::scan::ScanHeader;
@@ -223,7 +222,6 @@ pub fn forward<R: Real>(
             let apart = rows.next_multiple_of(WIDEST) + WIDEST;
             let mut sums = vec![R::ZERO; out.ncols() * apart];
             run(ColumnsForward { shape, voxels, occupied: &lines, columns, first, apart, sums: &mut sums });
-            allowance::trim();
             for row in 0..rows {
                 let mut line = out.row_mut(if downwards { rows - 1 - row } else { row });
                 line.iter_mut().zip(sums.chunks(apart)).for_each(|(out, sums)| *out = sums[row]);
@@ -441,7 +439,6 @@ pub fn adjoint<R: Real>(
                 let first = n * TILE;
                 let (occupied, pixels) = (&occupied, &pixels);
                 run(Adjoint { main, first, lines, nz, gathered: &mut gathered, views, occupied, pixels });
-                allowance::trim();
                 for (mut plane, found) in planes.outer_iter_mut().zip(gathered.chunks((lines + 2) * stride)) {
                     for (mut line, found) in plane.outer_iter_mut().zip(found.chunks(stride).skip(1)) {
                         let found = &found[PAD..];

@@ -3,9 +3,10 @@
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing, tensors_of};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::method::{Best, Job, Plan, Reconstruction, Solution};
+use conefield_core::parallel;
 use conefield_core::scan::Volume;
 use conefield_core::trained::{Placement, TrainedField};
-use ndarray::{Array3, Zip};
+use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 
 /// Names of tensors in a checkpoint: the start volume of the next method and the sum for the mean; then the name
@@ -79,7 +80,9 @@ impl Made {
         }
         if let (true, Some(volume)) = (counts, &self.volume) {
             match &mut self.sum {
-                Some(sum) => Zip::from(sum).and(&volume.data).par_for_each(|sum, x| *sum += x),
+                Some(sum) => {
+                    parallel::over(sum.outer_iter_mut().zip(volume.data.outer_iter()), |_, (mut sum, x)| sum += &x)
+                }
                 None => self.sum = Some(volume.data.clone()),
             }
         }

@@ -11,6 +11,7 @@ use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::finite::stray;
 use conefield_core::method::{Job, Observer, Reconstruction, Record, Solution};
+use conefield_core::parallel;
 use conefield_core::place::{Array, Place, StatePart, squares};
 use conefield_core::scan::Volume;
 use conefield_core::space::Space;
@@ -268,7 +269,7 @@ impl<'a> Run<'a> {
         };
         let mut data = self.problem.place.take(volume)?;
         let mm = job.scan.unit.mm as f32;
-        data.par_mapv_inplace(|x| x * mm);
+        parallel::change_all(&mut data, |x| x * mm);
         finite(&data, step)?;
         let volume = Volume { data, grid: job.scan.geometry.volume, affine: None };
         Ok(Solution {

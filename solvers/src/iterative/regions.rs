@@ -73,7 +73,7 @@ impl Regions {
     pub fn clip(&self, x: &mut Array3<f32>, grid: &VoxelGrid, bounds: Bounds, factor: f32) {
         if self.is_empty() {
             let bounds = Bounds { low: bounds.low * factor, high: bounds.high * factor };
-            return x.par_mapv_inplace(|x| bounds.clip(x));
+            return parallel::change_all(x, |x| bounds.clip(x));
         }
         parallel::over(x.axis_iter_mut(Axis(0)), |i, mut plane| {
             for ((j, k), x) in plane.indexed_iter_mut() {

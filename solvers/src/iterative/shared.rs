@@ -12,13 +12,14 @@ use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::{Job, Observer};
+use conefield_core::parallel;
 use conefield_core::place::{Array, Bounds, Mask, MeasuredViews, Place};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::VoxelScene;
 use conefield_core::settings::KnownVolume;
 use conefield_core::space::Space;
 use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
-use ndarray::{Array3, Zip};
+use ndarray::Array3;
 use std::sync::Arc;
 
 /// The common settings, built.
@@ -106,7 +107,9 @@ impl Shared {
         let regions = Regions::of(&self.scene.bounds, support.as_ref(), job)?;
         let inside = support.map(|support| {
             let mut inside = Array3::from_elem(grid.shape, false);
-            Zip::indexed(&mut inside).par_for_each(|(x, y, z), i| *i = support.holds(grid.voxel([x, y, z])));
+            parallel::over(inside.outer_iter_mut(), |x, mut plane| {
+                plane.indexed_iter_mut().for_each(|((y, z), i)| *i = support.holds(grid.voxel([x, y, z])));
+            });
             place.mask(inside)
         });
         let inside = inside.transpose()?;

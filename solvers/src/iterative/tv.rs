@@ -18,7 +18,6 @@ use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, s
 use conefield_core::space::Space;
 use conefield_core::wgsl::Fragment;
 use ndarray::ArrayView3;
-use rayon::prelude::*;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -254,7 +253,7 @@ impl TvProx {
         if tau < f32::MIN_POSITIVE {
             let bounds = self.bounds;
             return match &self.each {
-                None => u.par_iter_mut().zip(v).for_each(|(u, v)| *u = bounds.clip(*v)),
+                None => parallel::change(u, [v], |_, [v]| bounds.clip(v)),
                 Some(each) => clip_each(v, each, u),
             };
         }
@@ -338,8 +337,7 @@ impl TvProx {
 
 /// Overwrites each `u` with the number within its bounds that is closest to `v`.
 pub(super) fn clip_each(v: &[f32], [low, high]: &[Vec<f32>; 2], u: &mut [f32]) {
-    let all = u.par_iter_mut().zip(v).zip(low).zip(high);
-    all.for_each(|(((u, v), low), high)| *u = v.max(*low).min(*high));
+    parallel::change(u, [v, low, high], |_, [v, low, high]| v.max(low).min(high));
 }
 
 /// Most dual steps per sweep, so that their part of the volume stays in the last-level cache.

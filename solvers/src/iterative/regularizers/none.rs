@@ -3,11 +3,11 @@
 use crate::iterative::tv::clip_each;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
+use conefield_core::parallel;
 use conefield_core::place::Slab;
 use conefield_core::regularizer::{Bounds, Kernels, Penalty, Regularizer, RegularizerSpec};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -59,7 +59,7 @@ impl Penalty for BoundsPenalty {
 
     fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
         match &self.each {
-            None => u.par_iter_mut().zip(v).for_each(|(u, v)| *u = self.bounds.clip(*v)),
+            None => parallel::change(u, [v], |_, [v]| self.bounds.clip(v)),
             Some(each) => clip_each(v, each, u),
         }
     }

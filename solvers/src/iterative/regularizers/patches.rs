@@ -21,7 +21,6 @@ use conefield_core::regularizer::{Bounds, Penalty, Regularizer, RegularizerSpec,
 use conefield_core::simd::{Op, Simd, run};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -273,9 +272,9 @@ impl PatchesPenalty {
     /// `u = clip(v − τ·sum)`
     fn descend(&self, v: &[f32], tau: f32, u: &mut [f32]) {
         let bounds = self.bounds;
-        u.par_iter_mut().zip(v).zip(&self.sum).for_each(|((u, v), sum)| *u = bounds.clip(v - tau * sum));
+        parallel::change(u, [v, &self.sum], |_, [v, sum]| bounds.clip(v - tau * sum));
         if let Some([low, high]) = self.each.as_deref() {
-            u.par_iter_mut().zip(low).zip(high).for_each(|((u, low), high)| *u = u.max(*low).min(*high));
+            parallel::change(u, [low, high], |u, [low, high]| u.max(low).min(high));
         }
     }
 }

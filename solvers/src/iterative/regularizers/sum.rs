@@ -8,12 +8,12 @@
 use super::TotalVariation;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Vec3, VoxelGrid};
+use conefield_core::parallel;
 use conefield_core::place::{Host, StatePart};
 use conefield_core::regularizer::{Bounds, Penalty, Regularizer, RegularizerSpec};
 use conefield_core::space::Space;
 use conefield_core::spec::stage;
 use ndarray::ArrayView3;
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -138,16 +138,14 @@ impl Penalty for SumPenalty {
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
         u.copy_from_slice(v);
         for part in &self.parts {
-            u.par_iter_mut().zip(&part.dual).for_each(|(u, y)| *u -= y);
+            parallel::change(u, [&part.dual], |u, [y]| u - y);
         }
         let Self { parts, work, turns } = self;
         for part in (0..*turns).flat_map(|_| 0..parts.len()).collect::<Vec<_>>() {
             let Part { penalty, share, dual, .. } = &mut parts[part];
-            let argument = work.par_iter_mut().zip(v).zip(&*u).zip(&*dual);
-            argument.for_each(|(((w, v), u), y)| *w = if is_outside(*v) { *v } else { u + y });
+            parallel::change(work, [v, u, dual], |_, [v, u, y]| if is_outside(v) { v } else { u + y });
             penalty.prox(work, (f64::from(tau) * *share) as f32, u);
-            let taken = dual.par_iter_mut().zip(v).zip(&*u).zip(&*work);
-            taken.for_each(|(((y, v), u), w)| *y = if is_outside(*v) { 0.0 } else { w - u });
+            parallel::change(dual, [v, u, work], |_, [v, u, w]| if is_outside(v) { 0.0 } else { w - u });
         }
     }
 
