@@ -1,6 +1,6 @@
 //! Selection of the backend.
 
-use crate::ranks;
+use crate::{devices, ranks};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::pipeline::Pipeline;
@@ -12,20 +12,20 @@ use std::str::FromStr;
 use std::sync::OnceLock;
 
 /// Help text of `--backend`.
-pub const HELP: &str = "Backend: auto (the CPU, whose results repeat to the bit), cpu, wgpu, or wgpu:N for adapter N";
+pub const HELP: &str = "Backend: auto (the CPU, whose results repeat to the bit), cpu, wgpu, wgpu:N for adapter N, or wgpu:N,M,... for a volume that several adapters share";
 
 /// Value of `--backend`.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum BackendChoice {
     /// The CPU, whose results repeat to the bit.
     #[default]
     Auto,
     /// Rayon and SIMD.
     Cpu,
-    /// A GPU.
+    /// GPUs.
     Wgpu {
-        /// The adapter's number; otherwise the most capable one.
-        index: Option<usize>,
+        /// Numbers of adapters; the most capable one if there are none.
+        adapters: Vec<usize>,
     },
 }
 
@@ -35,8 +35,11 @@ impl FromStr for BackendChoice {
         match s.split_once(':') {
             None if s == "auto" => Ok(Self::Auto),
             None if s == "cpu" => Ok(Self::Cpu),
-            None if s == "wgpu" => Ok(Self::Wgpu { index: None }),
-            Some(("wgpu", n)) if n.parse::<usize>().is_ok() => Ok(Self::Wgpu { index: n.parse().ok() }),
+            None if s == "wgpu" => Ok(Self::Wgpu { adapters: vec![] }),
+            Some(("wgpu", all)) => match all.split(',').map(str::parse).collect() {
+                Ok(adapters) => Ok(Self::Wgpu { adapters }),
+                Err(_) => Err("expected numbers of adapters after wgpu:, as in wgpu:0 or wgpu:0,1".into()),
+            },
             _ => Err("expected auto, cpu, wgpu, or wgpu:N with the number of an adapter".into()),
         }
     }
@@ -47,9 +50,10 @@ impl fmt::Display for BackendChoice {
         match self {
             Self::Auto => f.write_str("auto"),
             Self::Cpu => f.write_str("cpu"),
-            Self::Wgpu { index } => {
+            Self::Wgpu { adapters } => {
                 f.write_str("wgpu")?;
-                index.map_or(Ok(()), |n| write!(f, ":{n}"))
+                let signs = [":"].into_iter().chain(std::iter::repeat(","));
+                adapters.iter().zip(signs).try_for_each(|(n, sign)| write!(f, "{sign}{n}"))
             }
         }
     }
@@ -63,20 +67,41 @@ impl Serialize for BackendChoice {
 
 impl BackendChoice {
     /// Opens the backend.
-    pub fn open(self) -> Result<Box<dyn Backend>> {
+    pub fn open(&self) -> Result<Box<dyn Backend>> {
         if let Some(shared) = ranks::backend() {
             return match self {
                 Self::Auto | Self::Cpu => Ok(shared),
-                Self::Wgpu { .. } => {
-                    Err(Error::invalid("this run", "backend", self, "auto or cpu: several processes share CPUs only"))
-                }
+                Self::Wgpu { .. } => Err(self.refused("auto or cpu: several processes share CPUs only")),
             };
         }
         Ok(match self {
             Self::Auto => Box::<Auto>::default(),
             Self::Cpu => Box::new(Cpu::new()),
-            Self::Wgpu { index } => gpu::open(index)?,
+            Self::Wgpu { adapters } => match adapters[..] {
+                [] => gpu::open(None)?,
+                [one] => gpu::open(Some(one))?,
+                _ => return Err(self.refused("one adapter: only a reconstruction shares a volume among several")),
+            },
         })
+    }
+
+    /// Opens the backend of a reconstruction, which several adapters may share. `budget` are its seconds, if it has a
+    /// budget.
+    pub fn open_for_run(&self, budget: Option<f64>) -> Result<Box<dyn Backend>> {
+        match self {
+            Self::Wgpu { adapters } if adapters.len() > 1 && ranks::count() == 1 => {
+                if budget.is_some() {
+                    return Err(self.refused("one adapter within a budget: methods are timed on one"));
+                }
+                let all: Vec<_> = adapters.iter().map(|&n| gpu::open(Some(n))).collect::<Result<_>>()?;
+                Ok(devices::join(all))
+            }
+            _ => self.open(),
+        }
+    }
+
+    fn refused(&self, expected: &str) -> Error {
+        Error::invalid("this run", "backend", self, expected)
     }
 }
 
@@ -157,10 +182,10 @@ mod tests {
 
     #[test]
     fn what_is_read_is_what_is_written() {
-        for s in ["auto", "cpu", "wgpu", "wgpu:3"] {
+        for s in ["auto", "cpu", "wgpu", "wgpu:3", "wgpu:0,2,1"] {
             assert_eq!(s.parse::<BackendChoice>().unwrap().to_string(), s);
         }
-        for s in ["", "gpu", "wgpu:", "wgpu:x", "cpu:1", "wgpu:-1"] {
+        for s in ["", "gpu", "wgpu:", "wgpu:x", "cpu:1", "wgpu:-1", "wgpu:0,", "wgpu:0 1"] {
             assert!(s.parse::<BackendChoice>().is_err(), "{s}");
         }
     }

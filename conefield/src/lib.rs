@@ -30,6 +30,7 @@
 //! draw them.
 
 pub mod backend;
+mod devices;
 pub mod explain;
 pub mod files;
 pub mod hounsfield;

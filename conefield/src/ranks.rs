@@ -11,7 +11,7 @@ pub use mpi::{Joined, start};
 
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::place::{Peers, Place, Ranks};
+use conefield_core::place::{Host, Peers, Place, Ranks};
 use conefield_core::{Error, Result};
 use std::sync::{Arc, OnceLock};
 
@@ -28,7 +28,7 @@ struct Shared {
 /// From now on, runs of this process are those of all processes that `peers` connects.
 pub fn join(peers: Arc<dyn Peers>) {
     let (rank, count) = (peers.rank(), peers.count());
-    let _ = SHARED.set(Shared { rank, count, place: Arc::new(Ranks::new(peers)) });
+    let _ = SHARED.set(Shared { rank, count, place: Arc::new(Ranks::new(peers, Arc::new(Host))) });
 }
 
 /// Number of processes of a run.

@@ -14,7 +14,7 @@ use crate::tradeoff::schedule::{Budget, Schedule};
 use crate::{plugins, score, specs};
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
-use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Solution};
+use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Silent, Solution};
 use conefield_core::place::Moved;
 use conefield_core::scan::Volume;
 use conefield_core::spec::load::Loaded;
@@ -172,7 +172,12 @@ impl Run<'_> {
         let job = self.input.job(self.backend, self.seed, self.limits, self.schedule.as_ref());
         let job = Job { start, resume, ..job };
         let Planned { loaded, plan, .. } = &mut self.method;
-        let solution = plan.run(&job, observer).map_err(|e| loaded.locate(e))?;
+        let mut solution = None;
+        let lead = &mut || plan.run(&job, observer).map(|found| solution = Some(found));
+        let follow =
+            |backend: &dyn Backend| method::plan(loaded, backend)?.run(&Job { backend, ..job }, &mut Silent).map(drop);
+        self.backend.run(lead, &follow).map_err(|e| loaded.locate(e))?;
+        let solution = solution.unwrap_or_else(|| unreachable!("the leading backend has run"));
         let prepare_s = (begin.elapsed().as_secs_f64() + self.spent - solution.train_s).max(0.0);
         let Moved { to_device, from_device } = self.moved();
         if to_device > 0 {

@@ -117,6 +117,16 @@ pub trait Backend: Send + Sync {
     fn moved(&self) -> Moved {
         Moved::default()
     }
+    /// Runs a method: `lead` here and, at the same time, `follow` on every other backend that shares the arrays of this
+    /// one's place. All make the same calls in the same order.
+    fn run(
+        &self,
+        lead: &mut dyn FnMut() -> Result<()>,
+        follow: &(dyn Fn(&dyn Backend) -> Result<()> + Sync),
+    ) -> Result<()> {
+        let _ = follow;
+        lead()
+    }
 }
 
 /// A compiled pipeline. Compile again after a mask has changed the pipeline. Each call returns the errors that stages

@@ -37,7 +37,7 @@ pub struct Job<'a> {
     /// Initial volume, in 1/unit of the scan. Takes precedence over one named in the method's settings.
     pub start: Option<&'a Volume>,
     /// Reads a volume named by the spec, in 1/unit of the scan.
-    pub volumes: &'a dyn Fn(&str) -> Result<Volume>,
+    pub volumes: &'a (dyn Fn(&str) -> Result<Volume> + Sync),
     /// State of an earlier run of the same job to continue from.
     pub resume: Option<&'a Resume>,
 }

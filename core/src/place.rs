@@ -320,11 +320,11 @@ pub trait Place: Send + Sync {
         self.change(x, &mut |x| parallel::change_all(x, |_| value))
     }
 
-    /// Overwrites `out` with the first planes of `from`, one for each plane of `out` in `at`.
-    fn scatter(&self, from: &Array, out: &mut Array, at: &[usize]) -> Result<()> {
+    /// Overwrites planes of `out`: each one in `at` with the next plane of `from`, from plane `first` on.
+    fn scatter(&self, from: &Array, first: usize, out: &mut Array, at: &[usize]) -> Result<()> {
         let from = self.read(from)?;
         self.change(out, &mut |out| {
-            for (plane, &i) in from.outer_iter().zip(at) {
+            for (plane, &i) in from.outer_iter().skip(first).zip(at) {
                 out.index_axis_mut(Axis(0), i).assign(&plane);
             }
         })
@@ -428,7 +428,12 @@ pub trait Place: Send + Sync {
         self.update_around(step, penalty)
     }
 
-    /// The same with the proximal map on the host, wherever the arrays are.
+    /// Overwrites `v` with the proximal map of `penalty` at `v`; see [`Penalty::prox`].
+    fn prox(&self, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+        prox_on_host(self, v, tau, penalty)
+    }
+
+    /// The same, around [`Place::prox`].
     fn update_around(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
         let ProximalStep { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
         // The argument of the proximal map, in `gradient`.
@@ -440,12 +445,7 @@ pub trait Place: Send + Sync {
         if let Some(inside) = inside {
             self.keep(gradient, inside, f32::MIN)?;
         }
-        self.change(gradient, &mut |v| {
-            let mut u = Array3::zeros(v.raw_dim());
-            penalty.prox(v.as_slice().unwrap_or_default(), tau, u.as_slice_mut().unwrap_or_default());
-            *v = u;
-        })?;
-        penalty.fault()?;
+        self.prox(gradient, tau, penalty)?;
         self.map(&ADD, [-f64::from(momentum), 0.0], ahead, &[x])?;
         self.map(&ADD, [1.0 + f64::from(momentum), 1.0], ahead, &[gradient])?;
         self.map(&ADD, [1.0, 0.0], x, &[gradient])
@@ -538,6 +538,16 @@ fn on_host<P: Place + ?Sized>(
     }
     work(&mut array);
     place.load(array.view(), x, 0)
+}
+
+/// [`Place::prox`] on the host.
+pub fn prox_on_host<P: Place + ?Sized>(place: &P, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+    place.change(v, &mut |v| {
+        let mut u = Array3::zeros(v.raw_dim());
+        penalty.prox(v.as_slice().unwrap_or_default(), tau, u.as_slice_mut().unwrap_or_default());
+        *v = u;
+    })?;
+    penalty.fault()
 }
 
 /// Overwrites `images` with the line integrals of `volume`. A volume that memory does not hold is projected in slabs, so

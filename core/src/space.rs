@@ -33,9 +33,9 @@ impl Space {
         Self { tally: true, ..Self::new(header, Arc::new(Host)) }
     }
 
-    /// A space in the host's memory for arrays in the shape of a slab.
+    /// A space for arrays in the shape of a slab, where this process keeps its planes.
     pub fn within(&self, slab: &Slab) -> Self {
-        Self { slab: Some([slab.whole, slab.planes.start]), ..Self::new(self.header, Arc::new(Host)) }
+        Self { slab: Some([slab.whole, slab.planes.start]), ..Self::new(self.header, slab.here.clone()) }
     }
 
     /// Whether it only counts: its arrays are empty.

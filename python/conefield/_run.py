@@ -204,7 +204,7 @@ def reconstruct(
     seed
         Seed of all random numbers. The same spec, seed, input and build give the same bits on the CPU.
     backend
-        ``"auto"``, ``"cpu"``, ``"wgpu"`` or ``"wgpu:N"``.
+        ``"auto"``, ``"cpu"``, ``"wgpu"``, ``"wgpu:N"`` or, for a volume that several adapters share, ``"wgpu:N,M"``.
     callback
         Called with a :class:`Progress` at most every ``every`` seconds, and at the end. With ``slices`` it also gets the
         middle slices of a training field. An exception ends the run.

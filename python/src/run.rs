@@ -177,7 +177,8 @@ pub fn reconstruct<'py>(
     let (start, reference, function) = (taken_if(start)?, taken_if(reference)?, callback(function));
     let scan = scan.get();
     let (volume, record, field) = without_lock(py, |watch| {
-        let backend = arguments::backend(&wanted.backend)?.open()?;
+        let backend =
+            arguments::backend(&wanted.backend)?.open_for_run(arguments::seconds("budget", wanted.budget.as_ref())?)?;
         let reference = wanted.reference(scan, reference)?;
         let mut run = wanted.planned(scan.scan.clone(), reference, start.as_ref(), backend.as_ref(), watch, begin)?;
         let mut progress = Progress::new(watch, function);

@@ -156,7 +156,7 @@ impl CompareArgs {
     /// Reads and builds every spec. Names must be distinct and valid as folder names.
     fn methods(&self) -> Result<Vec<Method>> {
         let mut methods: Vec<Method> = vec![];
-        let backend = self.protocol.backend.open()?;
+        let backend = self.protocol.backend.open_for_run(self.protocol.budget)?;
         for spec in &self.specs {
             let method = Method::read(spec, None, &self.protocol.sets, None, backend.as_ref())?;
             let free = !FILES.contains(&&method.name.to_lowercase()[..]);
@@ -205,7 +205,7 @@ impl CompareArgs {
             limits: &self.protocol.ends,
             budget_s: self.protocol.budget,
             sets: &self.protocol.sets,
-            backend: self.protocol.backend,
+            backend: self.protocol.backend.clone(),
             simd: simd_level(),
             threads: rayon::current_num_threads(),
             memory_limit: general.memory,

@@ -183,7 +183,7 @@ impl ReconstructArgs {
         // A spec stores this file name as text; a name that is not UTF-8 would be stored as another one.
         self.init.as_deref().map(boundary::text).transpose()?;
         memory::allow_scratch(boundary::folder_of(&self.output));
-        let backend = self.protocol.backend.open()?;
+        let backend = self.protocol.backend.open_for_run(self.protocol.budget)?;
         // An invalid spec, and weights that cannot be read or do not fit, are reported before anything is created.
         let session = self.session(backend.as_ref(), begin)?;
         let inputs = Inputs::of([&self.scan])

@@ -309,7 +309,7 @@ impl Work<'_> {
             sets: self.study.methods[cell.method].sets.clone(),
             ends: EndOptions { seconds: p.seconds, steps: p.steps.map(u64::from), at_most: p.at_most },
             budget: p.budget,
-            backend: p.backend.unwrap_or_default(),
+            backend: p.backend.clone().unwrap_or_default(),
             reference: match &self.study.cases[cell.case].source {
                 Source::Simulated(_) => Some("truth".into()),
                 Source::Scan { reference, .. } => reference.clone(),

@@ -164,7 +164,7 @@ impl TradeoffArgs {
             sets: sets.to_vec(),
             ends: EndOptions { steps: None, seconds: None, at_most: None },
             budget: Some(budget),
-            backend: self.backend,
+            backend: self.backend.clone(),
             reference: reference.cloned(),
             peak: self.peak,
             hold_out: self.hold_out.0.clone(),

@@ -138,3 +138,50 @@ fn an_interrupted_run_goes_on_on_the_other_backend() {
     // Relative to the volume's largest value: single precision, over 400 steps.
     assert!(scores["psnr"].as_f64().unwrap() > 80.0, "{scores}");
 }
+
+/// Several adapters share a volume, of which one checkpoint is whole; here it is the same adapter twice.
+#[cfg(unix)]
+#[test]
+fn several_adapters_share_a_volume() {
+    use std::process::{Command, Stdio};
+    use std::time::Duration;
+    if !adapter("a volume that adapters share") {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let scan = text(&scan(dir.path(), 24, 12));
+    let at = |name: &str| text(&dir.path().join(name));
+    let run = |name: &str, backend: &str, more: &[&str]| {
+        let (out, backend) = (at(name), format!("--backend={backend}"));
+        let fixed = ["--set=stop.passes=40", "--checkpoint-every=0.01s"];
+        done(&[&["reconstruct", &scan, "--spec", "fista-tv", "-o", &out, &backend][..], &fixed, more].concat())
+    };
+    let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
+        .args(["--quiet", "reconstruct", &scan, "--spec", "fista-tv", "-o", &at("run"), "--backend=wgpu:0,0"])
+        .args(["--set=stop.passes=40", "--checkpoint-every=0.01s"])
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    let checkpoint = dir.path().join("run").join("checkpoint.safetensors");
+    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(checkpoint.exists(), "the run was too fast to be killed");
+    run("cpu", "cpu", &[]);
+    run("run", "wgpu:0,0,0", &["--resume"]);
+    let volume = |name: &str| text(&dir.path().join(name).join("volume.nii.gz"));
+    let scores = done(&["evaluate", &volume("run"), &volume("cpu"), "--json"]);
+    let scores: Value = serde_json::from_str(&scores).unwrap();
+    assert!(scores["psnr"].as_f64().unwrap() > 80.0, "{scores}");
+
+    let refused = |args: &[&str]| refused(1, &[args, &["--backend", "wgpu:0,0"]].concat());
+    let e = refused(&["explain", "fista-tv"]);
+    assert!(e.contains("wgpu:0,0") && e.contains("one adapter"), "{e}");
+    let e = refused(&["reconstruct", &scan, "--budget", "9s", "-o", &at("timed")]);
+    assert!(e.contains("one adapter within a budget"), "{e}");
+    let e = refused(&["reconstruct", &scan, "--spec", "fast", "-o", &at("field")]);
+    assert!(e.contains("a field is trained by one"), "{e}");
+    assert!(!dir.path().join("field").join("spec.toml").exists(), "nothing was begun");
+}

@@ -197,7 +197,7 @@ impl Reading<'_> {
             let source = self.scan(entry, scan, reference)?;
             self.add(&mut cases, entry, Case { name, source, window: own })?;
         }
-        let backend = protocol.backend.unwrap_or_default().open()?;
+        let backend = protocol.backend.clone().unwrap_or_default().open_for_run(None)?;
         let mut methods: Vec<Method> = vec![];
         for entry in &specs {
             let method = self.method(entry, &protocol, backend.as_ref())?;

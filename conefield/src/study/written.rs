@@ -160,7 +160,7 @@ pub struct Protocol {
     /// Settings to change in every spec, as in --set.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub set: Vec<String>,
-    /// auto, cpu, wgpu or wgpu:N [default: auto].
+    /// auto, cpu, wgpu, wgpu:N or wgpu:N,M [default: auto].
     #[serde(deserialize_with = "backend", skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<String>")]
     pub backend: Option<BackendChoice>,

@@ -39,7 +39,7 @@ pub struct Bench<'a> {
     /// Seed of all randomness.
     pub seed: u64,
     /// Reads the start volume that a method names.
-    pub volumes: &'a dyn Fn(&str) -> Result<Volume>,
+    pub volumes: &'a (dyn Fn(&str) -> Result<Volume> + Sync),
     /// Whether to end after the current step.
     pub cancelled: &'a dyn Fn() -> bool,
 }

@@ -149,6 +149,8 @@ pub struct Dual<'a> {
     pub p: [&'a mut Array; 3],
     /// A vector per voxel; 0 if there are none.
     pub guide: Option<Guide<'a>>,
+    /// The slab of [`Penalty::divide`]: sums count its own planes only.
+    pub slab: Option<&'a Slab>,
 }
 
 /// Vectors normal to a volume's edges, which [`Penalty::adapt`] finds: `n = √strength·s/√(|s|² + η²)`, where the slope s

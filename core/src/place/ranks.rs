@@ -1,4 +1,5 @@
-//! A place that several processes share: each keeps a range of planes along the first axis of every array.
+//! A place that several processes share: each keeps a range of planes along the first axis of every array, in the host's
+//! memory or on a device of its own.
 //!
 //! Each process projects its slab of the volume; the partial line integrals are summed where their images are kept.
 //! Images go to every process for the adjoint. A penalty works on a slab with copies of its neighbours' planes, which
@@ -6,17 +7,16 @@
 //!
 //! Sums over processes are taken in the order of their ranks, so that a number of processes always gives the same bits.
 
-use super::map::{Map, Reduction};
+use super::map::{MULTIPLY, Map, Reduction};
 use super::views::filter;
-use super::{Array, FilteredViews, Held, Host, Mask, Penalty, Place, ProximalStep, StatePart, Update, Weighing};
+use super::{Array, FilteredViews, Held, Mask, MeasuredViews, Penalty, Place, StatePart, Weighing, prox_on_host};
 use crate::error::{Error, Result};
 use crate::geometry::Geometry;
-use crate::parallel;
 use crate::voxel::VoxelProjector;
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, s};
 use std::ops::Range;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 
 /// Connects the processes of a run. All of them make the same calls in the same order.
 pub trait Peers: Send + Sync {
@@ -43,6 +43,8 @@ pub struct Slab {
     /// Planes of its neighbours on each side, but for the volume's ends.
     halo: usize,
     wire: Arc<Wire>,
+    /// Where this process keeps its planes.
+    pub(crate) here: Arc<dyn Place>,
 }
 
 impl Slab {
@@ -87,12 +89,22 @@ const PIECE: usize = 1 << 25;
 /// The place of one of several processes.
 pub struct Ranks {
     wire: Arc<Wire>,
+    here: Arc<dyn Place>,
+}
+
+/// Flags of elements in every process, and what its own place works with.
+struct Flags {
+    all: Array3<bool>,
+    /// All of them, for views.
+    whole: OnceLock<Mask>,
+    /// Those of its planes.
+    own: OnceLock<Mask>,
 }
 
 impl Ranks {
-    /// The place of the process that `peers` connects, in the host's memory.
-    pub fn new(peers: Arc<dyn Peers>) -> Self {
-        Self { wire: Arc::new(Wire { peers, sent: AtomicU64::new(0) }) }
+    /// The place of the process that `peers` connects. It keeps its planes in the place `here`.
+    pub fn new(peers: Arc<dyn Peers>, here: Arc<dyn Place>) -> Self {
+        Self { wire: Arc::new(Wire { peers, sent: AtomicU64::new(0) }), here }
     }
 
     /// Bytes that this process has sent to the others.
@@ -123,13 +135,32 @@ impl Ranks {
         self.wire.all(x).iter().sum()
     }
 
-    /// Calls `take` with the planes of `x` in `wanted` for this process, one after another and with their number in
-    /// `wanted`. `wanted` says what each process wants.
-    fn collect(&self, x: Here<'_>, wanted: &[Vec<usize>], mut take: impl FnMut(usize, &[f32])) {
-        let Here { shape: [planes, rows, columns], first, numbers } = x;
+    /// Some planes of this process, in the host's memory.
+    fn read_planes(&self, x: &Array, planes: &[usize], mut into: &mut [f32]) -> Result<()> {
+        let ([_, rows, columns], (first, here)) = (x.shape(), at_hand(x)?);
+        for run in planes.chunk_by(|a, b| a + 1 == *b) {
+            let (to, rest) = into.split_at_mut(run.len() * rows * columns);
+            into = rest;
+            let to = ArrayViewMut3::from_shape([run.len(), rows, columns], to);
+            self.here.store(here, run[0] - first, to.unwrap_or_else(|e| unreachable!("whole planes: {e}")))?;
+        }
+        Ok(())
+    }
+
+    /// The planes of `x` that this process wants. `wanted` says it for each process.
+    fn collected(&self, x: &Array, wanted: &[Vec<usize>]) -> Result<Array3<f32>> {
+        let [planes, rows, columns] = x.shape();
         let (size, me) = (rows * columns, self.rank());
-        let at = |plane: usize| &numbers[(plane - first) * size..(plane - first + 1) * size];
+        let mut found = Array3::zeros([wanted[me].len(), rows, columns]);
+        let all = found.as_slice_mut().unwrap_or_default();
         let parts: Vec<Range<usize>> = (0..self.count()).map(|rank| self.part(rank, planes)).collect();
+        let mut i = 0;
+        for run in wanted[me].chunk_by(|a, b| parts[me].contains(a) == parts[me].contains(b)) {
+            if parts[me].contains(&run[0]) {
+                self.read_planes(x, run, &mut all[i * size..])?;
+            }
+            i += run.len();
+        }
         let together = self.together(size);
         let most = wanted.iter().map(Vec::len).max().unwrap_or(0);
         for turn in (0..most).step_by(together) {
@@ -139,31 +170,24 @@ impl Ranks {
                 let part = &parts[of];
                 some.copied().filter(move |plane| part.contains(plane))
             };
-            let out = |rank| now(rank, me).flat_map(at).copied().collect::<Vec<f32>>();
-            let out: Vec<_> = (0..self.count()).map(out).collect();
+            let out = |rank| {
+                let planes: Vec<usize> = now(rank, me).collect();
+                let mut out = vec![0.0; planes.len() * size];
+                self.read_planes(x, &planes, &mut out).map(|()| out)
+            };
+            let out = (0..self.count()).map(out).collect::<Result<Vec<_>>>()?;
             let mut into: Vec<_> = (0..self.count()).map(|of| vec![0.0; now(me, of).count() * size]).collect();
             self.wire.exchange(&out, &mut into);
             let mut next = vec![0; self.count()];
             for (i, &plane) in wanted[me].iter().enumerate().skip(turn).take(together) {
-                if parts[me].contains(&plane) {
-                    take(i, at(plane));
-                    continue;
+                let of = parts.iter().position(|part| part.contains(&plane)).unwrap_or(me);
+                if of != me {
+                    all[i * size..(i + 1) * size].copy_from_slice(&into[of][next[of]..next[of] + size]);
+                    next[of] += size;
                 }
-                let of = parts.iter().position(|part| part.contains(&plane)).unwrap_or(0);
-                take(i, &into[of][next[of]..next[of] + size]);
-                next[of] += size;
             }
         }
-    }
-
-    /// [`Ranks::collect`] as an array.
-    fn collected(&self, x: Here<'_>, wanted: &[Vec<usize>]) -> Array3<f32> {
-        let [_, rows, columns] = x.shape;
-        let mut found = Array3::zeros([wanted[self.rank()].len(), rows, columns]);
-        let all = found.as_slice_mut().unwrap_or_default();
-        let size = rows * columns;
-        self.collect(x, wanted, |i, plane| all[i * size..(i + 1) * size].copy_from_slice(plane));
-        found
+        Ok(found)
     }
 
     /// Planes of `size` numbers that each process sends to each other one at once.
@@ -176,10 +200,36 @@ impl Ranks {
         vec![planes.to_vec(); self.count()]
     }
 
+    /// An array of this process with as many `planes`, the first of them those that it wants of `x`.
+    fn gathered(&self, x: &Array, wanted: &[Vec<usize>], planes: usize) -> Result<Array> {
+        let ([_, rows, columns], (first, here)) = (x.shape(), at_hand(x)?);
+        let mut out = self.here.zeros([planes, rows, columns])?;
+        let is_own = |rank: usize, plane: &usize| self.part(rank, x.shape()[0]).contains(plane);
+        let others = |(rank, wanted): (usize, &Vec<usize>)| {
+            wanted.iter().copied().filter(|plane| !is_own(rank, plane)).collect::<Vec<usize>>()
+        };
+        let found = self.collected(x, &wanted.iter().enumerate().map(others).collect::<Vec<_>>())?;
+        let mut found = found.outer_iter();
+        let mut at = 0;
+        for run in wanted[self.rank()].chunk_by(|a, b| a + 1 == *b && is_own(self.rank(), a) == is_own(self.rank(), b))
+        {
+            let places: Vec<usize> = (at..at + run.len()).collect();
+            if is_own(self.rank(), &run[0]) {
+                self.here.scatter(here, run[0] - first, &mut out, &places)?;
+            } else {
+                for (i, plane) in places.into_iter().zip(&mut found) {
+                    self.here.load(plane.insert_axis(Axis(0)), &mut out, i)?;
+                }
+            }
+            at += run.len();
+        }
+        Ok(out)
+    }
+
     /// The planes of a slab of `x`, with its neighbours'.
-    fn near(&self, x: Here<'_>, slab: &Slab) -> Array3<f32> {
+    fn near(&self, x: &Array, slab: &Slab) -> Result<Array> {
         let wanted = |rank| around(self.part(rank, slab.whole), slab.halo, slab.whole).collect();
-        self.collected(x, &(0..self.count()).map(wanted).collect::<Vec<_>>())
+        self.gathered(x, &(0..self.count()).map(wanted).collect::<Vec<_>>(), slab.planes.len())
     }
 
     /// Renews the copies of its neighbours' planes in an array of a slab.
@@ -189,7 +239,7 @@ impl Ranks {
             around(own.clone(), slab.halo, slab.whole).filter(|plane| !own.contains(plane)).collect()
         };
         let wanted: Vec<Vec<usize>> = (0..self.count()).map(wanted).collect();
-        let found = self.collected(here(x)?, &wanted);
+        let found = self.collected(x, &wanted)?;
         for (plane, &i) in found.outer_iter().zip(&wanted[self.rank()]) {
             self.load(plane.insert_axis(Axis(0)), x, i)?;
         }
@@ -202,10 +252,10 @@ impl Ranks {
         &self,
         images: &Array,
         count: usize,
-        mut work: impl FnMut(&[usize], Array3<f32>) -> Result<()>,
+        mut work: impl FnMut(&[usize], Array) -> Result<()>,
     ) -> Result<()> {
         for some in self.turns(images.shape(), count) {
-            work(&some, self.collected(here(images)?, &self.to_all(&some)))?;
+            work(&some, self.gathered(images, &self.to_all(&some), some.len())?)?;
         }
         Ok(())
     }
@@ -229,18 +279,6 @@ impl Ranks {
     }
 }
 
-/// The numbers at hand of an array with this shape, from plane `first` on.
-struct Here<'a> {
-    shape: [usize; 3],
-    first: usize,
-    numbers: &'a [f32],
-}
-
-fn here(x: &Array) -> Result<Here<'_>> {
-    let (first, planes) = at_hand(x)?;
-    Ok(Here { shape: x.shape(), first, numbers: planes.slice() })
-}
-
 /// The planes at hand of an array of this place.
 fn at_hand<T>(x: &Held<T>) -> Result<(usize, &Held<T>)> {
     x.planes().ok_or_else(foreign)
@@ -259,20 +297,25 @@ fn around(part: Range<usize>, halo: usize, planes: usize) -> Range<usize> {
     part.start.saturating_sub(halo)..(part.end + halo).min(planes)
 }
 
-/// The flags of some planes.
-fn flags(mask: &Mask, planes: Range<usize>) -> Result<Mask> {
-    let all = mask.on_host().ok_or_else(foreign)?;
-    Ok(Mask::host(all.slice(s![planes, .., ..]).to_owned()))
+/// The mask of `of`, made at the first call.
+fn flags(of: &OnceLock<Mask>, make: impl FnOnce() -> Result<Mask>) -> Result<&Mask> {
+    if let Some(mask) = of.get() {
+        return Ok(mask);
+    }
+    let mask = make()?;
+    Ok(of.get_or_init(|| mask))
 }
 
 impl Place for Ranks {
     fn device(&self) -> Option<String> {
-        None
+        let others = self.count() - 1;
+        let and = if others > 0 { format!(" and {others} more") } else { String::new() };
+        self.here.device().map(|device| device + &and)
     }
 
     fn zeros(&self, [planes, rows, columns]: [usize; 3]) -> Result<Array> {
         let own = self.own(planes);
-        let here = Host.zeros([own.len(), rows, columns])?;
+        let here = self.here.zeros([own.len(), rows, columns])?;
         Ok(Array::part([planes, rows, columns], own.start, here))
     }
 
@@ -281,7 +324,7 @@ impl Place for Ranks {
         let low = first.max(start);
         let high = (first + from.len_of(Axis(0))).min(start + here.shape()[0]);
         if low < high {
-            Host.load(from.slice(s![low - first..high - first, .., ..]), here, low - start)?;
+            self.here.load(from.slice(s![low - first..high - first, .., ..]), here, low - start)?;
         }
         Ok(())
     }
@@ -292,14 +335,14 @@ impl Place for Ranks {
         for (i, mut to) in to.axis_chunks_iter_mut(Axis(0), together).enumerate() {
             let at = first + i * together;
             let planes: Vec<usize> = (at..at + to.len_of(Axis(0))).collect();
-            to.assign(&self.collected(here(from)?, &self.to_all(&planes)));
+            to.assign(&self.collected(from, &self.to_all(&planes))?);
         }
         Ok(())
     }
 
     fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
         if projector.operator().is_additive() {
-            return Ok(());
+            return self.here.admits(projector);
         }
         let expected = "one whose line integrals are the sums of those of slabs, as joseph's";
         Err(Error::invalid("spec", "projector", projector.describe(), expected))
@@ -307,7 +350,7 @@ impl Place for Ranks {
 
     /// By the process with the least memory, so that all of them divide their work alike.
     fn room(&self) -> u64 {
-        let least = self.wire.all(Host.room() as f64).into_iter().fold(f64::INFINITY, f64::min);
+        let least = self.wire.all(self.here.room() as f64).into_iter().fold(f64::INFINITY, f64::min);
         (least as u64).saturating_mul(self.count() as u64)
     }
 
@@ -317,7 +360,8 @@ impl Place for Ranks {
 
     fn slab(&self, planes: usize, halo: usize) -> Option<Slab> {
         let own = self.own(planes);
-        Some(Slab { whole: planes, planes: around(own.clone(), halo, planes), own, halo, wire: self.wire.clone() })
+        let (wire, here) = (self.wire.clone(), self.here.clone());
+        Some(Slab { whole: planes, planes: around(own.clone(), halo, planes), own, halo, wire, here })
     }
 
     fn gather<'a>(&self, x: &'a Array) -> Result<CowArray<'a, f32, Ix3>> {
@@ -325,38 +369,50 @@ impl Place for Ranks {
             return Ok(array.into());
         }
         let all = |rank| if rank == 0 { (0..x.shape()[0]).collect() } else { vec![] };
-        Ok(self.collected(here(x)?, &(0..self.count()).map(all).collect::<Vec<_>>()).into())
+        Ok(self.collected(x, &(0..self.count()).map(all).collect::<Vec<_>>())?.into())
     }
 
     fn fill(&self, x: &mut Array, value: f32) -> Result<()> {
-        Host.fill(at_hand_mut(x)?.1, value)
+        self.here.fill(at_hand_mut(x)?.1, value)
     }
 
-    fn scatter(&self, from: &Array, out: &mut Array, at: &[usize]) -> Result<()> {
+    fn scatter(&self, from: &Array, first: usize, out: &mut Array, at: &[usize]) -> Result<()> {
         let wanted = |rank| {
             let part = self.part(rank, out.shape()[0]);
-            (0..at.len()).filter(|&i| part.contains(&at[i])).collect::<Vec<usize>>()
+            (0..at.len()).filter(|&i| part.contains(&at[i])).map(|i| first + i).collect::<Vec<usize>>()
         };
         let wanted: Vec<_> = (0..self.count()).map(wanted).collect();
-        let found = self.collected(here(from)?, &wanted);
+        let found = self.collected(from, &wanted)?;
         for (plane, &i) in found.outer_iter().zip(&wanted[self.rank()]) {
-            self.load(plane.insert_axis(Axis(0)), out, at[i])?;
+            self.load(plane.insert_axis(Axis(0)), out, at[i - first])?;
         }
         Ok(())
     }
 
+    fn mask(&self, flags: Array3<bool>) -> Result<Mask> {
+        let shape = flags.dim().into();
+        Ok(Mask::there(shape, Flags { all: flags, whole: OnceLock::new(), own: OnceLock::new() }))
+    }
+
+    fn views<'a>(&self, measured: &'a Array3<f32>) -> Result<MeasuredViews<'a>> {
+        self.here.views(measured)
+    }
+
     fn keep(&self, x: &mut Array, inside: &Mask, value: f32) -> Result<()> {
         let (first, here) = at_hand_mut(x)?;
-        Host.keep(here, &flags(inside, first..first + here.shape()[0])?, value)
+        let Flags { all, own, .. } = inside.get::<Flags>().ok_or_else(foreign)?;
+        let planes = first..first + here.shape()[0];
+        let own = flags(own, || self.here.mask(all.slice(s![planes, .., ..]).to_owned()))?;
+        self.here.keep(here, own, value)
     }
 
     fn map(&self, map: &Map, factors: [f64; 2], out: &mut Array, inputs: &[&Array]) -> Result<()> {
         let inputs = inputs.iter().map(|x| Ok(at_hand(x)?.1)).collect::<Result<Vec<_>>>()?;
-        Host.map(map, factors, at_hand_mut(out)?.1, &inputs)
+        self.here.map(map, factors, at_hand_mut(out)?.1, &inputs)
     }
 
     fn reduce(&self, kind: Reduction, x: &Array, y: &Array) -> Result<f64> {
-        let here = Host.reduce(kind, at_hand(x)?.1, at_hand(y)?.1)?;
+        let here = self.here.reduce(kind, at_hand(x)?.1, at_hand(y)?.1)?;
         let all = self.wire.all(here);
         Ok(if kind == Reduction::Maximum { all.into_iter().fold(0.0, f64::max) } else { all.iter().sum() })
     }
@@ -374,13 +430,14 @@ impl Place for Ranks {
         let slab = Geometry { volume: geometry.volume.slab(own.clone()), ..geometry.clone() };
         for some in self.turns(images.shape(), views.len()) {
             let seen: Vec<usize> = some.iter().map(|&i| views[i]).collect();
-            let mut lines = Host.zeros([some.len(), rows, columns])?;
+            let mut lines = self.here.zeros([some.len(), rows, columns])?;
             if !own.is_empty() {
-                Host.forward(projector, &slab, &seen, here, &mut lines)?;
+                self.here.forward(projector, &slab, &seen, here, &mut lines)?;
             }
+            let lines = self.here.read(&lines)?;
             // Images of one process follow each other.
             let of = |rank| some.iter().filter(|i| self.part(rank, count).contains(i)).count() * rows * columns;
-            let mut rest = lines.slice();
+            let mut rest = lines.as_slice().unwrap_or_default();
             let mut blocks = vec![];
             for rank in 0..self.count() {
                 let (block, others) = rest.split_at(of(rank));
@@ -422,7 +479,7 @@ impl Place for Ranks {
             if own.is_empty() {
                 return Ok(());
             }
-            Host.adjoint(projector, &slab, &seen, &Array::host(images), here)
+            self.here.adjoint(projector, &slab, &seen, &images, here)
         })
     }
 
@@ -436,18 +493,21 @@ impl Place for Ranks {
                     let part = self.part(rank, count);
                     part.filter_map(|i| views.get(i)).copied().collect::<Vec<usize>>()
                 };
-                Some(self.collected(here(weights)?, &(0..self.count()).map(wanted).collect::<Vec<_>>()))
+                let wanted: Vec<_> = (0..self.count()).map(wanted).collect();
+                Some(self.gathered(weights, &wanted, at_hand(images)?.1.shape()[0])?)
             }
         };
         let mut sums = [0.0; 2];
         let here = at_hand_mut(images)?.1;
         if !used.is_empty() {
-            sums = Host.compare(&Weighing { weights: None, ..*by }, &views[used.clone()], here)?;
+            let shadow = by.shadow.map(|shadow| {
+                let Flags { all, whole, .. } = shadow.get::<Flags>().ok_or_else(foreign)?;
+                flags(whole, || self.here.mask(all.clone()))
+            });
+            let by = Weighing { shadow: shadow.transpose()?, weights: None, ..*by };
+            sums = self.here.compare(&by, &views[used], here)?;
             if let Some(weights) = weights {
-                Host.change(here, &mut |images| {
-                    let both = images.outer_iter_mut().zip(weights.outer_iter());
-                    parallel::over(both, |_, (mut image, weights)| image.zip_mut_with(&weights, |r, w| *r *= w));
-                })?;
+                self.here.map(&MULTIPLY, [1.0, 0.0], here, &[&weights])?;
             }
         }
         Ok(sums.map(|x| self.sum(x)))
@@ -456,7 +516,8 @@ impl Place for Ranks {
     fn weigh(&self, by: &Weighing<'_>, spread: bool, views: &[usize], images: &mut Array) -> Result<()> {
         let used = self.used(images.shape()[0], views.len());
         let here = at_hand_mut(images)?.1;
-        if used.is_empty() { Ok(()) } else { by.weigh(&Host, spread, &views[used], here) }
+        let by = Weighing { shadow: None, weights: None, ..*by };
+        if used.is_empty() { Ok(()) } else { self.here.weigh(&by, spread, &views[used], here) }
     }
 
     fn filtered(
@@ -467,47 +528,43 @@ impl Place for Ranks {
         slab: &mut Array,
         first: usize,
     ) -> Result<()> {
-        let used = self.used(images.shape()[0], views.len());
-        let here = at_hand_mut(images)?.1;
-        Host.change(here, &mut |images| {
-            filter(work, &views[used.clone()], images);
-        })?;
         let (start, here) = at_hand_mut(slab)?;
-        self.in_turns(images, views.len(), |some, images| {
+        if here.on_host().is_some() {
+            // Each image is filtered once. A device filters all of them faster than it would pass them on.
+            let used = self.used(images.shape()[0], views.len());
+            self.here.change(at_hand_mut(images)?.1, &mut |images| filter(work, &views[used.clone()], images))?;
+        }
+        self.in_turns(images, views.len(), |some, mut images| {
             let seen: Vec<usize> = some.iter().map(|&i| views[i]).collect();
-            Host.change(here, &mut |slab| work.backproject(&seen, images.view(), slab.view_mut(), first + start))
+            let Some(images) = images.on_host() else {
+                return self.here.filtered(work, &seen, &mut images, here, first + start);
+            };
+            let add = &mut |slab: &mut Array3<f32>| {
+                work.backproject(&seen, images.view(), slab.view_mut(), first + start);
+            };
+            self.here.change(here, add)
         })
     }
 
-    fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+    fn prox(&self, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
         let Some(slab) = penalty.slab().cloned() else {
-            return self.update_around(step, penalty);
+            return prox_on_host(self, v, tau, penalty);
         };
         for (_, part) in penalty.state() {
             if let StatePart::Placed(state) = part {
                 self.renew(state, &slab)?;
             }
         }
-        let ProximalStep { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
-        let shape = gradient.shape();
-        let inside = inside.map(|inside| flags(inside, slab.own.clone())).transpose()?;
-        let [gradient, ahead, x] = [gradient, ahead, x].map(Array::slice_mut);
-        let towards = towards.map(|(to, share)| (to.slice(), share));
-        let update = Update { gradient, ahead, x, step, momentum, towards, inside: inside.as_ref().map(Mask::slice) };
-        update.around(|v, u| {
-            let near = self.near(Here { shape, first: slab.own.start, numbers: v }, &slab);
-            let mut all = vec![0.0; near.len()];
-            penalty.prox(near.as_slice().unwrap_or_default(), tau, &mut all);
-            let size = shape[1] * shape[2];
-            u.copy_from_slice(&all[slab.inner().start * size..slab.inner().end * size]);
-        });
-        penalty.fault()
+        let mut near = self.near(v, &slab)?;
+        self.here.prox(&mut near, tau, penalty)?;
+        let own = at_hand_mut(v)?.1;
+        self.here.scatter(&near, slab.inner().start, own, &(0..slab.own.len()).collect::<Vec<_>>())
     }
 
     fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {
         match penalty.slab().cloned() {
             None => Ok(penalty.value(self.read(x)?.view())),
-            Some(slab) => Ok(self.sum(penalty.value(self.near(here(x)?, &slab).view()))),
+            Some(slab) => Ok(self.sum(self.here.penalty(penalty, &self.near(x, &slab)?)?)),
         }
     }
 
@@ -517,7 +574,7 @@ impl Place for Ranks {
         }
         Ok(match penalty.slab().cloned() {
             None => penalty.adapt(self.read(x)?.view()),
-            Some(slab) => penalty.adapt(self.near(here(x)?, &slab).view()).map(|value| self.sum(value)),
+            Some(slab) => self.here.adapt(penalty, &self.near(x, &slab)?)?.map(|value| self.sum(value)),
         })
     }
 }

@@ -197,7 +197,7 @@ impl Sweep {
         // One subset at a time, as in every pass.
         for views in &self.subsets {
             problem.forward(views, &self.work, &mut self.pixels)?;
-            problem.place.scatter(&self.pixels, &mut self.rows, views)?;
+            problem.place.scatter(&self.pixels, 0, &mut self.rows, views)?;
         }
         invert(problem.place, &mut self.rows)?;
         if let [all] = &self.subsets[..] {

@@ -239,7 +239,8 @@ impl TvProx {
             None => Fragment::new(&[if self.edges.is_some() { ALONG_EDGES } else { PLAIN }]),
         };
         let guide = self.edges.as_mut().map(Edges::guide);
-        Some(Dual { fragment, weights: self.g, steps, bounds: self.bounds, p: self.dual.each_mut(), guide })
+        let (p, slab) = (self.dual.each_mut(), self.slab.as_ref());
+        Some(Dual { fragment, weights: self.g, steps, bounds: self.bounds, p, guide, slab })
     }
 
     /// The dual along x, y and z, for a checkpoint.

@@ -169,7 +169,8 @@ fn maps_masks_and_reductions_are_those_of_the_host() {
             }
             let mut out = place.adopt(arrays[0].clone())?;
             place.keep(&mut out, &mask, -3.0)?;
-            place.scatter(&x, &mut out, &[9, 0, 4])?;
+            place.scatter(&x, 0, &mut out, &[9, 0, 4])?;
+            place.scatter(&x, 7, &mut out, &[2, 10])?;
             found.push(place.take(out)?);
             let mut out = place.zeros(shape)?;
             place.fill(&mut out, 1.5)?;
@@ -532,7 +533,7 @@ fn classical_methods_end_where_the_cpu_does() {
 }
 
 /// A scan large enough for its arrays to stand out among what else is moved.
-fn larger() -> Scan {
+pub fn larger() -> Scan {
     let data = Array3::from_shape_fn((40, 44, 48), |(x, y, z)| {
         let d = [x as f32 - 19.5, y as f32 - 21.5, z as f32 - 23.5];
         f32::from(u8::from(d.iter().map(|v| v * v).sum::<f32>() < 300.0)) * 0.01

@@ -1,13 +1,16 @@
 //! Several processes share the arrays of a method: threads stand for them here.
 
 use crate::common::{Heard, Stop, plan, scan, solve_on, spec};
+use crate::device::backends;
+use crate::places::larger;
 use conefield_backend_cpu::Cpu;
+use conefield_backend_wgpu::Wgpu;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::checkpoint::Resume;
 use conefield_core::method::Job;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::place::{Peers, Place, Ranks};
+use conefield_core::place::{Host, Moved, Peers, Place, Ranks};
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
 use ndarray::{Array3, Axis};
@@ -67,15 +70,23 @@ impl Backend for Shared {
     }
 }
 
-/// The results of `work` in each of `count` ranks. A rank that panics would leave the others waiting: it ends the test.
+/// The results of `work` in each of `count` ranks on the host.
 fn each<T: Send>(count: usize, work: impl Fn(&Shared) -> T + Sync) -> Vec<T> {
+    on(&vec![Arc::new(Host) as Arc<dyn Place>; count], work)
+}
+
+/// The results of `work` in each rank, whose arrays live in `places`. A rank that panics would leave the others waiting:
+/// it ends the test.
+fn on<T: Send>(places: &[Arc<dyn Place>], work: impl Fn(&Shared) -> T + Sync) -> Vec<T> {
+    let count = places.len();
     let sent = (0..count).map(|_| Mutex::default()).collect();
     let post = Arc::new(Post { barrier: Barrier::new(count), sent });
     std::thread::scope(|scope| {
         let rank = |rank| {
             let (post, work) = (post.clone(), &work);
             scope.spawn(move || {
-                let run = || work(&Shared(Arc::new(Ranks::new(Arc::new(Thread { rank, count, post })))));
+                let peers = Arc::new(Thread { rank, count, post });
+                let run = || work(&Shared(Arc::new(Ranks::new(peers, places[rank].clone()))));
                 std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).unwrap_or_else(|_| std::process::abort())
             })
         };
@@ -106,9 +117,9 @@ fn smooth() -> Value {
     ]})
 }
 
-#[test]
-fn every_number_of_ranks_ends_where_one_does() {
-    let methods = [
+/// Methods and settings that use the arrays in different ways.
+fn methods() -> Vec<Value> {
+    vec![
         json!({"type": "fdk", "window": "hann", "nonnegative": true}),
         json!({"type": "sart", "subsets": 1, "stop": {"passes": 3}}),
         json!({"type": "sart", "subsets": 3, "stop": {"passes": 3}, "scene": {"support": "carve"}}),
@@ -128,9 +139,13 @@ fn every_number_of_ranks_ends_where_one_does() {
         json!({"type": "fista", "prior": "directional-total-variation", "stop": {"passes": 5},
             "basis": {"type": "cubic", "spacing": 1.5}, "scene": {"support": "carve"}}),
         smooth(),
-    ];
+    ]
+}
+
+#[test]
+fn every_number_of_ranks_ends_where_one_does() {
     let scan = scan();
-    for method in &methods {
+    for method in &methods() {
         let want = volume(method, &scan, &Cpu::new());
         for count in [1, 2, 3, 7] {
             let found = each(count, |backend| volume(method, &scan, backend));
@@ -143,6 +158,60 @@ fn every_number_of_ranks_ends_where_one_does() {
         let mut lost = want.clone();
         lost.index_axis_mut(Axis(0), 7).fill(0.0);
         assert!(off(&lost, &want) > 1e-2, "{method}");
+    }
+}
+
+/// Root mean square of the differences as a share of the largest number.
+fn rms(found: &Array3<f32>, want: &Array3<f32>) -> f32 {
+    let top = want.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+    let squares: f32 = found.iter().zip(want).map(|(a, b)| ((a - b) / top).powi(2)).sum();
+    (squares / want.len() as f32).sqrt()
+}
+
+/// Devices add atomically, in no fixed order: their volumes differ by rounding. Where slopes are next to 0, edges magnify
+/// that.
+#[test]
+fn several_devices_end_where_one_does() {
+    let scan = scan();
+    let devices = backends("several devices");
+    for method in &methods() {
+        for some in [&devices[..devices.len() / 2], &devices[devices.len() / 2..]] {
+            let Some((_, one)) = some.first() else { return };
+            let want = volume(method, &scan, one);
+            let places: Vec<_> = some.iter().map(|(_, device)| device.place()).collect();
+            let found = on(&places, |backend| volume(method, &scan, backend));
+            let error = [off(&found[0], &want), rms(&found[0], &want)];
+            println!("{}, {} devices: {error:?}", method["type"], places.len());
+            assert!(error[0] < 1e-4 && error[1] < 1e-5, "{method}, {} devices: {error:?}", places.len());
+        }
+    }
+}
+
+/// A pass reads the partial line integrals of all views from each device, and its residuals, which the others load. A
+/// device loads the sums of its own views and the others' residuals.
+#[test]
+fn a_pass_moves_the_views_between_devices() {
+    let scan = larger();
+    let devices = backends("bytes between devices");
+    let Some(some) = devices.get(..2) else { return };
+    let moved = |passes: u64| {
+        let before: Vec<_> = some.iter().map(|(_, device)| device.moved()).collect();
+        let method = json!({"type": "sart", "subsets": 1, "stop": {"passes": passes}});
+        let places: Vec<_> = some.iter().map(|(_, device)| device.place()).collect();
+        on(&places, |backend| volume(&method, &scan, backend));
+        let moved = |(before, (_, device)): (&Moved, &(_, Wgpu))| {
+            let now = device.moved();
+            [now.to_device - before.to_device, now.from_device - before.from_device].map(|bytes| bytes as f64)
+        };
+        before.iter().zip(some).map(moved).collect::<Vec<_>>()
+    };
+    let views = 4.0 * scan.projections.len() as f64;
+    for (two, five) in moved(2).into_iter().zip(moved(5)) {
+        for (way, want) in [views, 1.5 * views].into_iter().enumerate() {
+            let each = (five[way] - two[way]) / 3.0;
+            println!("{each} bytes in a pass, {want} of them pixels");
+            assert!(each >= want && each < 1.1 * want, "{each} and {want}");
+        }
     }
 }
 

@@ -57,7 +57,7 @@ pub(super) fn fill(shared: &Shared, room: &mut Room, x: &mut Array, value: f32) 
     Ok(())
 }
 
-pub(super) fn scatter(shared: &Shared, from: &Array, out: &mut Array, at: &[usize]) {
+pub(super) fn scatter(shared: &Shared, (from, first): (&Array, usize), out: &mut Array, at: &[usize]) {
     let plane = 4 * plane(out.shape()) as u64;
     let mut encoder = shared.gpu.device.create_command_encoder(&Default::default());
     for (from_plane, &to_plane) in at.iter().enumerate() {
@@ -65,7 +65,7 @@ pub(super) fn scatter(shared: &Shared, from: &Array, out: &mut Array, at: &[usiz
             let part = parts(x).iter().find(|part| part.planes.contains(&i))?;
             Some((part.buffer.clone(), (i - part.planes.start) as u64 * plane))
         };
-        if let (Some((from, a)), Some((to, b))) = (of(from, from_plane), of(out, to_plane)) {
+        if let (Some((from, a)), Some((to, b))) = (of(from, first + from_plane), of(out, to_plane)) {
             encoder.copy_buffer_to_buffer(&from, a, &to, b, plane);
         }
     }

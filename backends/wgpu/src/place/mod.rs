@@ -20,6 +20,7 @@ use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
 use conefield_core::place::{
     Array, FilteredViews, Map, Mask, MeasuredViews, Place, ProximalStep, Reduction, VariationSlope, Weighing,
+    prox_on_host,
 };
 use conefield_core::regularizer::{Kernels, Penalty};
 use conefield_core::voxel::VoxelProjector;
@@ -45,6 +46,8 @@ pub struct DevicePlace {
 
 /// The parts of an array of this place.
 fn parts<T>(x: &conefield_core::place::Held<T>) -> &[Chunk] {
+    // An array in the shape of a slab.
+    let x = x.planes().map_or(x, |(_, planes)| planes);
     x.get::<Chunks>().map_or_else(|| unreachable!("an array of another place"), |parts| &parts.0)
 }
 
@@ -168,8 +171,8 @@ impl Place for DevicePlace {
         elements::fill(&self.shared, &mut self.room(), x, value)
     }
 
-    fn scatter(&self, from: &Array, out: &mut Array, at: &[usize]) -> Result<()> {
-        elements::scatter(&self.shared, from, out, at);
+    fn scatter(&self, from: &Array, first: usize, out: &mut Array, at: &[usize]) -> Result<()> {
+        elements::scatter(&self.shared, (from, first), out, at);
         Ok(())
     }
 
@@ -250,6 +253,14 @@ impl Place for DevicePlace {
             Some(kernels) => stencils::update(&self.shared, &mut self.room(), step, kernels),
             None => self.update_around(step, penalty),
         }
+    }
+
+    fn prox(&self, v: &mut Array, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+        let Some(kernels) = penalty.kernels() else {
+            return prox_on_host(self, v, tau, penalty);
+        };
+        let iterate = self.zeros(v.shape())?;
+        stencils::prox(&self.shared, &mut self.room(), (v, &iterate), tau, kernels)
     }
 
     fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {

@@ -11,7 +11,7 @@ use crate::compose::fragment_of;
 use crate::source::{Access, Source};
 use Access::{Read, Write};
 use conefield_core::error::Result;
-use conefield_core::place::{ProximalStep, VariationSlope};
+use conefield_core::place::{ProximalStep, Slab, VariationSlope};
 use conefield_core::regularizer::{Bounds, Dual, Guide, Kernels};
 
 /// `Stencil` in `kernels/stencil.wgsl`.
@@ -36,6 +36,11 @@ struct Stencil {
 /// Names of the dual variables and of the vectors that guide the penalty, along x, y and z.
 const DUAL: [&str; 3] = ["dual_x", "dual_y", "dual_z"];
 const GUIDE: [&str; 3] = ["guide_x", "guide_y", "guide_z"];
+/// Bindings of [`PRIMAL`] besides the argument of the proximal map.
+const OF_DUAL: [(&str, Access); 3] = [(DUAL[0], Read), (DUAL[1], Read), (DUAL[2], Read)];
+const BEFORE: [(&str, Access); 1] = [("before", Read)];
+/// The argument of the proximal map within the bounds.
+const CLIPPED: &str = "min(stencil.high, max(stencil.low, gradient[i]))";
 const PRIMAL: (&str, &str) = ("primal", include_str!("../kernels/primal.wgsl"));
 const VALUES: (&str, &str) = ("values", include_str!("../kernels/values.wgsl"));
 /// Bindings of [`VALUES`].
@@ -73,6 +78,22 @@ impl<'a> Volume<'a> {
     fn new(shared: &'a Shared, x: &Array) -> Self {
         let shape = x.shape();
         Self { shared, shape, whole: Stencil { shape: shape.map(|n| n as u32), ..Stencil::default() } }
+    }
+
+    /// With bounds of the result of the proximal map.
+    fn within(mut self, bounds: Bounds) -> Self {
+        // A shader need not know infinity.
+        let [low, high] = [bounds.low, bounds.high].map(|x| x.clamp(f32::MIN, f32::MAX));
+        self.whole = Stencil { low, high, ..self.whole };
+        self
+    }
+
+    /// With the factors of dual steps.
+    fn of_dual(mut self, dual: &Dual<'_>, tau: f32) -> Self {
+        let bound = Dual::bound(dual.weights);
+        self.whole.down = dual.weights.map(|g| g * tau);
+        self.whole.up = dual.weights.map(|g| g / (bound * tau));
+        self
     }
 
     fn uniform(&self, part: &Chunk) -> (&'static str, impl Fn(u32, u32) -> Stencil) {
@@ -123,20 +144,32 @@ impl<'a> Volume<'a> {
         Ok(())
     }
 
-    /// Adds up what a kernel computes on every part.
+    /// Adds up what a kernel computes on every part, or on its own planes of `slab`.
     fn sum(
         &self,
         room: &mut Room,
         (label, source): (&str, &Source),
         arrays: &[(&str, &Array)],
-        beside: &Array,
+        (beside, slab): (&Array, Option<&Slab>),
     ) -> Result<f64> {
         let mut total = 0.0;
+        let counted = slab.map_or(0..self.shape[0], Slab::inner);
         for (k, part) in parts(beside).iter().enumerate() {
             self.beside(room, beside, k)?;
             let bind = Self::bind(k, arrays);
-            let task = Task { label, source, bind: &bind };
-            total += room.sum(self.shared, task, self.uniform(part), self.count(part), false)?[0];
+            let (from, to) = (part.planes.start, part.planes.end);
+            let (first, last) = (counted.start.clamp(from, to), counted.end.clamp(from, to));
+            for (planes, counts) in [(from..first, false), (first..last, true), (last..to, false)] {
+                if planes.is_empty() {
+                    continue;
+                }
+                let (name, uniform) = self.uniform(part);
+                let [at, count] = [planes.start - from, planes.len()].map(|n| (n * plane(self.shape)) as u32);
+                let of = |begin, end| uniform(at + begin, at + end);
+                let task = Task { label, source, bind: &bind };
+                let found = room.sum(self.shared, task, (name, of), count, false)?[0];
+                total += if counts { found } else { 0.0 };
+            }
         }
         Ok(total)
     }
@@ -146,10 +179,8 @@ impl<'a> Volume<'a> {
 fn of_step<'a>(shared: &'a Shared, step: &ProximalStep<'_>, bounds: Bounds) -> Volume<'a> {
     let mut volume = Volume::new(shared, step.x);
     let pull = step.towards.map_or(0.0, |(_, share)| share);
-    // A shader need not know infinity.
-    let [low, high] = [bounds.low, bounds.high].map(|x| x.clamp(f32::MIN, f32::MAX));
-    volume.whole = Stencil { step: step.step, momentum: step.momentum, pull, low, high, ..volume.whole };
-    volume
+    volume.whole = Stencil { step: step.step, momentum: step.momentum, pull, ..volume.whole };
+    volume.within(bounds)
 }
 
 /// Overwrites the gradient with the argument of the proximal map.
@@ -185,7 +216,7 @@ fn extrapolation(u: &str) -> String {
 /// Ends an update without a penalty: the proximal map only clips.
 fn finish(shared: &Shared, room: &mut Room, step: ProximalStep<'_>, bounds: Bounds) -> Result<()> {
     let flat = [("gradient", Read), ("x", Write), ("ahead", Write)];
-    let source = kernel(&flat, &[], &extrapolation("min(stencil.high, max(stencil.low, gradient[i]))"));
+    let source = kernel(&flat, &[], &extrapolation(CLIPPED));
     let arrays: [(&str, &Array); 3] = [("gradient", step.gradient), ("x", step.x), ("ahead", step.ahead)];
     of_step(shared, &step, bounds).run(room, ("extrapolation", &source), &arrays, None)
 }
@@ -198,31 +229,64 @@ pub(super) fn update(shared: &Shared, room: &mut Room, step: ProximalStep<'_>, k
     if step.tau < f32::MIN_POSITIVE {
         return finish(shared, room, step, bounds);
     }
-    let mut volume = of_step(shared, &step, bounds);
-    let bound = Dual::bound(dual.weights);
-    volume.whole.down = dual.weights.map(|g| g * step.tau);
-    volume.whole.up = dual.weights.map(|g| g / (bound * step.tau));
-    let p: [(&str, &Array); 3] = std::array::from_fn(|k| (DUAL[k], &*dual.p[k]));
-    let fragment = fragment_of("the prior", Some(dual.fragment.clone()))?.named("penalty_");
-    let of_dual = |access| DUAL.map(|name| (name, access));
-    let before = [("before", Read)];
+    let volume = of_step(shared, &step, bounds).of_dual(&dual, step.tau);
     // The iterate of the dual steps has the memory of the next point, which is overwritten at the end.
-    let primal = [&of_dual(Read)[..], &[("gradient", Read), ("ahead", Write)], &before].concat();
-    let primal = kernel(&primal, &[PRIMAL], "ahead[i] = primal_of(i);");
-    let mut bindings = [&of_dual(Write)[..], &BESIDE].concat();
-    let mut arrays = [&p[..], &[("values", &*step.ahead)]].concat();
-    let guide = guided(&dual, &mut bindings, &mut arrays);
-    let body = include_str!("../kernels/ascend.wgsl").replace("GUIDE", guide);
-    let ascend = kernel(&bindings, &[VALUES, ("penalty", &fragment)], &body);
-    let of_primal = [&p[..], &[("gradient", &*step.gradient), ("ahead", &*step.ahead)]].concat();
-    for _ in 0..dual.steps {
-        volume.run(room, ("primal of the prior", &primal), &of_primal, Some(p[0].1))?;
-        volume.run(room, ("dual of the prior", &ascend), &arrays, Some(step.ahead))?;
-    }
+    dual_steps(&volume, room, &dual, [step.gradient, step.ahead])?;
+    let p = duals(&dual);
     let flat = [("gradient", Read), ("x", Write), ("ahead", Write)];
-    let source = kernel(&[&of_dual(Read)[..], &flat, &before].concat(), &[PRIMAL], &extrapolation("primal_of(i)"));
+    let source = kernel(&[&OF_DUAL[..], &flat, &BEFORE].concat(), &[PRIMAL], &extrapolation("primal_of(i)"));
     let arrays = [&p[..], &[("gradient", &*step.gradient), ("x", &*step.x), ("ahead", &*step.ahead)]].concat();
     volume.run(room, ("extrapolation", &source), &arrays, Some(p[0].1))
+}
+
+/// [`conefield_core::place::Place::prox`] with kernels. `iterate` is for the dual steps.
+pub(super) fn prox(
+    shared: &Shared,
+    room: &mut Room,
+    (v, iterate): (&Array, &Array),
+    tau: f32,
+    kernels: Kernels<'_>,
+) -> Result<()> {
+    let (Kernels::Clip(bounds) | Kernels::Dual(Dual { bounds, .. })) = kernels;
+    let volume = Volume::new(shared, v).within(bounds);
+    let label = "proximal map of the prior";
+    let dual = match kernels {
+        Kernels::Dual(dual) if tau >= f32::MIN_POSITIVE => dual,
+        _ => {
+            let source = kernel(&[("gradient", Write)], &[], &format!("gradient[i] = {CLIPPED};"));
+            return volume.run(room, (label, &source), &[("gradient", v)], None);
+        }
+    };
+    let volume = volume.of_dual(&dual, tau);
+    dual_steps(&volume, room, &dual, [v, iterate])?;
+    let p = duals(&dual);
+    let bindings = [&OF_DUAL[..], &[("gradient", Write)], &BEFORE].concat();
+    let source = kernel(&bindings, &[PRIMAL], "gradient[i] = primal_of(i);");
+    volume.run(room, (label, &source), &[&p[..], &[("gradient", v)]].concat(), Some(p[0].1))
+}
+
+/// The dual variables by name.
+fn duals<'a>(dual: &'a Dual<'_>) -> [(&'static str, &'a Array); 3] {
+    std::array::from_fn(|k| (DUAL[k], &*dual.p[k]))
+}
+
+/// Makes the dual steps of the proximal map of `v`. `iterate` is overwritten.
+fn dual_steps(volume: &Volume<'_>, room: &mut Room, dual: &Dual<'_>, [v, iterate]: [&Array; 2]) -> Result<()> {
+    let p = duals(dual);
+    let fragment = fragment_of("the prior", Some(dual.fragment.clone()))?.named("penalty_");
+    let primal = [&OF_DUAL[..], &[("gradient", Read), ("ahead", Write)], &BEFORE].concat();
+    let primal = kernel(&primal, &[PRIMAL], "ahead[i] = primal_of(i);");
+    let mut bindings = [&DUAL.map(|name| (name, Write))[..], &BESIDE].concat();
+    let mut arrays = [&p[..], &[("values", iterate)]].concat();
+    let guide = guided(dual, &mut bindings, &mut arrays);
+    let body = include_str!("../kernels/ascend.wgsl").replace("GUIDE", guide);
+    let ascend = kernel(&bindings, &[VALUES, ("penalty", &fragment)], &body);
+    let of_primal = [&p[..], &[("gradient", v), ("ahead", iterate)]].concat();
+    for _ in 0..dual.steps {
+        volume.run(room, ("primal of the prior", &primal), &of_primal, Some(p[0].1))?;
+        volume.run(room, ("dual of the prior", &ascend), &arrays, Some(iterate))?;
+    }
+    Ok(())
 }
 
 /// Adds the bindings and arrays of the vectors that guide a penalty. Returns the vector at voxel i in WGSL.
@@ -248,7 +312,7 @@ pub(super) fn value(shared: &Shared, room: &mut Room, dual: &Dual<'_>, x: &Array
     summing(&mut source, "stencil", &body, false);
     let mut volume = Volume::new(shared, x);
     volume.whole.up = dual.weights;
-    volume.sum(room, ("value of the prior", &source), &arrays, x)
+    volume.sum(room, ("value of the prior", &source), &arrays, (x, dual.slab))
 }
 
 /// Finds the edges of `x` that guide a penalty. Returns the new value.
@@ -261,9 +325,14 @@ pub(super) fn adapt(shared: &Shared, room: &mut Room, dual: Dual<'_>, x: &Array)
         let mut slopes = begun(&[&n[..], &BESIDE].concat(), &[VALUES, edges]);
         summing(&mut slopes, "stencil", include_str!("../kernels/edge_slopes.wgsl"), false);
         let vectors: [(&str, &Array); 3] = std::array::from_fn(|k| (GUIDE[k], &*vectors[k]));
-        let squares = volume.sum(room, ("edges", &slopes), &[&vectors[..], &[("values", x)]].concat(), x)?;
+        let squares =
+            volume.sum(room, ("edges", &slopes), &[&vectors[..], &[("values", x)]].concat(), (x, dual.slab))?;
+        let mean = match dual.slab {
+            None => squares / x.len() as f64,
+            Some(slab) => slab.sum(squares) / (slab.whole * plane(x.shape())) as f64,
+        };
         volume.whole.step = *strength;
-        volume.whole.momentum = (squares / x.len() as f64) as f32 * scale * scale;
+        volume.whole.momentum = mean as f32 * scale * scale;
         let lengths = kernel(&n, &[], include_str!("../kernels/edge_lengths.wgsl"));
         volume.run(room, ("lengths of edges", &lengths), &vectors, None)?;
     }
@@ -285,5 +354,5 @@ pub(super) fn slope(
     let mut volume = Volume::new(shared, x);
     volume.whole.up = slope.weights;
     volume.whole.step = slope.unit;
-    volume.sum(room, ("slope of total variation", &source), &[("out", out), ("values", x)], x)
+    volume.sum(room, ("slope of total variation", &source), &[("out", out), ("values", x)], (x, None))
 }
