@@ -68,21 +68,24 @@ impl Serialize for BackendChoice {
 impl BackendChoice {
     /// Opens the backend.
     pub fn open(&self) -> Result<Box<dyn Backend>> {
-        if let Some(shared) = ranks::backend() {
-            return match self {
-                Self::Auto | Self::Cpu => Ok(shared),
-                Self::Wgpu { .. } => Err(self.refused("auto or cpu: several processes share CPUs only")),
-            };
-        }
-        Ok(match self {
-            Self::Auto => Box::<Auto>::default(),
-            Self::Cpu => Box::new(Cpu::new()),
+        // Each process takes one of the adapters in turn.
+        let of_process = |rank: usize| match self {
+            Self::Wgpu { adapters } if !adapters.is_empty() => gpu::open(Some(adapters[rank % adapters.len()])),
+            _ => self.open_one(),
+        };
+        ranks::backend(of_process).unwrap_or_else(|| self.open_one())
+    }
+
+    fn open_one(&self) -> Result<Box<dyn Backend>> {
+        match self {
+            Self::Auto => Ok(Box::<Auto>::default()),
+            Self::Cpu => Ok(Box::new(Cpu::new())),
             Self::Wgpu { adapters } => match adapters[..] {
-                [] => gpu::open(None)?,
-                [one] => gpu::open(Some(one))?,
-                _ => return Err(self.refused("one adapter: only a reconstruction shares a volume among several")),
+                [] => gpu::open(None),
+                [one] => gpu::open(Some(one)),
+                _ => Err(self.refused("one adapter: only a reconstruction shares a volume among several")),
             },
-        })
+        }
     }
 
     /// Opens the backend of a reconstruction, which several adapters may share. `budget` are its seconds, if it has a

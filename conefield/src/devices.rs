@@ -10,10 +10,10 @@ use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 
-/// A device among several.
-struct Member {
-    device: Box<dyn Backend>,
-    place: Arc<dyn Place>,
+/// A backend among several that share the arrays of a method.
+pub(crate) struct Member {
+    pub(crate) device: Box<dyn Backend>,
+    pub(crate) place: Arc<Ranks>,
 }
 
 /// The backend of several devices: the first one leads.
@@ -40,7 +40,7 @@ impl Backend for Member {
     }
 
     fn compile(&self, _: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
-        Err(Error::unsupported("method", "several devices: a field is trained by one"))
+        Err(Error::unsupported("method", "several processes or devices: a field is trained by one"))
     }
 
     fn place(&self) -> Arc<dyn Place> {

@@ -9,59 +9,45 @@ mod mpi;
 
 pub use mpi::{Joined, start};
 
-use conefield_core::backend::{Backend, Executable, Explain};
-use conefield_core::pipeline::Pipeline;
-use conefield_core::place::{Host, Peers, Place, Ranks};
-use conefield_core::{Error, Result};
+use crate::devices::Member;
+use conefield_core::Result;
+use conefield_core::backend::Backend;
+use conefield_core::place::{Peers, Ranks};
 use std::sync::{Arc, OnceLock};
 
-/// The place that this process shares with others.
-static SHARED: OnceLock<Shared> = OnceLock::new();
+/// The connection to the other processes.
+static PEERS: OnceLock<Arc<dyn Peers>> = OnceLock::new();
 
-#[derive(Clone)]
-struct Shared {
-    rank: usize,
-    count: usize,
-    place: Arc<Ranks>,
-}
+/// The place that this process shares with others.
+static PLACE: OnceLock<Arc<Ranks>> = OnceLock::new();
 
 /// From now on, runs of this process are those of all processes that `peers` connects.
 pub fn join(peers: Arc<dyn Peers>) {
-    let (rank, count) = (peers.rank(), peers.count());
-    let _ = SHARED.set(Shared { rank, count, place: Arc::new(Ranks::new(peers, Arc::new(Host))) });
+    let _ = PEERS.set(peers);
 }
 
 /// Number of processes of a run.
 pub fn count() -> usize {
-    SHARED.get().map_or(1, |shared| shared.count)
+    PEERS.get().map_or(1, |peers| peers.count())
 }
 
 /// The number of this process, from 0. Rank 0 reports and writes.
 pub fn rank() -> usize {
-    SHARED.get().map_or(0, |shared| shared.rank)
+    PEERS.get().map_or(0, |peers| peers.rank())
 }
 
 /// Bytes that this process has sent to the others.
 pub fn sent() -> u64 {
-    SHARED.get().map_or(0, |shared| shared.place.sent())
+    PLACE.get().map_or(0, |place| place.sent())
 }
 
-/// The backend of processes that share their arrays, if there are several.
-pub(crate) fn backend() -> Option<Box<dyn Backend>> {
-    SHARED.get().filter(|shared| shared.count > 1).map(|shared| Box::new(shared.clone()) as Box<dyn Backend>)
-}
-
-impl Backend for Shared {
-    fn name(&self) -> &'static str {
-        "cpu"
-    }
-
-    fn compile(&self, _: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
-        let what = format!("{} processes: a field is trained by one; start it without mpirun", self.count);
-        Err(Error::unsupported("method", what))
-    }
-
-    fn place(&self) -> Arc<dyn Place> {
-        self.place.clone()
-    }
+/// The backend of processes that share their arrays, if there are several. `open` opens that of the process with the given
+/// number.
+pub(crate) fn backend(open: impl FnOnce(usize) -> Result<Box<dyn Backend>>) -> Option<Result<Box<dyn Backend>>> {
+    let peers = PEERS.get().filter(|peers| peers.count() > 1)?;
+    let shared = |device: Box<dyn Backend>| {
+        let place = PLACE.get_or_init(|| Arc::new(Ranks::new(peers.clone(), device.place())));
+        Box::new(Member { device, place: place.clone() }) as Box<dyn Backend>
+    };
+    Some(open(peers.rank()).map(shared))
 }
