@@ -11,7 +11,6 @@ use conefield_core::scene::Scene;
 use rand::seq::index::sample;
 use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{Rng, RngExt};
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
@@ -187,8 +186,11 @@ impl<'a> RaySource<'a> {
             Views::All => self.draw_from_all(count, &mut rng, &mut drawn),
         }
         // A GPU waits meanwhile.
-        let rays = drawn.par_iter().with_min_len(512).map(|&(view, pixel)| self.ray(view, pixel));
-        rays.collect_into_vec(out);
+        let rays = parallel::map(drawn.chunks(512), |_, drawn| {
+            drawn.iter().map(|&(view, pixel)| self.ray(view, pixel)).collect::<Vec<_>>()
+        });
+        out.clear();
+        out.extend(rays.into_iter().flatten());
     }
 
     /// The view of step `step`: every view once per epoch.

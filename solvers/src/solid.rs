@@ -14,7 +14,6 @@ use conefield_core::parallel;
 use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::scene::SupportRule;
 use conefield_core::support::Cylinder;
-use rayon::prelude::*;
 
 /// Most rays in the fit.
 const RAYS: usize = 50_000;
@@ -321,7 +320,10 @@ fn refine(start: Solid, measured: &[Measured], high: f64, pixel: f64) -> Solid {
     let mut damping = 1e-3;
     for _ in 0..60 {
         // Weights are those of the iteration's start, as in iteratively reweighted least squares.
-        let weights: Vec<f64> = measured.par_iter().map(|m| weight(solid.above(m))).collect();
+        let weights = parallel::map(measured.chunks(4096), |_, part| {
+            part.iter().map(|m| weight(solid.above(m))).collect::<Vec<f64>>()
+        });
+        let weights = weights.concat();
         let cost = |solid: &Solid| {
             let one = |(m, w): (&Measured, &f64)| [w * solid.above(m).powi(2)];
             sums(measured, &weights, one)[0]

@@ -2,8 +2,8 @@
 
 use conefield_core::arena::Arena;
 use conefield_core::backend::Adam;
+use conefield_core::parallel;
 use conefield_core::simd::{Op, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use rayon::prelude::*;
 
 const BLOCK: usize = 16_384;
 
@@ -19,14 +19,9 @@ pub fn update(arena: &mut Arena, adam: &Adam) {
         eps: adam.eps as f32,
     };
     let Arena { params, grads, first, second } = arena;
-    let blocks: Vec<_> = params
-        .chunks_mut(BLOCK)
-        .zip(grads.chunks_mut(BLOCK))
-        .zip(first.chunks_mut(BLOCK))
-        .zip(second.chunks_mut(BLOCK))
-        .map(|(((p, g), m), v)| Block { rule, p, g, m, v })
-        .collect();
-    blocks.into_par_iter().for_each(run);
+    let blocks = params.chunks_mut(BLOCK).zip(grads.chunks_mut(BLOCK));
+    let moments = first.chunks_mut(BLOCK).zip(second.chunks_mut(BLOCK));
+    parallel::over(blocks.zip(moments), |_, ((p, g), (m, v))| run(Block { rule, p, g, m, v }));
 }
 
 #[derive(Clone, Copy)]

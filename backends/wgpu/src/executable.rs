@@ -11,11 +11,11 @@ use crate::{Gpu, Shared};
 use conefield_core::backend::{Adam, BlockWork, Executable, StepStats, Work};
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;
+use conefield_core::parallel;
 use conefield_core::pipeline::Model;
 use conefield_core::prior::Prior;
 use conefield_core::stage::{Projector, UnitRay};
 use conefield_core::wgsl::Fragment;
-use rayon::prelude::*;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
@@ -241,14 +241,11 @@ impl Wgpu {
     fn compile(&mut self) -> Result<()> {
         let Shared { gpu, kernels, .. } = &*self.shared;
         let of_step = |label: &str| !["evaluate", "encode", "lines"].contains(&label);
-        let compiled: Result<Vec<_>> = self
-            .kernels
-            .sources
-            .par_iter()
-            .filter(|(label, _)| of_step(label) && !self.compiled.contains_key(*label))
-            .map(|(label, source)| Ok((label.clone(), kernels.get(gpu, label, source)?)))
-            .collect();
-        self.compiled.extend(compiled?);
+        let missing = |(label, _): &(&String, &Source)| of_step(label) && !self.compiled.contains_key(*label);
+        let missing = self.kernels.sources.iter().filter(missing);
+        let compiled =
+            parallel::map(missing, |_, (label, source)| Ok((label.clone(), kernels.get(gpu, label, source)?)));
+        self.compiled.extend(compiled.into_iter().collect::<Result<Vec<_>>>()?);
         Ok(())
     }
 

@@ -8,7 +8,6 @@ use super::shape::{M3, Shape, Slope, V3, apply, dot};
 use conefield_core::parallel;
 use conefield_core::simd::{self, Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, store};
 use conefield_core::stage::UnitGrid;
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// Cutoff of a Gaussian in standard deviations. The truncated part of its integral is 0.1 %, less than for line
@@ -42,16 +41,19 @@ impl Grid {
             let first = at(centre - reach).ceil().max(0.0) as usize;
             first..((at(centre + reach).floor() + 1.0).max(0.0) as usize).min(grid.shape[k])
         };
-        let found = shapes.par_iter().enumerate().filter_map(|(index, shape)| {
+        let found = |(index, shape): (usize, &Shape)| {
             if shape.density == 0.0 {
                 return None;
             }
             let reach = shape.reach(EXTENT);
             let points: [Range<usize>; 3] = std::array::from_fn(|k| range(shape.centre[k], reach[k], k));
             points.iter().all(|r| !r.is_empty()).then_some(Reach { index, points })
+        };
+        let parts = parallel::map(shapes.chunks(1024), |n, shapes| {
+            (n * 1024..).zip(shapes).filter_map(found).collect::<Vec<_>>()
         });
         self.reaching.clear();
-        self.reaching.par_extend(found);
+        self.reaching.extend(parts.into_iter().flatten());
         let reaching = &self.reaching;
         self.slabs.fill(grid.shape[0].div_ceil(PLANES), reaching.len(), |i, put| {
             let x = &reaching[i].points[0];
@@ -73,7 +75,7 @@ impl Grid {
     /// values of the grid.
     pub fn slopes<R: Real>(&self, grid: &UnitGrid, shapes: &[Shape], by: &[R]) -> Vec<(usize, Slope)> {
         let mut all = vec![(0, Slope::default()); self.reaching.len()];
-        all.par_chunks_mut(CHUNK).zip(self.reaching.par_chunks(CHUNK)).for_each(|(out, reaching)| {
+        parallel::over(all.chunks_mut(CHUNK).zip(self.reaching.chunks(CHUNK)), |_, (out, reaching)| {
             simd::run(Collect { grid, shapes, reaching, by, out });
         });
         all

@@ -3,7 +3,6 @@
 
 use conefield_core::parallel;
 use conefield_core::simd::{self, Op, Simd, SimdBase, SimdFloat, V, load, store};
-use rayon::prelude::*;
 
 /// Pixels on each side of the window's centre.
 const REACH: usize = 5;
@@ -47,30 +46,25 @@ impl Ssim {
         slopes.iter_mut().for_each(|s| s.resize(found.len(), 0.0));
         let [m1, m2, a, b, c] = &*maps;
         let [by_mean, by_square, by_product] = slopes;
-        let sums: Vec<f64> = by_mean
-            .par_chunks_mut(stride)
-            .zip(by_square.par_chunks_mut(stride))
-            .zip(by_product.par_chunks_mut(stride))
-            .enumerate()
-            .map(|(row, ((by_mean, by_square), by_product))| {
-                let mut sum = 0.0;
-                for i in 0..stride {
-                    let at = row * stride + i;
-                    let (x, y) = (m1[at], m2[at]);
-                    let (vx, vy, vxy) = (a[at] - x * x, b[at] - y * y, c[at] - x * y);
-                    let (a1, a2) = (2.0 * x * y + c1, 2.0 * vxy + c2);
-                    let (b1, b2) = (x * x + y * y + c1, vx + vy + c2);
-                    let s = a1 * a2 / (b1 * b2);
-                    // Windows centred on padding do not count.
-                    let weight = if i < columns { weight } else { 0.0 };
-                    sum += if i < columns { f64::from(s) } else { 0.0 };
-                    by_mean[i] = weight * 2.0 * (y * (a2 - a1) / (b1 * b2) + x * s * (1.0 / b2 - 1.0 / b1));
-                    by_square[i] = -weight * s / b2;
-                    by_product[i] = weight * 2.0 * a1 / (b1 * b2);
-                }
-                sum
-            })
-            .collect();
+        let rows = by_mean.chunks_mut(stride).zip(by_square.chunks_mut(stride)).zip(by_product.chunks_mut(stride));
+        let sums = parallel::map(rows, |row, ((by_mean, by_square), by_product)| {
+            let mut sum = 0.0;
+            for i in 0..stride {
+                let at = row * stride + i;
+                let (x, y) = (m1[at], m2[at]);
+                let (vx, vy, vxy) = (a[at] - x * x, b[at] - y * y, c[at] - x * y);
+                let (a1, a2) = (2.0 * x * y + c1, 2.0 * vxy + c2);
+                let (b1, b2) = (x * x + y * y + c1, vx + vy + c2);
+                let s = a1 * a2 / (b1 * b2);
+                // Windows centred on padding do not count.
+                let weight = if i < columns { weight } else { 0.0 };
+                sum += if i < columns { f64::from(s) } else { 0.0 };
+                by_mean[i] = weight * 2.0 * (y * (a2 - a1) / (b1 * b2) + x * s * (1.0 / b2 - 1.0 / b1));
+                by_square[i] = -weight * s / b2;
+                by_product[i] = weight * 2.0 * a1 / (b1 * b2);
+            }
+            sum
+        });
         for (slope, map) in [by_mean, by_square, by_product].into_iter().zip(maps.iter_mut()) {
             blur(&taps, [slope, &[]], map, between, stride);
         }

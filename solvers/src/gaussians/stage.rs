@@ -6,11 +6,11 @@
 use super::grid::{self, Grid};
 use super::shape::{DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, Slope, V3, apply, cross, dot};
 use super::view;
+use conefield_core::parallel;
 use conefield_core::simd::Real;
 use conefield_core::stage::{
     Field, GradKind, Grads, Info, Kernel, Lines, OnGrid, Parameter, Scope, Stage, Tile, TileMut, UnitGrid, UnitRay,
 };
-use rayon::prelude::*;
 use std::f64::consts::TAU;
 use std::ops::Range;
 
@@ -34,7 +34,11 @@ pub fn shapes<R: Real>(params: &[R]) -> Vec<Shape> {
 
 /// Like [`shapes`], into a vector that keeps its memory.
 pub fn reshape<R: Real>(params: &[R], all: &mut Vec<Shape>) {
-    params.par_chunks(NUMBERS).with_min_len(256).map(Shape::of).collect_into_vec(all);
+    let parts = parallel::map(params.chunks(CHUNK * NUMBERS), |_, part| {
+        part.chunks(NUMBERS).map(Shape::of).collect::<Vec<_>>()
+    });
+    all.clear();
+    all.extend(parts.into_iter().flatten());
 }
 
 /// Adds the part of `slope`, of the Gaussian `index`, that falls into `grads`.

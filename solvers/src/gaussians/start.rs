@@ -16,7 +16,6 @@ use conefield_core::random::stream;
 use conefield_core::scan::Volume;
 use conefield_core::scene::Scene;
 use rand::seq::index::sample;
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::cmp::Ordering;
@@ -288,7 +287,9 @@ fn widths(points: &[V3]) -> Vec<f64> {
         let found: Vec<f64> = nearest.into_iter().filter(|d| d.is_finite()).collect();
         (found.iter().sum::<f64>() / found.len().max(1) as f64).sqrt()
     };
-    points.par_iter().enumerate().map(near).collect()
+    let parts = points.chunks(256).enumerate();
+    let widths = |_, (n, part): (usize, &[V3])| (n * 256..).zip(part).map(near).collect::<Vec<_>>();
+    parallel::map(parts, widths).concat()
 }
 
 #[cfg(test)]

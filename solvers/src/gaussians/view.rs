@@ -17,7 +17,6 @@ use super::lists::Lists;
 use super::shape::{M3, Shape, Slope, V3, apply, cross, dot};
 use conefield_core::parallel;
 use conefield_core::simd::{self, Op, Real, Select, Simd, SimdBase, SimdFloat, V, WIDEST};
-use rayon::prelude::*;
 use std::f64::consts::TAU;
 use std::ops::Range;
 
@@ -248,8 +247,10 @@ impl<R: Real> Sight<R> {
     fn look(&mut self, beam: &Beam, shapes: &[Shape]) {
         let normal = cross(beam.u, beam.v);
         self.seen.resize(shapes.len(), Footprint::default());
-        self.seen.par_iter_mut().zip(shapes).with_min_len(CHUNK).for_each(|(seen, shape)| {
-            *seen = beam.footprint(shape, normal).unwrap_or_default();
+        parallel::over(self.seen.chunks_mut(CHUNK).zip(shapes.chunks(CHUNK)), |_, (seen, shapes)| {
+            for (seen, shape) in seen.iter_mut().zip(shapes) {
+                *seen = beam.footprint(shape, normal).unwrap_or_default();
+            }
         });
         let seen = &self.seen;
         self.strips.fill(beam.detector[0].div_ceil(STRIP), seen.len(), |i, put| {

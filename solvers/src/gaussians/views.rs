@@ -10,6 +10,7 @@ use conefield_core::backend::{Adam, BlockWork, Executable, StepStats, Work};
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::{Geometry, sub};
 use conefield_core::loss::Loss;
+use conefield_core::parallel;
 use conefield_core::pipeline::Model;
 use conefield_core::random::stream;
 use conefield_core::scan::{Scan, ScanHeader};
@@ -17,10 +18,11 @@ use conefield_core::scene::Scene;
 use conefield_core::simd::{self, Op, Select, Simd, SimdBase, SimdFloat, V, WIDEST, load, store};
 use conefield_core::stage::{UnitGrid, UnitRay};
 use rand::seq::SliceRandom;
-use rayon::prelude::*;
 
 /// Rays that a worker renders at once.
 const TOGETHER: usize = 64;
+/// Shapes or points per task.
+const PART: usize = 256;
 /// Period of the parameter kinds: a whole number of vectors.
 const PATTERN: usize = NUMBERS * WIDEST;
 
@@ -79,7 +81,7 @@ impl ViewTraining {
         for (out, row) in measured.chunks_mut(stride).zip(rows) {
             out.iter_mut().zip(row).for_each(|(out, a)| *out = scene.line_to_unit(*a));
         }
-        let top = measured.par_iter().map(|x| f64::from(*x)).reduce(|| 1e-12, f64::max);
+        let top = measured.iter().fold(1e-12, |top: f64, x| top.max(f64::from(*x)));
         let mut rates = [1.0; PATTERN];
         for (i, rate) in rates.iter_mut().enumerate() {
             *rate = match i % NUMBERS {
@@ -139,23 +141,19 @@ impl ViewTraining {
         sight.project(beam, shapes, found);
         let share = 1.0 / rule.views as f64;
         let scale = share / (rows * columns) as f64;
-        let sums: Vec<f64> = found
-            .par_chunks_mut(stride)
-            .zip(gradient.par_chunks_mut(stride))
-            .zip(wanted.par_chunks(stride))
-            .map(|((found, gradient), wanted)| {
-                let mut sum = 0.0;
-                for ((a, g), p) in found.iter().zip(gradient.iter_mut()).zip(wanted).take(columns) {
-                    let (value, slope) = loss.at(f64::from(*a), f64::from(*p));
-                    sum += value;
-                    *g = (slope * scale) as f32;
-                }
-                // Vectors reach past the last pixel.
-                found[columns..].fill(0.0);
-                gradient[columns..].fill(0.0);
-                sum
-            })
-            .collect();
+        let rows_of = found.chunks_mut(stride).zip(gradient.chunks_mut(stride)).zip(wanted.chunks(stride));
+        let sums = parallel::map(rows_of, |_, ((found, gradient), wanted)| {
+            let mut sum = 0.0;
+            for ((a, g), p) in found.iter().zip(gradient.iter_mut()).zip(wanted).take(columns) {
+                let (value, slope) = loss.at(f64::from(*a), f64::from(*p));
+                sum += value;
+                *g = (slope * scale) as f32;
+            }
+            // Vectors reach past the last pixel.
+            found[columns..].fill(0.0);
+            gradient[columns..].fill(0.0);
+            sum
+        });
         let mut unlike = 0.0;
         if rule.ssim > 0.0 {
             let weight = -rule.ssim * share;
@@ -216,11 +214,15 @@ impl Executable for ViewTraining {
             stats.loss += loss;
             stats.prior += unlike;
             stats.samples += self.beams[view].detector.iter().product::<usize>() as u64;
-            let seen = self.slopes.par_iter().zip(&self.shapes).zip(arena.params.par_chunks(NUMBERS));
-            arena.grads.par_chunks_mut(NUMBERS).zip(seen).with_min_len(256).for_each(|(g, ((slope, shape), p))| {
-                if shape.density > 0.0 {
-                    let more = slope.by_parameters(p, shape);
-                    g.iter_mut().zip(more).for_each(|(g, more)| *g += more as f32);
+            let (slopes, shapes) = (&self.slopes, &self.shapes);
+            let parts = arena.grads.chunks_mut(PART * NUMBERS).zip(arena.params.chunks(PART * NUMBERS));
+            parallel::over(parts, |n, (grads, params)| {
+                let those = slopes.iter().zip(shapes).skip(n * PART);
+                for ((g, p), (slope, shape)) in grads.chunks_mut(NUMBERS).zip(params.chunks(NUMBERS)).zip(those) {
+                    if shape.density > 0.0 {
+                        let more = slope.by_parameters(p, shape);
+                        g.iter_mut().zip(more).for_each(|(g, more)| *g += more as f32);
+                    }
                 }
             });
         }
@@ -242,13 +244,17 @@ impl Executable for ViewTraining {
         };
         let [least, widest] = self.rule.widths.map(|w| w.ln() as f32);
         let arena = &mut model.arena;
-        let parts = arena.params.par_chunks_mut(PATTERN).zip(arena.grads.par_chunks_mut(PATTERN));
-        let moments = arena.first.par_chunks_mut(PATTERN).zip(arena.second.par_chunks_mut(PATTERN));
-        parts.zip(moments).with_min_len(64).for_each(|((p, g), (m, v))| {
-            simd::run(AdamStep { rule, p: &mut *p, g, m, v });
-            for p in p.chunks_mut(NUMBERS).filter(|p| p[DENSITY] > FREE) {
-                p[CENTRE..SCALE].iter_mut().for_each(|x| *x = x.clamp(0.0, 1.0));
-                p[SCALE..ROTATION].iter_mut().for_each(|x| *x = x.clamp(least, widest));
+        const SIZE: usize = 64 * PATTERN;
+        let parts = arena.params.chunks_mut(SIZE).zip(arena.grads.chunks_mut(SIZE));
+        let moments = arena.first.chunks_mut(SIZE).zip(arena.second.chunks_mut(SIZE));
+        parallel::over(parts.zip(moments), |_, ((p, g), (m, v))| {
+            let parts = p.chunks_mut(PATTERN).zip(g.chunks_mut(PATTERN));
+            for ((p, g), (m, v)) in parts.zip(m.chunks_mut(PATTERN).zip(v.chunks_mut(PATTERN))) {
+                simd::run(AdamStep { rule, p: &mut *p, g, m, v });
+                for p in p.chunks_mut(NUMBERS).filter(|p| p[DENSITY] > FREE) {
+                    p[CENTRE..SCALE].iter_mut().for_each(|x| *x = x.clamp(0.0, 1.0));
+                    p[SCALE..ROTATION].iter_mut().for_each(|x| *x = x.clamp(least, widest));
+                }
             }
         });
         Ok(())
@@ -257,8 +263,10 @@ impl Executable for ViewTraining {
     fn evaluate(&mut self, model: &Model, points: &[[f32; 3]], out: &mut [f32]) -> Result<()> {
         reshape(&model.arena.params, &mut self.shapes);
         let (shapes, cells) = (&self.shapes, Cells::new(&self.shapes));
-        out.par_iter_mut().zip(points).with_min_len(256).for_each(|(out, p)| {
-            *out = cells.value(shapes, p.map(f64::from)) as f32;
+        parallel::over(out.chunks_mut(PART).zip(points.chunks(PART)), |_, (out, points)| {
+            for (out, p) in out.iter_mut().zip(points) {
+                *out = cells.value(shapes, p.map(f64::from)) as f32;
+            }
         });
         Ok(())
     }
@@ -269,8 +277,8 @@ impl Executable for ViewTraining {
 
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()> {
         if let Some(lines) = model.pipeline.field.lines() {
-            let parts = out.par_chunks_mut(TOGETHER).zip(rays.par_chunks(TOGETHER));
-            parts.for_each(|(out, rays)| lines.project(&model.arena.params, rays, out));
+            let parts = out.chunks_mut(TOGETHER).zip(rays.chunks(TOGETHER));
+            parallel::over(parts, |_, (out, rays)| lines.project(&model.arena.params, rays, out));
         }
         Ok(())
     }

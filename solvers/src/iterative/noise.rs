@@ -1,10 +1,11 @@
 //! Estimates the noise of a scan from the scan alone.
 
 use conefield_core::data_term::Misfit;
+use conefield_core::parallel;
 use conefield_core::scan::ScanHeader;
 use conefield_core::wgsl::Fragment;
-use ndarray::{ArrayView3, Axis};
-use rayon::prelude::*;
+use ndarray::ArrayView3;
+use rayon::slice::ParallelSliceMut;
 
 /// Approximate number of pixels used.
 const LOOKED_AT: usize = 4 << 20;
@@ -114,7 +115,7 @@ fn differences(measured: ArrayView3<'_, f32>) -> Vec<(f32, f32)> {
     // Outside the object negative noise is often clipped.
     let least = 0.1 * top;
     let every = measured.len().div_ceil(LOOKED_AT).max(1);
-    let view = |(n, view): (usize, ndarray::ArrayView2<'_, f32>)| {
+    let view = |n: usize, view: ndarray::ArrayView2<'_, f32>| {
         let mut found = vec![];
         for row in view.rows() {
             for c in (1 + n % every..row.len().saturating_sub(1)).step_by(every) {
@@ -126,7 +127,7 @@ fn differences(measured: ArrayView3<'_, f32>) -> Vec<(f32, f32)> {
         }
         found
     };
-    measured.axis_iter(Axis(0)).into_par_iter().enumerate().flat_map_iter(view).collect()
+    parallel::map(measured.outer_iter(), view).concat()
 }
 
 /// The least-squares line through `ln σ²` over the line integral; constant if it would fall.

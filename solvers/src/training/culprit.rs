@@ -3,9 +3,9 @@
 use crate::training::run::{HINT, Run, strayed};
 use conefield_core::backend::Work;
 use conefield_core::error::Error;
+use conefield_core::parallel;
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::stage::{Stage, Tile, TileMut, UnitRay};
-use rayon::prelude::*;
 
 /// Points looked at on each ray.
 const POINTS: usize = 128;
@@ -31,8 +31,8 @@ fn culprit(model: &Model, work: &Work<'_>) -> Option<String> {
         return None;
     }
     // Of several rays, the one that fails in the earliest stage.
-    let found = work.rays.par_iter().filter_map(|r| on_ray(pipeline, &model.arena.params, &r.ray));
-    found.min_by_key(|(stage, ..)| *stage).map(|(stage, [x, y, z], value)| {
+    let found = parallel::map(work.rays, |_, r| on_ray(pipeline, &model.arena.params, &r.ray));
+    found.into_iter().flatten().min_by_key(|(stage, ..)| *stage).map(|(stage, [x, y, z], value)| {
         let (name, stage) = &pipeline.stages()[stage];
         format!("{name} ({}), {value} at ({x:.3}, {y:.3}, {z:.3}) of the unit cube", stage.describe())
     })

@@ -8,9 +8,9 @@ use super::{Array, parts, plane};
 use crate::Shared;
 use crate::source::{Access, Source};
 use conefield_core::error::Result;
+use conefield_core::parallel;
 use conefield_core::place::FilteredViews;
 use conefield_core::voxel::VoxelView;
-use rayon::prelude::*;
 use wgpu::BufferUsages as U;
 
 /// Bytes of filtered views on the device at once.
@@ -101,7 +101,7 @@ pub(super) fn backproject(
     for part in parts(images) {
         let Some(of_part) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
         for (k, some) in of_part.chunks(chunk).enumerate() {
-            let all: Vec<_> = some.par_iter().map(|&v| work.weights(v)).collect();
+            let all = parallel::map(some, |_, &v| work.weights(v));
             let wide = |x: [f64; 3]| [x[0] as f32, x[1] as f32, x[2] as f32, 0.0];
             let data: Vec<[[f32; 4]; 4]> = all.iter().map(|w| [w.corner, w.u, w.v, w.normal].map(wide)).collect();
             room.write(gpu, "rows", &data)?;

@@ -18,6 +18,7 @@ mod stencils;
 use crate::Shared;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
+use conefield_core::parallel;
 use conefield_core::place::{
     Array, FilteredViews, Map, Mask, MeasuredViews, Place, ProximalStep, Reduction, VariationSlope, Weighing,
     prox_on_host,
@@ -25,7 +26,7 @@ use conefield_core::place::{
 use conefield_core::regularizer::{Kernels, Penalty};
 use conefield_core::voxel::VoxelProjector;
 use launch::{ARRAY, Room};
-use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, Zip, s};
+use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, s};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -132,7 +133,7 @@ impl Place for DevicePlace {
             room.read(&self.shared.gpu, &part.buffer, at, planes.len() * plane, |found| {
                 let found = ArrayView3::from_shape(shape, found);
                 let found = found.unwrap_or_else(|e| unreachable!("as many numbers as asked for: {e}"));
-                Zip::from(&mut to).and(found).par_for_each(|to, found| *to = *found);
+                parallel::over(to.outer_iter_mut().zip(found.outer_iter()), |_, (mut to, found)| to.assign(&found));
             })?;
         }
         Ok(())

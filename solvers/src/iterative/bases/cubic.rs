@@ -11,7 +11,6 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parallel;
 use conefield_core::simd::Real;
 use ndarray::{ArrayView3, ArrayViewMut3};
-use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -104,19 +103,24 @@ impl Taps {
     fn apply<R: Real>(&self, x: &[R], inner: usize, y: &mut [R]) {
         let (inputs, outputs) = (self.inputs, self.rows.len());
         if inner == 1 {
-            return y.par_chunks_mut(outputs).zip(x.par_chunks(inputs)).with_min_len(64).for_each(|(y, x)| {
-                for (y, row) in y.iter_mut().zip(&self.rows) {
-                    *y = row.iter().fold(R::ZERO, |sum, &(input, weight)| sum + R::of(weight) * x[input]);
+            return parallel::over(y.chunks_mut(LINES * outputs).zip(x.chunks(LINES * inputs)), |_, (y, x)| {
+                for (y, x) in y.chunks_mut(outputs).zip(x.chunks(inputs)) {
+                    for (y, row) in y.iter_mut().zip(&self.rows) {
+                        *y = row.iter().fold(R::ZERO, |sum, &(input, weight)| sum + R::of(weight) * x[input]);
+                    }
                 }
             });
         }
-        y.par_chunks_mut(inner).with_min_len(4096usize.div_ceil(inner)).enumerate().for_each(|(at, y)| {
-            let (outer, output) = (at / outputs, at % outputs);
-            y.fill(R::ZERO);
-            for &(input, weight) in &self.rows[output] {
-                let weight = R::of(weight);
-                let from = (outer * inputs + input) * inner;
-                y.iter_mut().zip(&x[from..from + inner]).for_each(|(y, x)| *y += weight * *x);
+        let some = 4096usize.div_ceil(inner);
+        parallel::over(y.chunks_mut(some * inner), |n, y| {
+            for (at, y) in (n * some..).zip(y.chunks_mut(inner)) {
+                let (outer, output) = (at / outputs, at % outputs);
+                y.fill(R::ZERO);
+                for &(input, weight) in &self.rows[output] {
+                    let weight = R::of(weight);
+                    let from = (outer * inputs + input) * inner;
+                    y.iter_mut().zip(&x[from..from + inner]).for_each(|(y, x)| *y += weight * *x);
+                }
             }
         });
     }
@@ -151,10 +155,10 @@ impl Prefilter {
     fn apply<R: Real>(&self, x: &mut [R], inner: usize) {
         let n = self.pivots.len();
         if inner == 1 {
-            return x.par_chunks_mut(n).with_min_len(64).for_each(|line| self.solve(line));
+            return parallel::over(x.chunks_mut(LINES * n), |_, x| x.chunks_mut(n).for_each(|line| self.solve(line)));
         }
         if x.len() > n * inner {
-            return x.par_chunks_mut(n * inner).for_each(|x| self.solve_rows(x.chunks_mut(inner).collect()));
+            return parallel::over(x.chunks_mut(n * inner), |_, x| self.solve_rows(x.chunks_mut(inner).collect()));
         }
         // Along the first axis, in blocks of columns.
         let mut parts: Vec<Vec<&mut [R]>> = (0..inner.div_ceil(COLUMNS)).map(|_| Vec::with_capacity(n)).collect();
@@ -195,6 +199,9 @@ impl Prefilter {
         }
     }
 }
+
+/// Lines per task.
+const LINES: usize = 64;
 
 /// Columns solved together.
 const COLUMNS: usize = 1024;
