@@ -197,12 +197,8 @@ impl Observer for Progress {
         let Some(keeper) = &mut self.keeper else { return Ok(()) };
         let written = files::write_checkpoint(&keeper.path, checkpoint, &keeper.run);
         keeper.last = Instant::now();
-        match written {
-            // Only an interrupted run needs its checkpoint.
-            Err(e) if signals::caught().is_none() => warn!("no checkpoint, the run goes on: {e}"),
-            Err(e) => return Err(e),
-            Ok(()) => debug!("checkpoint after step {}", checkpoint.standing.step),
-        }
+        written?;
+        debug!("checkpoint after step {}", checkpoint.standing.step);
         Ok(())
     }
 

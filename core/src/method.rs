@@ -151,7 +151,7 @@ pub trait Observer {
     fn checkpoint_due(&self) -> bool {
         false
     }
-    /// Stores a checkpoint: when one is due, and before an interrupted run ends.
+    /// Stores a checkpoint: when one is due, and before an interrupted run ends; see [`Checkpoint::keep`].
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
         let _ = checkpoint;
         Ok(())

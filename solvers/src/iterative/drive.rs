@@ -84,7 +84,7 @@ pub(super) fn drive(
     loop {
         let cancelled = problem.place.agree(observer.cancelled());
         if run.step > run.started && (cancelled || problem.place.agree(observer.checkpoint_due())) {
-            run.checkpoint(method.as_mut(), observer)?;
+            run.checkpoint(method.as_mut(), observer, cancelled)?;
         }
         if cancelled {
             return Err(Error::Interrupted { step: run.step });
@@ -242,7 +242,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    fn checkpoint(&mut self, method: &mut dyn Iteration, observer: &mut dyn Observer) -> Result<()> {
+    fn checkpoint(&mut self, method: &mut dyn Iteration, observer: &mut dyn Observer, ends: bool) -> Result<()> {
         self.clock.pause();
         self.kept.numbers = method.numbers().iter().map(|x| **x).collect();
         let (step, seconds) = (self.step, self.clock.seconds());
@@ -255,7 +255,7 @@ impl<'a> Run<'a> {
         let read = state.iter().map(|(n, x)| Ok((n, [x.count()], x.read(self.problem.place)?)));
         let read = read.collect::<Result<Vec<_>>>()?;
         let tensors = read.iter().map(|(n, size, x)| ((*n).clone(), &size[..], &**x)).collect();
-        observer.checkpoint(&Checkpoint { tensors, standing })?;
+        Checkpoint { tensors, standing }.keep(observer, ends)?;
         self.clock.resume();
         Ok(())
     }

@@ -7,8 +7,8 @@ use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::Wgpu;
 use conefield_core::arena::Weights;
 use conefield_core::backend::{Backend, Executable, Explain};
-use conefield_core::checkpoint::Resume;
-use conefield_core::method::Job;
+use conefield_core::checkpoint::{Checkpoint, Resume};
+use conefield_core::method::{Job, Observer, Record};
 use conefield_core::pipeline::Pipeline;
 use conefield_core::place::{Host, Moved, Peers, Place, Ranks};
 use conefield_core::scan::Scan;
@@ -277,6 +277,57 @@ fn ranks_stop_together() {
         let ended = plan.run(&Job::new(&scan, backend), &mut stop);
         assert!(matches!(ended, Err(Error::Interrupted { step: 2 })));
     });
+}
+
+/// An observer whose disk is full.
+struct Full {
+    stop: Stop,
+    due: bool,
+    warned: usize,
+}
+
+impl Observer for Full {
+    fn progress(&mut self, step: u64, share: f64, left: f64) {
+        self.stop.progress(step, share, left);
+    }
+    fn record(&mut self, _: &Record) {}
+    fn note(&mut self, _: &str) {}
+    fn warn(&mut self, text: &str) {
+        assert!(text.contains("goes on") && text.contains("disk"), "{text}");
+        self.warned += 1;
+    }
+    fn cancelled(&self) -> bool {
+        self.stop.cancelled()
+    }
+    fn checkpoint_due(&self) -> bool {
+        self.due
+    }
+    fn checkpoint(&mut self, _: &Checkpoint<'_>) -> Result<()> {
+        Err(Error::unsupported("checkpoint", "no room on the disk"))
+    }
+}
+
+/// A run that goes on needs no checkpoint. One that ends needs it, whichever rank was asked to stop.
+#[test]
+fn a_checkpoint_without_room_is_an_error_where_the_run_ends() {
+    let link = json!({"type": "sart", "stop": {"passes": 3}});
+    let chain = json!({"type": "chain", "methods": [link, {"type": "sart", "stop": {"passes": 2}}]});
+    let scan = scan();
+    for method in [link, chain] {
+        let run = |backend: &dyn Backend, at: u64, due: bool| {
+            let mut full = Full { stop: Stop::at(at), due, warned: 0 };
+            let mut plan = plan(&spec(&method).unwrap(), backend, &Weights::default()).unwrap();
+            let ended = plan.run(&Job::new(&scan, backend), &mut full).map(drop);
+            (ended, full.warned)
+        };
+        let (ended, warned) = run(&Cpu::new(), 100, true);
+        assert!(ended.is_ok() && warned >= 2, "{method}: {ended:?}, {warned}");
+        let ended = each(3, |backend| {
+            let last = backend.0.slab(3, 0).unwrap().own.contains(&2);
+            run(backend, if last { 2 } else { 100 }, false).0.unwrap_err().to_string()
+        });
+        assert!(ended.iter().all(|e| e.contains("disk")), "{ended:?}");
+    }
 }
 
 /// Line integrals are summed where they are kept, and their images go to all: with n ranks, each sends a share of
