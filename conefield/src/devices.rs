@@ -77,6 +77,8 @@ impl Backend for Devices {
         lead: &mut dyn FnMut() -> Result<()>,
         follow: &(dyn Fn(&dyn Backend) -> Result<()> + Sync),
     ) -> Result<()> {
+        // An earlier run may have failed.
+        *lock(&self.post.state) = State::default();
         let ends = thread::scope(|scope| {
             let others = self.members[1..].iter();
             let followers: Vec<_> =
@@ -215,6 +217,11 @@ mod tests {
         };
         let e = backend.run(&mut || wait(backend.as_ref()), &one_fails).unwrap_err().to_string();
         assert!(e.contains("out of memory"), "{e}");
+        let meet = |backend: &dyn Backend| {
+            backend.place().agree(false);
+            Ok(())
+        };
+        backend.run(&mut || meet(backend.as_ref()), &meet).expect("the next run can succeed");
     }
 
     #[test]

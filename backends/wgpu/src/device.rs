@@ -370,7 +370,9 @@ fn note(keep: &Mutex<Option<String>>, what: String) {
 fn in_words(e: &wgpu::Error) -> String {
     match e {
         wgpu::Error::OutOfMemory { .. } => {
-            "out of memory on the device; a smaller volume, smaller tables or fewer rays per step may fit".into()
+            "out of memory on the device; a smaller volume, smaller tables, fewer rays per step, or several adapters that \
+             share a volume (--backend wgpu:0,1) may fit"
+                .into()
         }
         other => other.to_string(),
     }
