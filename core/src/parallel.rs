@@ -41,20 +41,18 @@ pub fn map<T: Send, U: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(u
     results.into_iter().map(done).collect()
 }
 
-/// Replaces each number of `out` by `f` of it and of the numbers of `with`, which have the same length.
-pub fn change<const N: usize>(out: &mut [f32], with: [&[f32]; N], f: impl Fn(f32, [f32; N]) -> f32 + Sync) {
+/// Calls `work` with parts of `out` and the same parts of `with`, which have its length.
+pub fn change<const N: usize>(out: &mut [f32], with: [&[f32]; N], work: impl Fn(&mut [f32], [&[f32]; N]) + Sync) {
     over(out.chunks_mut(PART), |n, out| {
         let with = with.map(|x| &x[n * PART..][..out.len()]);
-        for (i, x) in out.iter_mut().enumerate() {
-            *x = f(*x, with.map(|with| with[i]));
-        }
+        work(out, with);
     });
 }
 
 /// Replaces each number of `x` by `f` of it.
 pub fn change_all(x: &mut Array3<f32>, f: impl Fn(f32) -> f32 + Sync) {
     match x.as_slice_memory_order_mut() {
-        Some(x) => change(x, [], |x, []| f(x)),
+        Some(x) => change(x, [], |x, []| x.iter_mut().for_each(|x| *x = f(*x))),
         None => x.mapv_inplace(f),
     }
 }
@@ -68,7 +66,9 @@ mod tests {
         let count = 3 * PART + 5;
         let numbers = |from: usize| (from..from + count).map(|i| i as f32).collect::<Vec<_>>();
         let mut out = numbers(0);
-        change(&mut out, [&numbers(7), &numbers(1)], |x, [a, b]| x + a - b);
+        change(&mut out, [&numbers(7), &numbers(1)], |x, [a, b]| {
+            x.iter_mut().zip(a).zip(b).for_each(|((x, a), b)| *x += a - b);
+        });
         assert!(out == numbers(6));
         let mut array = Array3::from_shape_fn((3, 4, 5), |(i, j, k)| (i * 20 + j * 5 + k) as f32).reversed_axes();
         let doubled = array.mapv(|x| 2.0 * x);

@@ -12,7 +12,7 @@ mod penalty;
 mod ranks;
 mod views;
 
-pub use map::{ADD, CLIP, DIVIDE, INVERT, MULTIPLY, Map, RELAX, Reduction, squares};
+pub use map::{ADD, CLIP, DIVIDE, EXTRAPOLATE, INVERT, MULTIPLY, Map, RELAX, Reduction, squares};
 pub use penalty::{Bounds, Dual, Guide, Kernels, Penalty, Update};
 pub use ranks::{Peers, Ranks, Slab};
 pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
@@ -325,6 +325,7 @@ pub trait Place: Send + Sync {
         let from = self.read(from)?;
         self.change(out, &mut |out| {
             for (plane, &i) in from.outer_iter().skip(first).zip(at) {
+                allowance::trim();
                 out.index_axis_mut(Axis(0), i).assign(&plane);
             }
         })
@@ -446,8 +447,7 @@ pub trait Place: Send + Sync {
             self.keep(gradient, inside, f32::MIN)?;
         }
         self.prox(gradient, tau, penalty)?;
-        self.map(&ADD, [-f64::from(momentum), 0.0], ahead, &[x])?;
-        self.map(&ADD, [1.0 + f64::from(momentum), 1.0], ahead, &[gradient])?;
+        self.map(&EXTRAPOLATE, [f64::from(momentum), 0.0], ahead, &[gradient, x])?;
         self.map(&ADD, [1.0, 0.0], x, &[gradient])
     }
 

@@ -55,6 +55,17 @@ pub const MULTIPLY: Map = Map {
     },
 };
 
+/// `x + a·(x − y)`.
+pub const EXTRAPOLATE: Map = Map {
+    name: "extrapolation",
+    inputs: 2,
+    wgsl: "x + a * (x - y)",
+    host: |[a, _], out, [x, y]| {
+        let a = a as f32;
+        out.iter_mut().zip(x).zip(y).for_each(|((o, x), y)| *o = x + a * (x - y));
+    },
+};
+
 /// `max(b, o + a·x·y)`.
 pub const RELAX: Map = Map {
     name: "relaxed step",
@@ -91,7 +102,7 @@ pub const CLIP: Map = Map {
 
 impl Map {
     /// All maps.
-    pub const ALL: [&'static Map; 6] = [&ADD, &DIVIDE, &MULTIPLY, &RELAX, &INVERT, &CLIP];
+    pub const ALL: [&'static Map; 7] = [&ADD, &DIVIDE, &MULTIPLY, &RELAX, &EXTRAPOLATE, &INVERT, &CLIP];
 
     /// Overwrites `out` on the host; all arrays have the same shape and are in standard order.
     pub fn run(&self, factors: [f64; 2], out: &mut Array3<f32>, inputs: &[CowArray<'_, f32, Ix3>]) {

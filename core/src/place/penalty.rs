@@ -30,6 +30,11 @@ impl Bounds {
     pub fn clip(self, x: f32) -> f32 {
         x.max(self.low).min(self.high)
     }
+
+    /// Overwrites each `u` with the number within the bounds that is closest to `v`.
+    pub fn clip_to(self, u: &mut [f32], v: &[f32]) {
+        parallel::change(u, [v], |u, [v]| u.iter_mut().zip(v).for_each(|(u, v)| *u = self.clip(*v)));
+    }
 }
 
 impl std::fmt::Display for Bounds {

@@ -209,17 +209,15 @@ impl Ranks {
             wanted.iter().copied().filter(|plane| !is_own(rank, plane)).collect::<Vec<usize>>()
         };
         let found = self.collected(x, &wanted.iter().enumerate().map(others).collect::<Vec<_>>())?;
-        let mut found = found.outer_iter();
-        let mut at = 0;
+        let (mut at, mut taken) = (0, 0);
         for run in wanted[self.rank()].chunk_by(|a, b| a + 1 == *b && is_own(self.rank(), a) == is_own(self.rank(), b))
         {
-            let places: Vec<usize> = (at..at + run.len()).collect();
             if is_own(self.rank(), &run[0]) {
+                let places: Vec<usize> = (at..at + run.len()).collect();
                 self.here.scatter(here, run[0] - first, &mut out, &places)?;
             } else {
-                for (i, plane) in places.into_iter().zip(&mut found) {
-                    self.here.load(plane.insert_axis(Axis(0)), &mut out, i)?;
-                }
+                self.here.load(found.slice(s![taken..taken + run.len(), .., ..]), &mut out, at)?;
+                taken += run.len();
             }
             at += run.len();
         }

@@ -254,7 +254,7 @@ impl TvProx {
         if tau < f32::MIN_POSITIVE {
             let bounds = self.bounds;
             return match &self.each {
-                None => parallel::change(u, [v], |_, [v]| bounds.clip(v)),
+                None => bounds.clip_to(u, v),
                 Some(each) => clip_each(v, each, u),
             };
         }
@@ -338,7 +338,10 @@ impl TvProx {
 
 /// Overwrites each `u` with the number within its bounds that is closest to `v`.
 pub(super) fn clip_each(v: &[f32], [low, high]: &[Vec<f32>; 2], u: &mut [f32]) {
-    parallel::change(u, [v, low, high], |_, [v, low, high]| v.max(low).min(high));
+    parallel::change(u, [v, low, high], |u, [v, low, high]| {
+        let all = u.iter_mut().zip(v).zip(low).zip(high);
+        all.for_each(|(((u, v), low), high)| *u = v.max(*low).min(*high));
+    });
 }
 
 /// Most dual steps per sweep, so that their part of the volume stays in the last-level cache.

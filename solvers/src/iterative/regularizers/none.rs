@@ -3,7 +3,6 @@
 use crate::iterative::tv::clip_each;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::parallel;
 use conefield_core::place::Slab;
 use conefield_core::regularizer::{Bounds, Kernels, Penalty, Regularizer, RegularizerSpec};
 use conefield_core::space::Space;
@@ -59,7 +58,7 @@ impl Penalty for BoundsPenalty {
 
     fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
         match &self.each {
-            None => parallel::change(u, [v], |_, [v]| self.bounds.clip(v)),
+            None => self.bounds.clip_to(u, v),
             Some(each) => clip_each(v, each, u),
         }
     }

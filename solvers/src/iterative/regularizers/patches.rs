@@ -272,9 +272,13 @@ impl PatchesPenalty {
     /// `u = clip(v − τ·sum)`
     fn descend(&self, v: &[f32], tau: f32, u: &mut [f32]) {
         let bounds = self.bounds;
-        parallel::change(u, [v, &self.sum], |_, [v, sum]| bounds.clip(v - tau * sum));
+        parallel::change(u, [v, &self.sum], |u, [v, sum]| {
+            u.iter_mut().zip(v).zip(sum).for_each(|((u, v), sum)| *u = bounds.clip(v - tau * sum));
+        });
         if let Some([low, high]) = self.each.as_deref() {
-            parallel::change(u, [low, high], |u, [low, high]| u.max(low).min(high));
+            parallel::change(u, [low, high], |u, [low, high]| {
+                u.iter_mut().zip(low).zip(high).for_each(|((u, low), high)| *u = u.max(*low).min(*high));
+            });
         }
     }
 }

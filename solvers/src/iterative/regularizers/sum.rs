@@ -138,14 +138,20 @@ impl Penalty for SumPenalty {
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
         u.copy_from_slice(v);
         for part in &self.parts {
-            parallel::change(u, [&part.dual], |u, [y]| u - y);
+            parallel::change(u, [&part.dual], |u, [y]| u.iter_mut().zip(y).for_each(|(u, y)| *u -= y));
         }
         let Self { parts, work, turns } = self;
         for part in (0..*turns).flat_map(|_| 0..parts.len()).collect::<Vec<_>>() {
             let Part { penalty, share, dual, .. } = &mut parts[part];
-            parallel::change(work, [v, u, dual], |_, [v, u, y]| if is_outside(v) { v } else { u + y });
+            parallel::change(work, [v, u, dual], |work, [v, u, y]| {
+                let all = work.iter_mut().zip(v).zip(u).zip(y);
+                all.for_each(|(((w, v), u), y)| *w = if is_outside(*v) { *v } else { u + y });
+            });
             penalty.prox(work, (f64::from(tau) * *share) as f32, u);
-            parallel::change(dual, [v, u, work], |_, [v, u, w]| if is_outside(v) { 0.0 } else { w - u });
+            parallel::change(dual, [v, u, work], |dual, [v, u, w]| {
+                let all = dual.iter_mut().zip(v).zip(u).zip(w);
+                all.for_each(|(((y, v), u), w)| *y = if is_outside(*v) { 0.0 } else { w - u });
+            });
         }
     }
 
