@@ -2,7 +2,6 @@
 
 use crate::arena::{Arena, Layout, Weights};
 use crate::error::{Error, Result};
-use crate::method::Observer;
 use crate::pipeline::Model;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -31,18 +30,6 @@ pub struct Checkpoint<'a> {
     pub tensors: Vec<(String, &'a [usize], &'a [f32])>,
     /// Everything else.
     pub standing: Standing,
-}
-
-impl Checkpoint<'_> {
-    /// Gives it to `observer`. A run that goes on needs no checkpoint: if it cannot be stored, that is a warning. Only a
-    /// run that `ends` needs it.
-    pub fn keep(&self, observer: &mut dyn Observer, ends: bool) -> Result<()> {
-        match observer.checkpoint(self) {
-            Err(e) if !ends => observer.warn(&format!("no checkpoint, the run goes on: {e}")),
-            done => return done,
-        }
-        Ok(())
-    }
 }
 
 /// Parts of the arena in a checkpoint, by name. Gradients are zero between steps.

@@ -151,7 +151,7 @@ pub trait Observer {
     fn checkpoint_due(&self) -> bool {
         false
     }
-    /// Stores a checkpoint: when one is due, and before an interrupted run ends; see [`Checkpoint::keep`].
+    /// Stores a checkpoint: when one is due, and before an interrupted run ends. Methods call it by `keep`.
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
         let _ = checkpoint;
         Ok(())
@@ -163,6 +163,18 @@ pub trait Observer {
     /// Receives the three middle slices of the current state, each with its part of `grid`, in 1/unit of the scan.
     fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
         let _ = (grid, slices);
+        Ok(())
+    }
+}
+
+impl dyn Observer + '_ {
+    /// Stores a checkpoint. A run that goes on needs none: if it cannot be stored, that is a warning. Only a run that
+    /// `ends` needs it.
+    pub fn keep(&mut self, checkpoint: &Checkpoint<'_>, ends: bool) -> Result<()> {
+        match self.checkpoint(checkpoint) {
+            Err(e) if !ends => self.warn(&format!("no checkpoint, the run goes on: {e}")),
+            done => return done,
+        }
         Ok(())
     }
 }

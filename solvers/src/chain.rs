@@ -200,7 +200,7 @@ impl Plan for ChainPlan {
             made.add(solution, self.counts(i), i + 1 < count, job)?;
             if i + 1 < count {
                 // The next method resumes here if it is interrupted before its own first checkpoint.
-                made.checkpoint(None)?.keep(observer, false)?;
+                observer.keep(&made.checkpoint(None)?, false)?;
             }
         }
         let mean = (0..count).filter(|&i| self.counts(i) && merged[i].is_none()).count();

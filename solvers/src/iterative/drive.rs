@@ -255,7 +255,7 @@ impl<'a> Run<'a> {
         let read = state.iter().map(|(n, x)| Ok((n, [x.count()], x.read(self.problem.place)?)));
         let read = read.collect::<Result<Vec<_>>>()?;
         let tensors = read.iter().map(|(n, size, x)| ((*n).clone(), &size[..], &**x)).collect();
-        Checkpoint { tensors, standing }.keep(observer, ends)?;
+        observer.keep(&Checkpoint { tensors, standing }, ends)?;
         self.clock.resume();
         Ok(())
     }

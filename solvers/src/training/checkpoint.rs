@@ -44,7 +44,7 @@ pub fn keep(run: &mut Run<'_>, callbacks: &Callbacks) -> Result<()> {
                 masks: run.model.masks().to_vec(),
                 method: method.map_err(|e| Error::unsupported("checkpoint", e.to_string()))?,
             };
-            Checkpoint { tensors, standing }.keep(run.observer, cancelled)?;
+            run.observer.keep(&Checkpoint { tensors, standing }, cancelled)?;
         }
         run.clock.resume();
     }
