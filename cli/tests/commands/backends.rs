@@ -96,6 +96,26 @@ const TINY: [&str; 5] = [
     "--set=field.width=8",
 ];
 
+/// Starts the command, and kills it once there is a checkpoint in its folder.
+#[cfg(unix)]
+fn killed_at_a_checkpoint(run: &Path, args: &[&str]) {
+    use std::process::{Command, Stdio};
+    let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
+        .arg("--quiet")
+        .args(args)
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let checkpoint = run.join("checkpoint.safetensors");
+    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(checkpoint.exists(), "{args:?} was too fast to be killed");
+}
+
 /// Checkpoints and weights of finished runs can be exchanged between backends.
 #[cfg(unix)]
 #[test]
@@ -103,28 +123,13 @@ fn an_interrupted_run_goes_on_on_the_other_backend() {
     if !adapter("an interrupted run") {
         return;
     }
-    use std::process::{Command, Stdio};
-    use std::time::Duration;
     let dir = tempfile::tempdir().unwrap();
     let scan = scan(dir.path(), 16, 8);
     for (first, second) in [("wgpu", "cpu"), ("cpu", "wgpu")] {
         let run = dir.path().join(first);
         let command = [&["--steps=400", "--checkpoint-every=0.01s"][..], &TINY].concat();
-        let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
-            .args(["--quiet", "reconstruct", &text(&scan), "--spec", "ni-naf", "-o", &text(&run)])
-            .args(["--reference", "truth", "--backend", first])
-            .args(&command)
-            .stdout(Stdio::null())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
-        let checkpoint = run.join("checkpoint.safetensors");
-        while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
-            std::thread::sleep(Duration::from_millis(2));
-        }
-        child.kill().unwrap();
-        child.wait().unwrap();
-        assert!(checkpoint.exists(), "the run on {first} was too fast to be killed");
+        let fixed = ["reconstruct", &text(&scan), "--spec", "ni-naf", "-o", &text(&run), "--reference", "truth"];
+        killed_at_a_checkpoint(&run, &[&fixed[..], &["--backend", first], &command].concat());
         let record = reconstruct(&scan, &run, &[&command[..], &["--backend", second, "--resume"]].concat());
         assert_eq!(record["steps"], 400);
         assert!(record["backend"]["backend"].as_str().unwrap().starts_with(second));
@@ -143,8 +148,6 @@ fn an_interrupted_run_goes_on_on_the_other_backend() {
 #[cfg(unix)]
 #[test]
 fn several_adapters_share_a_volume() {
-    use std::process::{Command, Stdio};
-    use std::time::Duration;
     if !adapter("a volume that adapters share") {
         return;
     }
@@ -156,19 +159,11 @@ fn several_adapters_share_a_volume() {
         let fixed = ["--set=stop.passes=40", "--checkpoint-every=0.01s"];
         done(&[&["reconstruct", &scan, "--spec", "fista-tv", "-o", &out, &backend][..], &fixed, more].concat())
     };
-    let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
-        .args(["--quiet", "reconstruct", &scan, "--spec", "fista-tv", "-o", &at("run"), "--backend=wgpu:0,0"])
-        .args(["--set=stop.passes=40", "--checkpoint-every=0.01s"])
-        .stdout(Stdio::null())
-        .spawn()
-        .unwrap();
-    let checkpoint = dir.path().join("run").join("checkpoint.safetensors");
-    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
-        std::thread::sleep(Duration::from_millis(2));
-    }
-    child.kill().unwrap();
-    child.wait().unwrap();
-    assert!(checkpoint.exists(), "the run was too fast to be killed");
+    let of_run = ["reconstruct", &scan, "--spec", "fista-tv", "-o", &at("run"), "--backend=wgpu:0,0"];
+    killed_at_a_checkpoint(
+        &dir.path().join("run"),
+        &[&of_run[..], &["--set=stop.passes=40", "--checkpoint-every=0.01s"]].concat(),
+    );
     run("cpu", "cpu", &[]);
     run("run", "wgpu:0,0,0", &["--resume"]);
     let volume = |name: &str| text(&dir.path().join(name).join("volume.nii.gz"));

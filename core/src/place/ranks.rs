@@ -92,12 +92,12 @@ pub struct Ranks {
     here: Arc<dyn Place>,
 }
 
-/// Flags of elements in every process, and what its own place works with.
+/// All flags of a mask, and copies of them in the place of this process.
 struct Flags {
     all: Array3<bool>,
-    /// All of them, for views.
+    /// All flags, for views.
     whole: OnceLock<Mask>,
-    /// Those of its planes.
+    /// The flags of its own planes.
     own: OnceLock<Mask>,
 }
 
@@ -313,7 +313,13 @@ impl Place for Ranks {
 
     fn zeros(&self, [planes, rows, columns]: [usize; 3]) -> Result<Array> {
         let own = self.own(planes);
-        let here = self.here.zeros([own.len(), rows, columns])?;
+        let here = self.here.zeros([own.len(), rows, columns]);
+        // A method may try a smaller array: all processes must then do so.
+        let refused = self.agree(here.is_err());
+        let here = here?;
+        if refused {
+            return Err(Error::unsupported("memory", "another process or device has too little"));
+        }
         Ok(Array::part([planes, rows, columns], own.start, here))
     }
 
@@ -528,7 +534,7 @@ impl Place for Ranks {
     ) -> Result<()> {
         let (start, here) = at_hand_mut(slab)?;
         if here.on_host().is_some() {
-            // Each image is filtered once. A device filters all of them faster than it would pass them on.
+            // Each image is filtered once. Devices pass on raw images, and each filters all of them.
             let used = self.used(images.shape()[0], views.len());
             self.here.change(at_hand_mut(images)?.1, &mut |images| filter(work, &views[used.clone()], images))?;
         }

@@ -43,7 +43,7 @@ pub fn apply(m: &M3, x: V3) -> V3 {
 }
 
 /// A Gaussian, decoded from its parameters.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Shape {
     /// Centre, in cube sides.
     pub centre: V3,

@@ -34,11 +34,10 @@ pub fn shapes<R: Real>(params: &[R]) -> Vec<Shape> {
 
 /// Like [`shapes`], into a vector that keeps its memory.
 pub fn reshape<R: Real>(params: &[R], all: &mut Vec<Shape>) {
-    let parts = parallel::map(params.chunks(CHUNK * NUMBERS), |_, part| {
-        part.chunks(NUMBERS).map(Shape::of).collect::<Vec<_>>()
+    all.resize(params.len().div_ceil(NUMBERS), Shape::default());
+    parallel::over(all.chunks_mut(CHUNK).zip(params.chunks(CHUNK * NUMBERS)), |_, (all, params)| {
+        all.iter_mut().zip(params.chunks(NUMBERS)).for_each(|(shape, params)| *shape = Shape::of(params));
     });
-    all.clear();
-    all.extend(parts.into_iter().flatten());
 }
 
 /// Adds the part of `slope`, of the Gaussian `index`, that falls into `grads`.

@@ -217,7 +217,7 @@ impl Executable for ViewTraining {
             let (slopes, shapes) = (&self.slopes, &self.shapes);
             let parts = arena.grads.chunks_mut(PART * NUMBERS).zip(arena.params.chunks(PART * NUMBERS));
             parallel::over(parts, |n, (grads, params)| {
-                let those = slopes.iter().zip(shapes).skip(n * PART);
+                let those = slopes[n * PART..].iter().zip(&shapes[n * PART..]);
                 for ((g, p), (slope, shape)) in grads.chunks_mut(NUMBERS).zip(params.chunks(NUMBERS)).zip(those) {
                     if shape.density > 0.0 {
                         let more = slope.by_parameters(p, shape);

@@ -10,10 +10,10 @@ use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::method::{Job, Observer, Record};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::place::{Host, Moved, Peers, Place, Ranks};
+use conefield_core::place::{Array, Host, Moved, Peers, Place, Ranks};
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
-use ndarray::{Array3, Axis};
+use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis};
 use serde_json::{Value, json};
 use std::sync::{Arc, Barrier, Mutex};
 
@@ -304,6 +304,34 @@ impl Observer for Full {
     }
     fn checkpoint(&mut self, _: &Checkpoint<'_>) -> Result<()> {
         Err(Error::unsupported("checkpoint", "no room on the disk"))
+    }
+}
+
+/// A place with room for a few planes only.
+struct Small(usize);
+
+impl Place for Small {
+    fn device(&self) -> Option<String> {
+        None
+    }
+    fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
+        if shape[0] > self.0 { Err(Error::unsupported("memory", "none is left")) } else { Host.zeros(shape) }
+    }
+    fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()> {
+        Host.load(from, to, first)
+    }
+    fn store(&self, from: &Array, first: usize, to: ArrayViewMut3<'_, f32>) -> Result<()> {
+        Host.store(from, first, to)
+    }
+}
+
+/// `fdk` tries smaller slabs where an array finds no room: all ranks must take the same ones.
+#[test]
+fn an_array_that_one_rank_has_no_room_for_is_refused_by_all() {
+    let places: Vec<Arc<dyn Place>> = vec![Arc::new(Host), Arc::new(Small(3)), Arc::new(Host)];
+    for (planes, fits) in [(9, true), (12, false), (9, true)] {
+        let made = on(&places, |backend| backend.place().zeros([planes, 2, 2]).is_ok());
+        assert_eq!(made, [fits; 3], "{planes} planes");
     }
 }
 
