@@ -3,12 +3,9 @@
 
 use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::place::{Moved, Peers, Place, Ranks};
+use conefield_core::place::{Moved, Place, Ranks, Threads};
 use conefield_core::{Error, Result};
-use std::any::Any;
-use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread;
+use std::sync::Arc;
 
 /// A backend among several that share the arrays of a method.
 pub(crate) struct Member {
@@ -19,19 +16,17 @@ pub(crate) struct Member {
 /// The backend of several devices: the first one leads.
 struct Devices {
     members: Vec<Member>,
-    post: Arc<Post>,
+    threads: Arc<Threads>,
 }
 
 /// The backend of `devices`, which share the arrays of a method. A field is trained by one device only.
 pub fn join(devices: Vec<Box<dyn Backend>>) -> Box<dyn Backend> {
-    let sent = devices.iter().map(|_| Mutex::default()).collect();
-    let post = Arc::new(Post { sent, state: Mutex::default(), changed: Condvar::new() });
-    let member = |(rank, device): (usize, Box<dyn Backend>)| {
-        let peers = Arc::new(Thread { rank, post: post.clone() });
+    let threads = Threads::new(devices.len());
+    let member = |(device, peers): (Box<dyn Backend>, _)| {
         let place = Arc::new(Ranks::new(peers, device.place()));
         Member { device, place }
     };
-    Box::new(Devices { members: devices.into_iter().enumerate().map(member).collect(), post: post.clone() })
+    Box::new(Devices { members: devices.into_iter().zip(threads.peers()).map(member).collect(), threads })
 }
 
 impl Backend for Member {
@@ -77,106 +72,7 @@ impl Backend for Devices {
         lead: &mut dyn FnMut() -> Result<()>,
         follow: &(dyn Fn(&dyn Backend) -> Result<()> + Sync),
     ) -> Result<()> {
-        // An earlier run may have failed.
-        *lock(&self.post.state) = State::default();
-        let ends = thread::scope(|scope| {
-            let others = self.members[1..].iter();
-            let followers: Vec<_> =
-                others.map(|other| scope.spawn(|| self.post.until_the_end(|| follow(other)))).collect();
-            let led = self.post.until_the_end(lead);
-            let followed = followers.into_iter().map(|thread| thread.join().unwrap_or_else(Err));
-            [led].into_iter().chain(followed).collect::<Vec<_>>()
-        });
-        // A thread that the others have left says nothing about why.
-        let (left, reasons): (Vec<_>, Vec<_>) =
-            ends.into_iter().partition(|end| end.as_ref().is_err_and(|panic| panic.is::<Left>()));
-        for reason in reasons {
-            reason.unwrap_or_else(|panic| resume_unwind(panic))?;
-        }
-        assert!(left.is_empty(), "a thread is left only by one that fails");
-        Ok(())
-    }
-}
-
-/// What a thread unwinds with when another one has ended.
-struct Left;
-
-/// What threads send to each other.
-struct Post {
-    /// What each sends to each.
-    sent: Vec<Mutex<Vec<Vec<f32>>>>,
-    state: Mutex<State>,
-    changed: Condvar,
-}
-
-#[derive(Default)]
-struct State {
-    /// Threads that wait for the others.
-    waiting: usize,
-    /// How often all have met.
-    met: u64,
-    /// Whether a thread has failed, and will not come.
-    failed: bool,
-}
-
-fn lock<T>(of: &Mutex<T>) -> MutexGuard<'_, T> {
-    of.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-impl Post {
-    /// Waits for all threads.
-    fn meet(&self) {
-        let mut state = lock(&self.state);
-        let met = state.met;
-        state.waiting += 1;
-        if state.waiting == self.sent.len() {
-            state.waiting = 0;
-            state.met += 1;
-            self.changed.notify_all();
-            return;
-        }
-        while state.met == met && !state.failed {
-            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
-        }
-        if state.met == met {
-            drop(state);
-            resume_unwind(Box::new(Left));
-        }
-    }
-
-    /// Does the work of a thread. If it fails, the others do not wait for it.
-    fn until_the_end(&self, work: impl FnOnce() -> Result<()>) -> Result<Result<()>, Box<dyn Any + Send>> {
-        let end = catch_unwind(AssertUnwindSafe(work));
-        if !matches!(end, Ok(Ok(()))) {
-            lock(&self.state).failed = true;
-            self.changed.notify_all();
-        }
-        end
-    }
-}
-
-/// A thread among those of a [`Post`].
-struct Thread {
-    rank: usize,
-    post: Arc<Post>,
-}
-
-impl Peers for Thread {
-    fn rank(&self) -> usize {
-        self.rank
-    }
-
-    fn count(&self) -> usize {
-        self.post.sent.len()
-    }
-
-    fn exchange(&self, out: &[Vec<f32>], into: &mut [Vec<f32>]) {
-        *lock(&self.post.sent[self.rank]) = out.to_vec();
-        self.post.meet();
-        for (from, into) in self.post.sent.iter().zip(into) {
-            into.copy_from_slice(&lock(from)[self.rank]);
-        }
-        self.post.meet();
+        self.threads.run(lead, |rank| follow(&self.members[rank])).map(drop)
     }
 }
 
@@ -184,6 +80,7 @@ impl Peers for Thread {
 mod tests {
     use super::*;
     use conefield_backend_cpu::Cpu;
+    use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     fn three() -> Box<dyn Backend> {

@@ -1,7 +1,7 @@
 //! Explains a spec: stages, widths, parameters, memory, operations.
 
 use crate::memory::{self, Memory};
-use crate::plugins;
+use crate::{plugins, scratch};
 use conefield_core::Result;
 use conefield_core::method::{Findings, Line, Outline, Plan};
 use conefield_core::scan::Scan;
@@ -36,6 +36,8 @@ struct ForScan {
     #[serde(flatten)]
     findings: Findings,
     memory: Memory,
+    /// What is read how often if the memory is too small.
+    reads: Vec<String>,
 }
 
 impl Explanation {
@@ -49,6 +51,7 @@ impl Explanation {
                 volume: g.volume.shape,
                 findings: plan.inspect(scan).map_err(|e| loaded.locate(e))?,
                 memory: run.memory(plan),
+                reads: plan.reads(&scan.header(), scratch::room(memory::limit())),
             })
         };
         let scan = scan.map(for_scan).transpose()?;
@@ -111,8 +114,9 @@ fn text(r: &Explanation) -> String {
         if let Some(beside) = s.memory.beside(limit) {
             let (limit, beside) = (bytes(limit), bytes(beside));
             lines.push(format!(
-                "it stays below {limit}, with scratch files of up to {beside} on the disk of the output"
+                "it stays below {limit}, with scratch files of up to {beside} on the disk of the output:"
             ));
+            lines.extend(s.reads.iter().map(|line| format!("  {line}")));
         }
     }
     lines.join("\n")

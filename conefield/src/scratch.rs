@@ -117,8 +117,13 @@ pub fn begin(folder: &Path, limit: u64, bytes: u64) -> Result<()> {
     }
     files::begin(folder, limit, bytes)?;
     STAYS.store(limit / 3, Relaxed);
-    allowance::set_room(limit / 16 * 5, files::trim);
+    allowance::set_room(room(limit), files::trim);
     Ok(())
+}
+
+/// Bytes of an array that a process with this limit has in memory at once.
+pub fn room(limit: u64) -> u64 {
+    limit / 16 * 5
 }
 
 /// Free bytes on the disk of `folder`, if the system says so.

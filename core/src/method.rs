@@ -331,6 +331,13 @@ pub trait Plan: Send {
     /// Memory needed for a scan of this size.
     fn needs(&self, scan: &ScanHeader) -> Needs;
 
+    /// How often it goes through the views and the volume if no more than `room` bytes of an array are in memory at once;
+    /// one line for each method of a chain.
+    fn reads(&self, scan: &ScanHeader, room: u64) -> Vec<String> {
+        let _ = (scan, room);
+        vec![]
+    }
+
     /// Analyses a scan before the start.
     fn inspect(&self, scan: &Scan) -> Result<Findings>;
 

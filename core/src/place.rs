@@ -10,15 +10,19 @@
 mod map;
 mod penalty;
 mod ranks;
+mod streamed;
+mod threads;
 mod views;
 
 pub use map::{ADD, CLIP, DIVIDE, EXTRAPOLATE, INVERT, MULTIPLY, Map, RELAX, Reduction, squares};
 pub use penalty::{Bounds, Dual, Guide, Kernels, Penalty, Update};
 pub use ranks::{Peers, Ranks, Slab};
+pub use streamed::{Streamed, zeros_with_spare};
+pub use threads::Threads;
 pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 
 use crate::allowance;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::geometry::Geometry;
 use crate::parallel;
 use crate::voxel::{VoxelOperator, VoxelProjector};
@@ -26,6 +30,7 @@ use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, s};
 use serde::Serialize;
 use std::any::Any;
 use std::borrow::Cow;
+use std::sync::Arc;
 
 /// Elements of an array that lives in a place.
 pub struct Held<T> {
@@ -246,6 +251,17 @@ pub trait Place: Send + Sync {
     fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
         let _ = projector;
         Ok(())
+    }
+
+    /// Whether arrays of so many bytes fit here together.
+    fn holds(&self, bytes: u64) -> bool {
+        let _ = bytes;
+        true
+    }
+
+    /// A place for arrays that do not fit here: in the host's memory. Line integrals are still computed here.
+    fn streamed(&self) -> Option<Arc<dyn Place>> {
+        None
     }
 
     /// Bytes of an array that a method may pass through many times.
@@ -548,6 +564,15 @@ pub fn prox_on_host<P: Place + ?Sized>(place: &P, v: &mut Array, tau: f32, penal
         *v = u;
     })?;
     penalty.fault()
+}
+
+/// Refuses a projector whose line integrals of slabs cannot be summed.
+fn additive(projector: &dyn VoxelProjector) -> Result<()> {
+    let expected = "one whose line integrals are the sums of those of slabs, as joseph's";
+    if projector.operator().is_additive() {
+        return Ok(());
+    }
+    Err(Error::invalid("spec", "projector", projector.describe(), expected))
 }
 
 /// Overwrites `images` with the line integrals of `volume`. A volume that memory does not hold is projected in slabs, so

@@ -219,6 +219,11 @@ impl Plan for ChainPlan {
         self.trains().pipeline()
     }
 
+    fn reads(&self, scan: &ScanHeader, room: u64) -> Vec<String> {
+        let all = self.links.iter().enumerate();
+        all.flat_map(|(i, l)| l.reads(scan, room).into_iter().map(move |line| format!("{}: {line}", at(i)))).collect()
+    }
+
     fn needs_held_out(&self) -> Option<String> {
         let mut all = self.links.iter().enumerate();
         all.find_map(|(i, l)| l.needs_held_out().map(|setting| format!("{}.{setting}", at(i))))

@@ -171,6 +171,8 @@ pub struct Limits {
     pub binding_bytes: Option<u64>,
     /// Bytes of the largest uniform buffer, if fewer than the device allows.
     pub uniform_bytes: Option<u64>,
+    /// Bytes of arrays and other buffers together, if fewer than the device has.
+    pub memory_bytes: Option<u64>,
     /// No subgroup operations, even where the device has them.
     pub no_subgroups: bool,
     /// Time every kernel, where the device has timestamps; every call then waits for the device.
@@ -185,6 +187,8 @@ pub struct Gpu {
     pub(crate) queue: wgpu::Queue,
     /// The first error outside of an error scope.
     failed: Arc<Mutex<Option<String>>>,
+    /// See [`Limits::memory_bytes`]; with what the device holds at the start.
+    memory: Option<u64>,
     /// Bytes to the device and from it.
     moved: [AtomicU64; 2],
     /// Buffers through which large arrays go to the device.
@@ -244,7 +248,8 @@ impl Gpu {
                 note(&keep, format!("the device was lost: {message}"));
             }
         });
-        Ok(Self { adapter, device, queue, failed, moved: Default::default(), staging: Mutex::default() })
+        let memory = limits.memory_bytes.map(|bytes| bytes + allocated(&device));
+        Ok(Self { adapter, device, queue, failed, memory, moved: Default::default(), staging: Mutex::default() })
     }
 
     /// The first error on the device since the last call.
@@ -316,6 +321,13 @@ impl Gpu {
                 self.error(format!("{name} takes {size} bytes, more than a buffer's {}", self.adapter.buffer_bytes))
             );
         }
+        if let Some(limit) = self.memory {
+            // Buffers that are no longer used are freed when the device has finished.
+            self.wait()?;
+            if allocated(&self.device) + size > limit {
+                return Err(self.error(format!("{name}, {size} bytes: {OUT_OF_MEMORY}")));
+            }
+        }
         self.checked(&format!("{name}, {size} bytes"), || {
             self.device.create_buffer(&wgpu::BufferDescriptor {
                 label: Some(name),
@@ -367,13 +379,17 @@ fn note(keep: &Mutex<Option<String>>, what: String) {
     keep.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(what);
 }
 
+/// Bytes of a device's buffers, as far as its allocator reports them.
+fn allocated(device: &wgpu::Device) -> u64 {
+    device.generate_allocator_report().map_or(0, |report| report.total_allocated_bytes)
+}
+
+const OUT_OF_MEMORY: &str = "out of memory on the device; a smaller volume, smaller tables, fewer rays per step, or several \
+                             adapters that share a volume (--backend wgpu:0,1) may fit";
+
 fn in_words(e: &wgpu::Error) -> String {
     match e {
-        wgpu::Error::OutOfMemory { .. } => {
-            "out of memory on the device; a smaller volume, smaller tables, fewer rays per step, or several adapters that \
-             share a volume (--backend wgpu:0,1) may fit"
-                .into()
-        }
+        wgpu::Error::OutOfMemory { .. } => OUT_OF_MEMORY.into(),
         other => other.to_string(),
     }
 }

@@ -11,8 +11,9 @@ use std::time::Duration;
 
 const LIMIT: u64 = 256 << 20;
 
-/// Runs `spec` with and without a limit. Its volume is the same, and the limited run stays below the limit.
-fn the_same_in_less_memory(spec: &str, [views, side, voxels]: [usize; 3], more: &[&str]) {
+/// Runs `spec` with and without a limit. Its volume is the same, and the limited run stays below the limit. `explain`
+/// says how often what is `read`.
+fn the_same_in_less_memory(spec: &str, [views, side, voxels]: [usize; 3], more: &[&str], read: &str) {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| text(&dir.path().join(name));
     let scan = text(&scan_of(dir.path(), views, side, voxels));
@@ -26,16 +27,20 @@ fn the_same_in_less_memory(spec: &str, [views, side, voxels]: [usize; 3], more: 
     println!("{spec}: {} MiB without a limit, {} MiB with one", peaks[0] >> 20, peaks[1] >> 20);
     assert!(peaks[0] > LIMIT && free["memory"]["total"].as_u64().unwrap() > LIMIT, "{spec} needs no limit: {peaks:?}");
     assert!(peaks[1] <= LIMIT, "{spec}: {peaks:?}");
+    let explain = |limit: &str| done(&["explain", spec, "--scan", &scan, "--memory", limit]);
+    let (little, enough) = (explain("256MiB"), explain("8GiB"));
+    assert!(little.contains("it stays below 256 MiB") && little.contains(read), "{little}");
+    assert!(!enough.contains("it stays below") && !enough.contains(read), "{enough}");
 }
 
 #[test]
 fn an_iterative_method_gives_the_same_bits() {
-    the_same_in_less_memory("fista-tv", [6, 48, 272], &["--steps", "1"]);
+    the_same_in_less_memory("fista-tv", [6, 48, 272], &["--steps", "1"], "once for each of the 6 subsets");
 }
 
 #[test]
 fn fdk_gives_the_same_bits_slab_by_slab() {
-    the_same_in_less_memory("fdk", [28, 1024, 330], &[]);
+    the_same_in_less_memory("fdk", [28, 1024, 330], &[], "the views are read 2 times");
 }
 
 #[test]

@@ -9,7 +9,9 @@
 
 use super::map::{MULTIPLY, Map, Reduction};
 use super::views::filter;
-use super::{Array, FilteredViews, Held, Mask, MeasuredViews, Penalty, Place, StatePart, Weighing, prox_on_host};
+use super::{
+    Array, FilteredViews, Held, Mask, MeasuredViews, Penalty, Place, StatePart, Weighing, additive, prox_on_host,
+};
 use crate::error::{Error, Result};
 use crate::geometry::Geometry;
 use crate::voxel::VoxelProjector;
@@ -345,11 +347,17 @@ impl Place for Ranks {
     }
 
     fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
-        if projector.operator().is_additive() {
-            return self.here.admits(projector);
-        }
-        let expected = "one whose line integrals are the sums of those of slabs, as joseph's";
-        Err(Error::invalid("spec", "projector", projector.describe(), expected))
+        additive(projector)?;
+        self.here.admits(projector)
+    }
+
+    fn holds(&self, bytes: u64) -> bool {
+        !self.agree(!self.here.holds(bytes.div_ceil(self.count() as u64)))
+    }
+
+    fn streamed(&self) -> Option<Arc<dyn Place>> {
+        let here = self.here.streamed()?;
+        Some(Arc::new(Self { wire: self.wire.clone(), here }))
     }
 
     /// By the process with the least memory, so that all of them divide their work alike.

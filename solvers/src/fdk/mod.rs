@@ -21,7 +21,7 @@ use conefield_core::method::{
     Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
 };
 use conefield_core::parallel;
-use conefield_core::place::{Array, CLIP, FilteredViews, Host, Place, RowWeights};
+use conefield_core::place::{Array, CLIP, FilteredViews, Host, Place, RowWeights, zeros_with_spare};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::SurroundRule;
 use conefield_core::space::Space;
@@ -125,6 +125,10 @@ impl Plan for Fdk {
         Ok(Solution { result, steps: 1, train_s, samples: 0, sampling_s: 0.0, rollbacks: 0, best: None })
     }
 
+    fn reads(&self, header: &ScanHeader, room: u64) -> Vec<String> {
+        slabs(header.volume[0], planes_within(room, header.volume)).into_iter().collect()
+    }
+
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
         let axis = OrbitAxis::of(&scan.geometry);
         let upright = upright(&scan.geometry, axis.as_ref());
@@ -179,11 +183,7 @@ impl Backprojection<'_> {
         let mut images = images(space, self.geometry.detector, at_once)?;
         let all: Vec<usize> = (0..self.geometry.views.len()).collect();
         let planes = planes(place.as_ref(), [nx, ny, nz])?;
-        if planes < nx {
-            let count = nx.div_ceil(planes);
-            observer
-                .note(&format!("{count} slabs of at most {planes} planes along x: the views are read {count} times"));
-        }
+        slabs(nx, planes).into_iter().for_each(|line| observer.note(&line));
         let mut volume = None;
         let (mut done, whole) = (0, nx.div_ceil(planes) * all.len());
         for first in (0..nx).step_by(planes) {
@@ -350,15 +350,28 @@ fn views_at_once(detector: [usize; 2], bytes: u64) -> usize {
     (bytes / column_major_bytes::<f32>(detector, 1).max(1)).clamp(1, 64) as usize
 }
 
-/// Planes along x of the largest slab that `place` has room for: whole tiles of the back-projection, at least one.
-fn planes(place: &dyn Place, [nx, ny, nz]: [usize; 3]) -> Result<usize> {
+/// Planes along x of the largest slab within `room` bytes: whole tiles of the back-projection, at least one.
+fn planes_within(room: u64, [nx, ny, nz]: [usize; 3]) -> usize {
     let plane = (4 * ny * nz).max(1) as u64;
-    let mut planes = (place.room() / plane).min(nx as u64) as usize;
-    if planes < nx {
-        planes = (planes / TILE * TILE).max(TILE);
-    }
+    let planes = (room / plane).min(nx as u64) as usize;
+    if planes < nx { (planes / TILE * TILE).max(TILE) } else { planes }
+}
+
+/// Text for people, if there are several slabs.
+fn slabs(nx: usize, planes: usize) -> Option<String> {
+    let count = nx.div_ceil(planes.max(1));
+    (count > 1).then(|| format!("{count} slabs of at most {planes} planes along x: the views are read {count} times"))
+}
+
+/// Planes along x of the largest slab that `place` has room for.
+fn planes(place: &dyn Place, [nx, ny, nz]: [usize; 3]) -> Result<usize> {
+    let mut planes = planes_within(place.room(), [nx, ny, nz]);
     // A device does not say how much memory it has.
-    while let Err(e) = place.zeros([planes, ny, nz]) {
+    let fits = |planes| match place.device() {
+        None => place.zeros([planes, ny, nz]),
+        Some(_) => zeros_with_spare(place, [planes, ny, nz]),
+    };
+    while let Err(e) = fits(planes) {
         if planes <= TILE {
             return Err(e);
         }

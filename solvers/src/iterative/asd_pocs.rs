@@ -3,7 +3,7 @@
 
 use super::noise::{self, Noise};
 use super::norms::{change, distance, norm2};
-use super::order::{Order, Subsets, summary};
+use super::order::{Order, Subsets};
 use super::plan::{Iterative, IterativePlan};
 use super::problem::copy;
 use super::sart::{Sweep, Updates};
@@ -108,7 +108,7 @@ impl Iterative for AsdPocsMethod {
 
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let opened = self.shared.open(&self.describe(), job, observer)?;
+        let opened = self.shared.open(self, job, observer)?;
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
         let sigma = Noise::of(job.scan.projections.view(), false).sigma;
@@ -120,9 +120,12 @@ impl Iterative for AsdPocsMethod {
         drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
     }
 
+    fn subsets(&self) -> Subsets {
+        self.updates.subsets
+    }
+
     fn found(&self, scan: &Scan) -> Vec<String> {
-        let noise = Noise::of(scan.projections.view(), false).to_string();
-        vec![summary(&self.updates.subsets.of(scan.geometry.views.len())), noise]
+        vec![Noise::of(scan.projections.view(), false).to_string()]
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {

@@ -101,7 +101,7 @@ pub(super) fn least_squares<I: Iteration + 'static>(
     prepare: impl FnOnce(&mut I, &Problem<'_>) -> Result<()>,
 ) -> Result<Solution> {
     let (begun, shared) = (Instant::now(), plan.shared());
-    let opened = shared.open(&plan.describe(), job, observer)?;
+    let opened = shared.open(plan, job, observer)?;
     let job = &opened.job(job);
     let mut problem = opened.problem(job);
     let space = opened.space(job.scan.header());

@@ -14,7 +14,7 @@ use super::bases::Voxels;
 use super::data::NoiseWeighted;
 use super::model::{Model, projected};
 use super::norms::{change, distance, norm2};
-use super::order::{Order, Subsets, split, summary};
+use super::order::{Order, Subsets, split};
 use super::plan::{Iterative, IterativePlan};
 use super::problem::{copy, room};
 use super::regularizers::Nonnegative;
@@ -194,7 +194,8 @@ impl Iterative for FistaMethod {
         let room = format!("at most {longest}, the detector's longer side");
         ensure(self.bin <= longest, "spec", "bin", self.bin, room)?;
         let grid = projected(expansion.as_ref(), voxels);
-        let opened = self.shared.open_on(grid, self.bin, &format!("{}; {stages}", self.describe()), job, observer)?;
+        let text = format!("{}; {stages}", self.describe());
+        let opened = self.shared.open_on(grid, self.bin, &text, self, job, observer)?;
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
         if self.air {
@@ -225,10 +226,11 @@ impl Iterative for FistaMethod {
 
     fn found(&self, scan: &Scan) -> Vec<String> {
         let noise = self.data.of(scan.projections.view());
-        vec![
-            summary(&self.subsets.of(scan.geometry.views.len())),
-            noise.map_or_else(|e| e.to_string(), |n| n.describe()),
-        ]
+        vec![noise.map_or_else(|e| e.to_string(), |n| n.describe())]
+    }
+
+    fn subsets(&self) -> Subsets {
+        self.subsets
     }
 
     fn stages(&self) -> Vec<Line> {

@@ -4,7 +4,7 @@
 //! attenuation stays positive, and errors are relative.
 
 use super::norms::change;
-use super::order::{Order, Subsets, summary};
+use super::order::{Order, Subsets};
 use super::plan::{Iterative, IterativePlan};
 use super::problem::{copy, room};
 use super::sart::column_sums;
@@ -16,7 +16,7 @@ use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
 use conefield_core::place::{Array, Bounds, CLIP, MULTIPLY, RELAX, Reduction, StatePart};
-use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::scan::ScanHeader;
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
 use conefield_core::spec::stage;
@@ -109,7 +109,7 @@ impl Iterative for MlemMethod {
 
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let opened = self.shared.open(&self.describe(), job, observer)?;
+        let opened = self.shared.open(self, job, observer)?;
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
         let space = opened.space(job.scan.header());
@@ -119,8 +119,8 @@ impl Iterative for MlemMethod {
         drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
     }
 
-    fn found(&self, scan: &Scan) -> Vec<String> {
-        vec![summary(&self.subsets.of(scan.geometry.views.len()))]
+    fn subsets(&self) -> Subsets {
+        self.subsets
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {

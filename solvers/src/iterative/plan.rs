@@ -1,6 +1,7 @@
 //! Common part of the plans of iterative methods.
 
 use super::mask_bytes;
+use super::order::{Subsets, summary};
 use super::shared::Shared;
 use crate::fit::object;
 use crate::{solid, surround};
@@ -21,7 +22,12 @@ pub(super) trait Iterative: Send + Sync {
         vec![]
     }
 
-    /// Its findings about a scan, one line each.
+    /// Its subsets of views.
+    fn subsets(&self) -> Subsets {
+        Subsets::Count(1)
+    }
+
+    /// Its findings about a scan besides the subsets, one line each.
     fn found(&self, scan: &Scan) -> Vec<String> {
         let _ = scan;
         vec![]
@@ -65,10 +71,20 @@ impl<T: Iterative> Plan for IterativePlan<T> {
         Needs { surround, corrected, working, resume: working + 4 * scan.voxels(), volume: true, ..Needs::default() }
     }
 
+    fn reads(&self, scan: &ScanHeader, _: u64) -> Vec<String> {
+        let each = match self.0.subsets().count(scan.views) {
+            1 => String::new(),
+            n => format!(" for each of the {n} subsets"),
+        };
+        vec![format!("a pass goes through the views once, and through the arrays of the volume once{each}")]
+    }
+
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
         let scene = &self.0.shared().scene;
         let mut lines = surround::found(scan, scene.surround)?;
         lines.extend(object(scan, &scene.support, None)?.found);
+        let subsets = self.0.subsets().of(scan.geometry.views.len());
+        lines.extend((subsets.len() > 1).then(|| summary(&subsets)));
         lines.extend(self.0.found(scan));
         Ok(Findings { lines, ..Findings::default() })
     }

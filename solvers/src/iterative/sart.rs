@@ -3,7 +3,7 @@
 //! views at once are SIRT, anything in between is OS-SART.
 
 use super::norms::change;
-use super::order::{Order, Subsets, summary};
+use super::order::{Order, Subsets};
 use super::plan::{Iterative, IterativePlan};
 use super::problem::{copy, invert, room};
 use super::shared::Shared;
@@ -13,7 +13,7 @@ use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
 use conefield_core::place::{Array, Bounds, RELAX, StatePart};
-use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::scan::ScanHeader;
 use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
 use conefield_core::spec::stage;
@@ -135,7 +135,7 @@ impl Iterative for SartMethod {
 
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let opened = self.shared.open(&self.describe(), job, observer)?;
+        let opened = self.shared.open(self, job, observer)?;
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
         let space = opened.space(job.scan.header());
@@ -145,8 +145,8 @@ impl Iterative for SartMethod {
         drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
     }
 
-    fn found(&self, scan: &Scan) -> Vec<String> {
-        vec![summary(&self.updates.subsets.of(scan.geometry.views.len()))]
+    fn subsets(&self) -> Subsets {
+        self.updates.subsets
     }
 
     fn bytes(&self, header: &ScanHeader) -> u64 {

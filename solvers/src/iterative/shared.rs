@@ -1,6 +1,7 @@
 //! Common settings of the iterative methods: projector, start volume, stopping criteria.
 
 use super::order::Subsets;
+use super::plan::Iterative;
 use super::problem::Problem;
 use super::regions::Regions;
 use super::stop::Stop;
@@ -78,16 +79,18 @@ impl Shared {
     }
 
     /// Validates the scan, logs `method` and its projector, and finds the object's support.
-    pub(super) fn open(&self, method: &str, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Opened> {
-        self.open_on(job.scan.geometry.volume, 1, method, job, observer)
+    pub(super) fn open(&self, method: &dyn Iterative, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Opened> {
+        self.open_on(job.scan.geometry.volume, 1, &method.describe(), method, job, observer)
     }
 
-    /// Like [`Shared::open`], with `grid` as the grid of the unknowns and `bin` × `bin` pixels averaged to one.
+    /// Like [`Shared::open`], with `grid` as the grid of the unknowns and `bin` × `bin` pixels averaged to one; `text`
+    /// describes the method.
     pub(super) fn open_on(
         &self,
         grid: VoxelGrid,
         bin: usize,
-        method: &str,
+        text: &str,
+        method: &dyn Iterative,
         job: &Job<'_>,
         observer: &mut dyn Observer,
     ) -> Result<Opened> {
@@ -97,10 +100,9 @@ impl Shared {
         let meets = |v, p: usize| g.ray(v, p / columns, p % columns).clip(bounds).is_some();
         let met = (0..g.views.len()).any(|v| (0..rows * columns).any(|p| meets(v, p)));
         ensure(met, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
-        let place = job.backend.place();
-        place.admits(self.projector.as_ref())?;
+        let place = self.place(method, job, observer)?;
         let on = place.device().map(|device| format!(", on {device}")).unwrap_or_default();
-        observer.note(&format!("{method}; {}{on}", self.projector.describe()));
+        observer.note(&format!("{text}; {}{on}", self.projector.describe()));
         // Uses the views as measured: the attenuation subtracted later is too coarse for carving.
         let Object { support, solid, found } = object(job.scan, &self.scene.support, Some(job.volumes))?;
         found.iter().for_each(|line| observer.note(line));
@@ -122,6 +124,25 @@ impl Shared {
             bounds.high = solid.attenuation as f32;
         }
         Ok(Opened { place, projector: self.projector.clone(), bounds, regions, inside, corrected, binned, geometry })
+    }
+
+    /// The backend's place, if it has room for all arrays of `method`; else one that streams them.
+    fn place(&self, method: &dyn Iterative, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Arc<dyn Place>> {
+        let mut place = job.backend.place();
+        let header = job.scan.header();
+        let bytes = method.bytes(&header).saturating_add(4 * header.voxels());
+        if !place.holds(bytes)
+            && let (Some(device), Some(streamed)) = (place.device(), place.streamed())
+        {
+            let gib = bytes as f64 / f64::from(1 << 30);
+            observer.note(&format!(
+                "{device} has no room for {gib:.1} GiB of arrays: they stay in the host's memory, and it computes the line \
+                 integrals of one slab after another"
+            ));
+            place = streamed;
+        }
+        place.admits(self.projector.as_ref())?;
+        Ok(place)
     }
 
     /// Adds the memory of the driver and of the projector for a subset to the method's own arrays in `space`; returns

@@ -49,3 +49,9 @@ pub fn backends(what: &str) -> Vec<(&'static str, Wgpu)> {
     }
     opened
 }
+
+/// A backend on a device with room for this many bytes of arrays.
+#[allow(dead_code)]
+pub fn little(bytes: u64) -> Option<Wgpu> {
+    open(Limits { memory_bytes: Some(bytes), ..Limits::default() })
+}

@@ -1,7 +1,7 @@
 //! Several processes share the arrays of a method: threads stand for them here.
 
 use crate::common::{Heard, Stop, plan, scan, solve_on, spec};
-use crate::device::backends;
+use crate::device::{backends, little};
 use crate::places::larger;
 use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::Wgpu;
@@ -10,48 +10,12 @@ use conefield_core::backend::{Backend, Executable, Explain};
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::method::{Job, Observer, Record};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::place::{Array, Host, Moved, Peers, Place, Ranks};
+use conefield_core::place::{Array, Host, Moved, Place, Ranks, Threads};
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis};
 use serde_json::{Value, json};
-use std::sync::{Arc, Barrier, Mutex};
-
-/// What threads send to each other.
-struct Post {
-    barrier: Barrier,
-    /// What each sends to each.
-    sent: Vec<Mutex<Vec<Vec<f32>>>>,
-}
-
-/// A thread among `count`.
-struct Thread {
-    rank: usize,
-    count: usize,
-    post: Arc<Post>,
-}
-
-impl Peers for Thread {
-    fn rank(&self) -> usize {
-        self.rank
-    }
-
-    fn count(&self) -> usize {
-        self.count
-    }
-
-    fn exchange(&self, out: &[Vec<f32>], into: &mut [Vec<f32>]) {
-        let Post { barrier, sent } = &*self.post;
-        *sent[self.rank].lock().unwrap() = out.to_vec();
-        barrier.wait();
-        for (from, into) in sent.iter().zip(into) {
-            let sent = &from.lock().unwrap()[self.rank];
-            assert_eq!(sent.len(), into.len(), "rank {}", self.rank);
-            into.copy_from_slice(sent);
-        }
-        barrier.wait();
-    }
-}
+use std::sync::Arc;
 
 /// The backend of a rank.
 struct Shared(Arc<Ranks>);
@@ -75,24 +39,12 @@ fn each<T: Send>(count: usize, work: impl Fn(&Shared) -> T + Sync) -> Vec<T> {
     on(&vec![Arc::new(Host) as Arc<dyn Place>; count], work)
 }
 
-/// The results of `work` in each rank, whose arrays live in `places`. A rank that panics would leave the others waiting:
-/// it ends the test.
+/// The results of `work` in each rank, whose arrays live in `places`.
 fn on<T: Send>(places: &[Arc<dyn Place>], work: impl Fn(&Shared) -> T + Sync) -> Vec<T> {
-    let count = places.len();
-    let sent = (0..count).map(|_| Mutex::default()).collect();
-    let post = Arc::new(Post { barrier: Barrier::new(count), sent });
-    std::thread::scope(|scope| {
-        let rank = |rank| {
-            let (post, work) = (post.clone(), &work);
-            scope.spawn(move || {
-                let peers = Arc::new(Thread { rank, count, post });
-                let run = || work(&Shared(Arc::new(Ranks::new(peers, places[rank].clone()))));
-                std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).unwrap_or_else(|_| std::process::abort())
-            })
-        };
-        let all: Vec<_> = (0..count).map(rank).collect();
-        all.into_iter().map(|thread| thread.join().unwrap()).collect()
-    })
+    let threads = Threads::new(places.len());
+    let all = threads.peers().zip(places).map(|(peers, place)| Shared(Arc::new(Ranks::new(peers, place.clone()))));
+    let all: Vec<_> = all.collect();
+    threads.run(|| Ok(work(&all[0])), |rank| Ok(work(&all[rank]))).unwrap()
 }
 
 fn volume(method: &Value, scan: &Scan, backend: &dyn Backend) -> Array3<f32> {
@@ -162,7 +114,7 @@ fn every_number_of_ranks_ends_where_one_does() {
 }
 
 /// Root mean square of the differences as a share of the largest number.
-fn rms(found: &Array3<f32>, want: &Array3<f32>) -> f32 {
+pub fn rms(found: &Array3<f32>, want: &Array3<f32>) -> f32 {
     let top = want.iter().fold(0.0f32, |m, v| m.max(v.abs()));
     let squares: f32 = found.iter().zip(want).map(|(a, b)| ((a - b) / top).powi(2)).sum();
     (squares / want.len() as f32).sqrt()
@@ -212,6 +164,26 @@ fn a_pass_moves_the_views_between_devices() {
             println!("{each} bytes in a pass, {want} of them pixels");
             assert!(each >= want && each < 1.1 * want, "{each} and {want}");
         }
+    }
+}
+
+/// Devices that have no room for their parts of the arrays keep these on the host, all of them or none.
+#[test]
+fn devices_without_room_share_a_volume() {
+    let scan = larger();
+    let volume_bytes = 4 * scan.geometry.volume.len().unwrap() as u64;
+    let Some(devices) = [1, 20].map(|n| little(n * volume_bytes)).into_iter().collect::<Option<Vec<_>>>() else {
+        return;
+    };
+    let places: Vec<_> = devices.iter().map(|device| device.place()).collect();
+    for (bytes, holds) in [(volume_bytes, true), (8 * volume_bytes, false), (100 * volume_bytes, false)] {
+        assert_eq!(on(&places, |backend| backend.place().holds(bytes)), [holds; 2], "{bytes} bytes");
+    }
+    let method = json!({"type": "fista", "prior": "total-variation", "stop": {"passes": 3}});
+    let want = volume(&method, &scan, &Cpu::new());
+    for found in on(&places, |backend| volume(&method, &scan, backend)) {
+        let error = rms(&found, &want);
+        assert!(error < 1e-5, "{error}");
     }
 }
 

@@ -20,7 +20,7 @@ use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
 use conefield_core::parallel;
 use conefield_core::place::{
-    Array, FilteredViews, Map, Mask, MeasuredViews, Place, ProximalStep, Reduction, VariationSlope, Weighing,
+    Array, FilteredViews, Map, Mask, MeasuredViews, Place, ProximalStep, Reduction, Streamed, VariationSlope, Weighing,
     prox_on_host,
 };
 use conefield_core::regularizer::{Kernels, Penalty};
@@ -29,6 +29,12 @@ use launch::{ARRAY, Room};
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, s};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Bytes of a buffer with which free memory is sought.
+const PIECE: u64 = 1 << 30;
+
+/// Numbers that are read at once, about: as many as the buffer holds through which they come.
+const READ: usize = 1 << 24;
 
 /// A part of an array: planes along its first axis, in a buffer.
 pub(crate) struct Chunk {
@@ -96,6 +102,17 @@ impl Place for DevicePlace {
         rays::Walks::new(&self.shared, projector)?.validate()
     }
 
+    fn holds(&self, bytes: u64) -> bool {
+        let most = self.shared.gpu.adapter.buffer_bytes.min(PIECE);
+        let pieces = (0..bytes).step_by(most as usize).map(|at| most.min(bytes - at));
+        // All of them at once.
+        pieces.map(|bytes| self.shared.gpu.buffer("arrays", bytes, ARRAY)).collect::<Result<Vec<_>>>().is_ok()
+    }
+
+    fn streamed(&self) -> Option<Arc<dyn Place>> {
+        Some(Arc::new(Streamed::new(Arc::new(Self::new(self.shared.clone())))))
+    }
+
     fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
         let parts = self.split(shape)?.into_iter().map(|planes| {
             let bytes = 4 * (planes.len() * plane(shape)) as u64;
@@ -123,18 +140,18 @@ impl Place for DevicePlace {
         let (n, plane) = (to.len_of(Axis(0)), plane(from.shape()));
         let mut room = self.room();
         for part in parts(from) {
-            let planes = part.planes.start.max(first)..part.planes.end.min(first + n);
-            if planes.is_empty() {
-                continue;
+            let (start, end) = (part.planes.start.max(first), part.planes.end.min(first + n));
+            for start in (start..end).step_by((READ / plane.max(1)).max(1)) {
+                let end = end.min(start + (READ / plane.max(1)).max(1));
+                let mut to = to.slice_mut(s![start - first..end - first, .., ..]);
+                let at = (start - part.planes.start) * plane;
+                let shape = to.raw_dim();
+                room.read(&self.shared.gpu, &part.buffer, at, (end - start) * plane, |found| {
+                    let found = ArrayView3::from_shape(shape, found);
+                    let found = found.unwrap_or_else(|e| unreachable!("as many numbers as asked for: {e}"));
+                    parallel::over(to.outer_iter_mut().zip(found.outer_iter()), |_, (mut to, found)| to.assign(&found));
+                })?;
             }
-            let mut to = to.slice_mut(s![planes.start - first..planes.end - first, .., ..]);
-            let at = (planes.start - part.planes.start) * plane;
-            let shape = to.raw_dim();
-            room.read(&self.shared.gpu, &part.buffer, at, planes.len() * plane, |found| {
-                let found = ArrayView3::from_shape(shape, found);
-                let found = found.unwrap_or_else(|e| unreachable!("as many numbers as asked for: {e}"));
-                parallel::over(to.outer_iter_mut().zip(found.outer_iter()), |_, (mut to, found)| to.assign(&found));
-            })?;
         }
         Ok(())
     }
