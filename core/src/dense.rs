@@ -3,6 +3,9 @@
 //! `x` is `[k][n]` and `y` is `[m][n]` with the rows of the tile innermost, so that lanes run over rows; `W` is
 //! `[m][ld]` row-major. Register blocks hold 8 channels × 2 vectors (forward, input gradient) and 4 × 4 channels
 //! (weight gradient).
+//!
+//! The three products are compiled once for each set of instructions, and called: a copy of all their blocks in each
+//! stage would be most of what a crate with dense layers compiles.
 
 use crate::simd::{Real, Select, Simd, SimdBase, SimdFloat, V, WIDEST, load, store};
 
@@ -29,8 +32,16 @@ pub enum Output {
 }
 
 /// `y = W[:, column..column + k]·x + bias`, or `y += …` without a bias.
-#[inline(always)]
+#[inline(never)]
 pub fn affine<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, bias: Option<&[R]>, x: &[R], y: &mut [R], n: usize) {
+    s.vectorize(
+        #[inline(always)]
+        || affine_blocks(s, w, bias, x, y, n),
+    );
+}
+
+#[inline(always)]
+fn affine_blocks<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, bias: Option<&[R]>, x: &[R], y: &mut [R], n: usize) {
     let (k, m) = (x.len() / n, y.len() / n);
     let len = V::<S, R>::LEN;
     let mut o = 0;
@@ -123,8 +134,16 @@ fn write<S: Simd, R: Real, const FULL: bool>(v: V<S, R>, y: &mut [R], i: usize, 
 }
 
 /// `dx = W[:, column..column + k]ᵀ·dy`, set, added or multiplied into `dx`.
-#[inline(always)]
+#[inline(never)]
 pub fn affine_input<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, dy: &[R], dx: &mut [R], out: Output, n: usize) {
+    s.vectorize(
+        #[inline(always)]
+        || input_blocks(s, w, dy, dx, out, n),
+    );
+}
+
+#[inline(always)]
+fn input_blocks<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, dy: &[R], dx: &mut [R], out: Output, n: usize) {
     let (k, m) = (dx.len() / n, dy.len() / n);
     let len = V::<S, R>::LEN;
     let mut c = 0;
@@ -200,8 +219,25 @@ fn input_block<S: Simd, R: Real, const K: usize, const C: usize, const FULL: boo
 }
 
 /// `dW[:, column..column + k] += dy·xᵀ`, and `db += Σ dy` where `db` is given.
-#[inline(always)]
+#[inline(never)]
 pub fn affine_weights<S: Simd, R: Real>(
+    s: S,
+    dy: &[R],
+    x: &[R],
+    dw: &mut [R],
+    ld: usize,
+    column: usize,
+    db: Option<&mut [R]>,
+    n: usize,
+) {
+    s.vectorize(
+        #[inline(always)]
+        || weights_blocks(s, dy, x, dw, ld, column, db, n),
+    );
+}
+
+#[inline(always)]
+fn weights_blocks<S: Simd, R: Real>(
     s: S,
     dy: &[R],
     x: &[R],

@@ -247,6 +247,15 @@ fn by_level<L>(parts: &[Part<L>]) -> impl Iterator<Item = &[Part<L>]> {
     parts.chunk_by(|a, b| a.number == b.number)
 }
 
+/// [`Level::locate`], compiled once for all numbers of features.
+#[inline(never)]
+fn locate<S: Simd, L: Level, R: Real>(s: S, level: &L, to: &mut L::Located<R>, x: Tile<'_, R>, at: usize, n: usize) {
+    s.vectorize(
+        #[inline(always)]
+        || level.locate(s, to, x, at, n),
+    );
+}
+
 struct LevelsForward<'a, L: Level, R> {
     stage: &'a Levels<L>,
     parts: &'a [Part<L>],
@@ -263,7 +272,7 @@ impl<L: Level, R: Real> LevelsForward<'_, L, R> {
         for parts in by_level(self.parts) {
             for at in (0..self.x.rows).step_by(BLOCK) {
                 let n = BLOCK.min(self.x.rows - at);
-                parts[0].level.locate(s, &mut located, self.x, at, n);
+                locate(s, &parts[0].level, &mut located, self.x, at, n);
                 for part in parts {
                     let (table, _) = self.params[part.range()].as_chunks::<F>();
                     part.level.gather(s, &located, table, &mut out, n);
@@ -303,7 +312,7 @@ impl<L: Level, R: Real> LevelsBackward<'_, L, R> {
             for at in (0..self.x.rows).step_by(BLOCK) {
                 let n = BLOCK.min(self.x.rows - at);
                 part.take(self.dy, &mut dy, at, n);
-                level.locate(s, &mut located, self.x, at, n);
+                locate(s, level, &mut located, self.x, at, n);
                 if !own.is_empty() {
                     level.scatter(s, &located, table, &dy, n, grads, &own);
                 }

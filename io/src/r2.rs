@@ -8,7 +8,7 @@
 use crate::input::LONGEST_TEXT;
 use crate::orbit::{common_orbit, written};
 use crate::scan::DataSet;
-use crate::text::{self, Notation, parse, shortened, unread};
+use crate::text::{self, parse_json, shortened, unread};
 use crate::unit::{self, Reading, Units};
 use crate::{ScanSize, folder, memory, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
 use conefield_core::error::ensure;
@@ -84,7 +84,7 @@ pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
 
 fn warn_of_others(folder: &Path) -> Result<()> {
     let file = folder.join(META);
-    let meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
+    let meta = parse_json(&file, &read_text(&file, LONGEST_TEXT)?)?;
     text::warn(&file.display().to_string(), unread(&others(&meta)));
     Ok(())
 }
@@ -127,7 +127,7 @@ const SCANNER_KEYS: [&str; 11] = [
 fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
     let place = file.display().to_string();
-    let meta: Meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
+    let meta: Meta = parse_json(&file, &read_text(&file, LONGEST_TEXT)?)?;
     let s = &meta.scanner;
     for (field, x) in [("scanner.DSO", s.DSO), ("scanner.DSD", s.DSD)] {
         ensure(x.is_finite() && x > 0.0, &place, field, x, "a positive finite distance")?;
@@ -165,7 +165,7 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
 /// which is read to find the unit.
 pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
     let file = folder.join(META);
-    let meta: Meta = parse(&file, &read_text(&file, LONGEST_TEXT)?, Notation::Json)?;
+    let meta: Meta = parse_json(&file, &read_text(&file, LONGEST_TEXT)?)?;
     let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
     let pixels_of = |frames: &[Frame]| product(&meta.scanner.nDetector).saturating_mul(frames.len() as u64);
     let (pixels, test_pixels) = (pixels_of(&meta.proj_train), pixels_of(&meta.proj_test));

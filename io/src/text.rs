@@ -12,14 +12,14 @@ use std::path::Path;
 
 /// The notation of a text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Notation {
+enum Notation {
     Toml,
     Json,
 }
 
 impl Notation {
     /// JSON for the extension `.json`, else TOML.
-    pub fn of(path: &Path) -> Self {
+    fn of(path: &Path) -> Self {
         let json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
         if json { Self::Json } else { Self::Toml }
     }
@@ -90,21 +90,26 @@ pub(crate) fn xml<'t>(place: &str, text: &'t str, expected: &str) -> Result<Docu
 }
 
 /// Parses `text`, the content of `path`.
-pub(crate) fn parse<T: DeserializeOwned>(path: &Path, text: &str, notation: Notation) -> Result<T> {
+fn parse<T: DeserializeOwned>(path: &Path, text: &str, notation: Notation) -> Result<T> {
     match notation {
-        Notation::Toml => toml::from_str(text).map_err(|e| explain(path, text, toml_line(text, &e), e.message())),
-        Notation::Json => serde_json::from_str(text).map_err(|e| {
-            let full = e.to_string();
-            let message = full.rsplit_once(" at line ").map_or(full.as_str(), |(m, _)| m);
-            explain(path, text, (e.line() > 0).then(|| e.line()), message)
-        }),
+        Notation::Toml => parse_toml(path, text),
+        Notation::Json => parse_json(path, text),
     }
+}
+
+/// Parses `text`, the content of the JSON file `path`.
+pub(crate) fn parse_json<T: DeserializeOwned>(path: &Path, text: &str) -> Result<T> {
+    serde_json::from_str(text).map_err(|e| {
+        let full = e.to_string();
+        let message = full.rsplit_once(" at line ").map_or(full.as_str(), |(m, _)| m);
+        explain(path, text, (e.line() > 0).then(|| e.line()), message)
+    })
 }
 
 /// Parses `text`, the content of the TOML file `path`. Errors name the line and, for an unknown key, the nearest valid
 /// one.
 pub fn parse_toml<T: DeserializeOwned>(path: &Path, text: &str) -> Result<T> {
-    parse(path, text, Notation::Toml)
+    toml::from_str(text).map_err(|e| explain(path, text, toml_line(text, &e), e.message()))
 }
 
 fn explain(path: &Path, text: &str, line: Option<usize>, message: &str) -> Error {

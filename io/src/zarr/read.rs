@@ -6,7 +6,7 @@ use crate::folder;
 use crate::input::{Input, LONGEST_TEXT, must_unpack};
 use crate::npy;
 use crate::number::{ByteOrder, Number};
-use crate::text::{Notation, parse, shortened};
+use crate::text::{parse_json, shortened};
 use conefield_core::files::read_text;
 use conefield_core::finite::stray;
 use conefield_core::geometry::VoxelGrid;
@@ -141,7 +141,7 @@ struct Stored {
 }
 
 fn json<T: DeserializeOwned>(path: &Path) -> Result<T> {
-    parse(path, &read_text(path, LONGEST_TEXT)?, Notation::Json)
+    parse_json(path, &read_text(path, LONGEST_TEXT)?)
 }
 
 impl Stored {

@@ -6,7 +6,7 @@
 pub use rustfft::Fft;
 pub use rustfft::num_complex::Complex;
 
-use rustfft::FftPlanner;
+use rustfft::{FftPlanner, FftPlannerScalar};
 use std::sync::Arc;
 
 /// The transform of rows of `length` values and its inverse, in single precision. Neither divides by `length`.
@@ -17,5 +17,5 @@ pub fn pair_f32(length: usize) -> [Arc<dyn Fft<f32>>; 2] {
 
 /// The transform of rows of `length` values in double precision.
 pub fn forward_f64(length: usize) -> Arc<dyn Fft<f64>> {
-    FftPlanner::new().plan_fft_forward(length)
+    FftPlannerScalar::new().plan_fft_forward(length)
 }
