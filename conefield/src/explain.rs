@@ -114,7 +114,7 @@ fn text(r: &Explanation) -> String {
         if let Some(beside) = s.memory.beside(limit) {
             let (limit, beside) = (bytes(limit), bytes(beside));
             lines.push(format!(
-                "it stays below {limit}, with scratch files of up to {beside} on the disk of the output:"
+                "it stays below {limit}, with scratch files of up to {beside} on the disk of the output"
             ));
             lines.extend(s.reads.iter().map(|line| format!("  {line}")));
         }
