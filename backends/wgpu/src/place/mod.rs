@@ -33,6 +33,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 /// Bytes of a buffer with which free memory is sought.
 const PIECE: u64 = 1 << 30;
 
+/// Bytes beside all arrays, for transfers and kernels.
+const SPARE: u64 = 1 << 28;
+
 /// Numbers that are read at once, about: as many as the buffer holds through which they come.
 const READ: usize = 1 << 24;
 
@@ -103,7 +106,7 @@ impl Place for DevicePlace {
     }
 
     fn holds(&self, bytes: u64) -> bool {
-        let most = self.shared.gpu.adapter.buffer_bytes.min(PIECE);
+        let (most, bytes) = (self.shared.gpu.adapter.buffer_bytes.min(PIECE), bytes.saturating_add(bytes.min(SPARE)));
         let pieces = (0..bytes).step_by(most as usize).map(|at| most.min(bytes - at));
         // All of them at once.
         pieces.map(|bytes| self.shared.gpu.buffer("arrays", bytes, ARRAY)).collect::<Result<Vec<_>>>().is_ok()
