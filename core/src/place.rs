@@ -17,7 +17,7 @@ mod views;
 pub use map::{ADD, CLIP, DIVIDE, EXTRAPOLATE, INVERT, MULTIPLY, Map, RELAX, Reduction, squares};
 pub use penalty::{Bounds, Dual, Guide, Kernels, Penalty, Update};
 pub use ranks::{Peers, Ranks, Slab};
-pub use streamed::{Streamed, zeros_with_spare};
+pub use streamed::{SPARE, Streamed, zeros_with_spare};
 pub use threads::Threads;
 pub use views::{FilteredViews, MeasuredViews, RowWeights, Weighing};
 

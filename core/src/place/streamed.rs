@@ -14,8 +14,8 @@ use std::sync::Arc;
 const PIECE: usize = 1 << 22;
 /// Images beside a slab take at most this share of its memory.
 const IMAGES: usize = 4;
-/// Numbers for which a device keeps room.
-const SPARE: usize = 1 << 26;
+/// Bytes that a device keeps free beside arrays, for transfers and kernels; as many as the arrays take, if those are fewer.
+pub const SPARE: u64 = 1 << 28;
 
 /// Arrays in the host's memory, line integrals on a device.
 pub struct Streamed {
@@ -64,14 +64,13 @@ impl Streamed {
     }
 }
 
-/// Zeros, if the device then still has room for transfers and kernels: a quarter of a GiB, or as much again if that is
-/// less.
+/// Zeros, if the device then still has [`SPARE`] bytes.
 ///
 /// # Errors
 /// Too little memory.
 pub fn zeros_with_spare(device: &dyn Place, [planes, rows, columns]: [usize; 3]) -> Result<Array> {
     let array = device.zeros([planes, rows, columns])?;
-    let spare = planes.min(SPARE / (rows * columns).max(1));
+    let spare = planes.min(SPARE as usize / (size_of::<f32>() * rows * columns).max(1));
     device.zeros([spare, rows, columns]).map(|_| array)
 }
 

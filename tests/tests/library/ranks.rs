@@ -183,7 +183,8 @@ fn devices_without_room_share_a_volume() {
     let want = volume(&method, &scan, &Cpu::new());
     for found in on(&places, |backend| volume(&method, &scan, backend)) {
         let error = rms(&found, &want);
-        assert!(error < 1e-4, "{error}");
+        println!("{error:.1e}");
+        assert!(error < 1e-5, "{error}");
     }
 }
 

@@ -20,8 +20,8 @@ use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
 use conefield_core::parallel;
 use conefield_core::place::{
-    Array, FilteredViews, Map, Mask, MeasuredViews, Place, ProximalStep, Reduction, Streamed, VariationSlope, Weighing,
-    prox_on_host,
+    Array, FilteredViews, Map, Mask, MeasuredViews, Place, ProximalStep, Reduction, SPARE, Streamed, VariationSlope,
+    Weighing, prox_on_host,
 };
 use conefield_core::regularizer::{Kernels, Penalty};
 use conefield_core::voxel::VoxelProjector;
@@ -32,9 +32,6 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Bytes of a buffer with which free memory is sought.
 const PIECE: u64 = 1 << 30;
-
-/// Bytes beside all arrays, for transfers and kernels.
-const SPARE: u64 = 1 << 28;
 
 /// Numbers that are read at once, about: as many as the buffer holds through which they come.
 const READ: usize = 1 << 24;
