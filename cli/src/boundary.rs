@@ -4,7 +4,7 @@
 
 use conefield_core::error::ensure;
 use conefield_core::spec::load::Loaded;
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, written};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -29,10 +29,10 @@ impl Inputs {
         self.and(loaded.sources()).and(loaded.input_files())
     }
 
-    /// Adds a TOML description with every file that it names.
+    /// Adds a description in TOML or JSON with every file that it names.
     pub fn and_description(self, path: &Path) -> Self {
         let text = conefield_core::files::read_text(path, 16 << 20).unwrap_or_default();
-        let tree: Value = toml::from_str(&text).unwrap_or_default();
+        let tree: Value = written::read(&path.display().to_string(), &text).unwrap_or_default();
         let mut named = vec![];
         texts(&tree, &mut named);
         let folder = path.parent().unwrap_or(Path::new("")).to_path_buf();

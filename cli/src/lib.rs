@@ -7,7 +7,6 @@ mod live;
 mod log;
 mod out;
 mod outgoing;
-mod pca;
 mod program;
 mod progress;
 mod run_folder;

@@ -7,7 +7,7 @@ use conefield_core::error::ensure;
 use conefield_core::pipeline::Model;
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::trained::{Placement, TrainedField};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, written};
 #[cfg(feature = "plots")]
 pub use conefield_evaluation::report::result_png as picture;
 pub use conefield_evaluation::report::text::stem;
@@ -91,8 +91,7 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
     };
     let loaded = crate::specs::reread(note("spec")?, &format!("{place}: spec.toml"))?;
     let plan = crate::method::plan_without_files(&loaded, &Cpu::new())?;
-    let placement: Placement = serde_json::from_str(note(PLACEMENT)?)
-        .map_err(|e| Error::invalid(&place, PLACEMENT, e, "a value written by conefield"))?;
+    let placement: Placement = written::read(&format!("{place}: {PLACEMENT}.json"), note(PLACEMENT)?)?;
     placement.validate(&place)?;
     // The notes imply the size of the network: the tensors must match before memory is allocated for it. A mask reduces
     // the size.
@@ -129,8 +128,7 @@ pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Re
     let mut file = conefield_io::read_checkpoint(path)?;
     let standing = file.notes.remove(STANDING).unwrap_or_default();
     same_run(&place, &file.notes, run)?;
-    let standing: Standing = serde_json::from_str(&standing)
-        .map_err(|e| Error::invalid(&place, STANDING, e, "a value written by conefield"))?;
+    let standing: Standing = written::read(&format!("{place}: {STANDING}.json"), &standing)?;
     let Standing { step, recorded, seconds, .. } = standing;
     ensure(step <= MOST_STEPS, &place, "step", step, format!("at most {MOST_STEPS}"))?;
     ensure(recorded <= step, &place, "recorded", recorded, format!("at most {step}, the steps that are done"))?;

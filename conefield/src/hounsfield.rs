@@ -276,11 +276,7 @@ impl How {
 
 fn read(path: &Path) -> Result<CalibrationFile> {
     let text = conefield_core::files::read_text(path, LONGEST)?;
-    toml::from_str(&text).map_err(|e| {
-        let line = conefield_core::files::toml_line(&text, &e).unwrap_or(1);
-        let expected = "water and air in 1/mm, and energy_kev if known";
-        Error::invalid(format!("{}:{line}", path.display()), "calibration", e.message(), expected)
-    })
+    conefield_core::written::read(&path.display().to_string(), &text)
 }
 
 impl Calibration {
@@ -457,7 +453,7 @@ mod tests {
         assert_eq!(converted(&how, None).unwrap().1, "HU: water 0.021, air 0.001 per mm at 62.5 keV");
         std::fs::write(&path, "water = 0.021\nare = 0.001\n").unwrap();
         let said = converted(&how, None).unwrap_err().to_string();
-        assert!(said.contains("a.toml:2") && said.contains("water and air"), "{said}");
+        assert!(said.contains("a.toml:2:1: are") && said.contains("\"air\" (of water, air, energy_kev)"), "{said}");
         for bad in ["", "60", "keV", "€V", "water=1", "water=a,air=0", "air=0,water=1", "water=sphere:1,air=0"] {
             assert!(bad.parse::<How>().is_err(), "{bad}");
         }

@@ -1,6 +1,7 @@
 //! Parsers of values from the command line and elsewhere. Errors are reported before any work.
 
 use conefield_core::error::ensure;
+use conefield_core::finite::range;
 use conefield_core::scan::Volume;
 use conefield_io::I0;
 use conefield_projectors::simulate::{DetectorNoise, HuMapping};
@@ -183,14 +184,10 @@ const LEAST: f32 = -50.0;
 
 /// Refuses a volume whose values are no attenuation, but probably Hounsfield units.
 pub fn must_be_attenuation(volume: &Volume) -> conefield_core::Result<()> {
-    let [low, high] = range(volume);
+    let [low, high] = range(&volume.data);
     let expected = "attenuation, which is not negative (Hounsfield units? --values hu:0.02 of simulate and convert makes \
                     attenuation, with water 0.02 per mm; clip:-1000,2000 numbers from 0 to 1)";
     ensure(low >= LEAST, "volume", "values", format!("{low} to {high}"), expected)
-}
-
-fn range(volume: &Volume) -> [f32; 2] {
-    volume.data.iter().fold([f32::INFINITY, f32::NEG_INFINITY], |[low, high], x| [low.min(*x), high.max(*x)])
 }
 
 impl Values {
@@ -200,7 +197,7 @@ impl Values {
         let volume = self.apply(volume)?;
         if self == Self::AsIs {
             must_be_attenuation(&volume)?;
-            let [low, high] = range(&volume);
+            let [low, high] = range(&volume.data);
             if low < -0.1 * high.max(0.0) {
                 tracing::warn!("the volume has values from {low} to {high}: attenuation is not negative (--values)");
             }

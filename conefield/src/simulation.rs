@@ -2,10 +2,11 @@
 
 use crate::memory::Memory;
 use crate::parse::{AnglesOption, Values};
-use conefield_core::files::{read_text, toml_line};
+use conefield_core::files::read_text;
+use conefield_core::finite::range;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, written};
 use conefield_projectors::simulate::{Angles, DetectorNoise, HuMapping, Protocol, downsample, project, simulate};
 use serde_json::json;
 use std::path::Path;
@@ -101,7 +102,7 @@ pub fn scan(mut volume: Volume, values: Values, protocol: &Protocol, source: &st
         volume = volume.mapped(|x| x * per_unit);
     }
     let mut scan = simulate(&volume, protocol)?;
-    let most = scan.projections.iter().copied().fold(0.0, f32::max);
+    let most = range(&scan.projections)[1];
     if most > OPAQUE {
         tracing::warn!(
             "line integrals up to {most}: nothing passes such an object; voxel values are attenuation per {} (--values)",
@@ -145,15 +146,7 @@ pub fn check_memory(volume: &Volume, g: &Geometry) -> Result<()> {
 
 fn read_protocol(path: &Path) -> Result<Protocol> {
     let text = read_text(path, LONGEST)?;
-    let place = path.display();
-    if text.trim_start().starts_with('{') {
-        return serde_json::from_str(&text)
-            .map_err(|e| Error::invalid(format!("{place}:{}:{}", e.line(), e.column()), "protocol", e, "a protocol"));
-    }
-    toml::from_str(&text).map_err(|e| {
-        let line = toml_line(&text, &e).unwrap_or(1);
-        Error::invalid(format!("{place}:{line}"), "protocol", e.message(), "a protocol")
-    })
+    written::read(&path.display().to_string(), &text)
 }
 
 fn read_angles(path: &Path) -> Result<Vec<f64>> {

@@ -51,12 +51,6 @@ pub fn read_text_bytes(path: &Path, most: u64) -> Result<Vec<u8>> {
 /// UTF-8's byte-order mark, which programs on Windows put at the start of a text.
 pub const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
 
-/// The line of `text` (from 1) of a TOML error, if known.
-pub fn toml_line(text: &str, error: &toml::de::Error) -> Option<usize> {
-    let before = &text.as_bytes()[..error.span()?.start.min(text.len())];
-    Some(1 + before.iter().filter(|b| **b == b'\n').count())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -78,13 +72,5 @@ mod tests {
         }
         let e = read(b"\xa9 2004").unwrap_err().to_string();
         assert!(e.contains("not UTF-8"), "{e}");
-    }
-
-    #[test]
-    fn a_toml_error_has_its_line() {
-        for (text, line) in [("a = = 1", 1), ("a = 1\n\nb = é", 3), ("a = 1\na = 2\n", 2), ("\n[b", 2)] {
-            let error = toml::from_str::<toml::Table>(text).unwrap_err();
-            assert_eq!(toml_line(text, &error), Some(line), "{text}");
-        }
     }
 }

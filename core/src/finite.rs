@@ -1,4 +1,4 @@
-//! Searches arrays for values that are not allowed, such as NaN.
+//! Which values an array holds: the first that is not allowed, such as NaN, and the range.
 
 use crate::parallel;
 use ndarray::{ArrayBase, Data, Dimension};
@@ -27,6 +27,15 @@ where
     array.indexed_iter().find(|(_, x)| !fine(**x)).map(|(at, x)| (at, *x))
 }
 
+/// The least and the largest number of `array`, NaN aside; `[∞, −∞]` if there is none.
+pub fn range<S: Data<Elem = f32>, D: Dimension>(array: &ArrayBase<S, D>) -> [f32; 2] {
+    let wider = |[low, high]: [f32; 2], x: f32| [low.min(x), high.max(x)];
+    let none = [f32::INFINITY, f32::NEG_INFINITY];
+    let Some(values) = array.as_slice_memory_order() else { return array.iter().copied().fold(none, wider) };
+    let parts = parallel::map(values.chunks(PART), |_, part| part.iter().copied().fold(none, wider));
+    parts.into_iter().fold(none, |[low, high], [least, most]| [low.min(least), high.max(most)])
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -44,5 +53,16 @@ mod tests {
         assert_eq!(stray(&array.slice(s![..7, .., ..])), None);
         assert_eq!(stray(&array.slice(s![.., ..;2, ..])).map(|found| found.0), Some((7, 4, 31)));
         assert_eq!(first_not(&array, |x| x < 1.0).map(|found| found.0), Some((7, 8, 31)));
+    }
+
+    #[test]
+    fn the_range_leaves_nan_aside_in_any_layout() {
+        assert_eq!(range(&Array3::<f32>::zeros([0, 1, 1])), [f32::INFINITY, f32::NEG_INFINITY]);
+        let mut array = Array3::from_shape_fn([40, 50, 60], |(i, j, k)| (i + j + k) as f32 - 7.0);
+        array[[0, 0, 1]] = f32::NAN;
+        assert_eq!(range(&array), [-7.0, 140.0]);
+        assert_eq!(range(&array.slice(s![1.., ..;2, ..])), [-6.0, 139.0]);
+        array[[3, 3, 3]] = f32::INFINITY;
+        assert_eq!(range(&array), [-7.0, f32::INFINITY]);
     }
 }

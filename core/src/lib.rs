@@ -62,5 +62,6 @@ pub mod trained;
 pub mod trilinear;
 pub mod voxel;
 pub mod wgsl;
+pub mod written;
 
 pub use error::{Error, Result};

@@ -9,7 +9,6 @@ pub mod marks;
 mod one_of;
 pub mod schema;
 pub mod stage;
-mod tree;
 
 use crate::method::Method;
 use schemars::JsonSchema;

@@ -4,4 +4,5 @@
 //! - [`report`]: numbers in words and tables; plots, pictures and pages.
 
 pub mod metrics;
+pub mod pca;
 pub mod report;

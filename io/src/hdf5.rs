@@ -16,6 +16,7 @@ use crate::number::{ByteOrder, Number};
 use conefield_core::error::ensure;
 use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance, files};
+use hdf5_reader::datatype_api::H5Type;
 use hdf5_reader::{Dataset, Datatype, FileStorage, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
 use layout::{Found, Layout};
 use ndarray::{ArrayD, Dimension, IxDyn};
@@ -234,30 +235,7 @@ impl Container {
 
     /// Storage type of the values.
     fn number(&self, data: &Dataset) -> Result<(Number, ByteOrder)> {
-        let order = |o: hdf5_reader::ByteOrder| match o {
-            hdf5_reader::ByteOrder::LittleEndian => ByteOrder::Little,
-            hdf5_reader::ByteOrder::BigEndian => ByteOrder::Big,
-        };
-        let (number, byte_order) = match *data.dtype() {
-            Datatype::FixedPoint { size, signed, byte_order } => {
-                let number = match (size, signed) {
-                    (1, false) => Number::U8,
-                    (1, true) => Number::I8,
-                    (2, false) => Number::U16,
-                    (2, true) => Number::I16,
-                    (4, false) => Number::U32,
-                    (4, true) => Number::I32,
-                    (8, false) => Number::U64,
-                    (8, true) => Number::I64,
-                    _ => return Err(self.other_type(data)),
-                };
-                (number, byte_order)
-            }
-            Datatype::FloatingPoint { size: 4, byte_order } => (Number::F32, byte_order),
-            Datatype::FloatingPoint { size: 8, byte_order } => (Number::F64, byte_order),
-            _ => return Err(self.other_type(data)),
-        };
-        Ok((number, order(byte_order)))
+        stored(data.dtype()).ok_or_else(|| self.other_type(data))
     }
 
     fn other_type(&self, data: &Dataset) -> Error {
@@ -377,27 +355,9 @@ impl Container {
             }
             let mut selection = SliceInfo::all(shape.len());
             selection.selections[0] = SliceInfoElem::Slice { start: from as u64, end: to as u64, step: 1 };
-            macro_rules! append {
-                ($t:ty) => {{
-                    let slab = data.read_slice::<$t>(&selection).map_err(|e| self.broken(data, &e))?;
-                    for (values, place) in slab.outer_iter().zip(places) {
-                        if place.is_some() {
-                            out.extend(values.iter().map(|x| *x as f32));
-                        }
-                    }
-                }};
-            }
-            match number {
-                Number::U8 => append!(u8),
-                Number::I8 => append!(i8),
-                Number::U16 => append!(u16),
-                Number::I16 => append!(i16),
-                Number::U32 => append!(u32),
-                Number::I32 => append!(i32),
-                Number::U64 => append!(u64),
-                Number::I64 => append!(i64),
-                Number::F32 => append!(f32),
-                _ => append!(f64),
+            let slab = data.read_slice::<Single>(&selection).map_err(|e| self.broken(data, &e))?;
+            for (values, _) in slab.outer_iter().zip(places).filter(|(_, place)| place.is_some()) {
+                out.extend(values.iter().map(|x| x.0));
             }
         }
         Ok(out)
@@ -436,5 +396,59 @@ impl Container {
             || attribute.read_scalar::<i64>().map(|x| x as f64).or(attribute.read_scalar::<i32>().map(f64::from));
         let as_float = || attribute.read_scalar::<f64>().or(attribute.read_scalar::<f32>().map(f64::from));
         as_float().or_else(|_| as_integer()).ok().filter(|x| x.is_finite())
+    }
+}
+
+/// How values of the type `dtype` are stored; `None` if they are not numbers.
+fn stored(dtype: &Datatype) -> Option<(Number, ByteOrder)> {
+    let (number, order) = match *dtype {
+        Datatype::FixedPoint { size, signed, byte_order } => {
+            let number = match (size, signed) {
+                (1, false) => Number::U8,
+                (1, true) => Number::I8,
+                (2, false) => Number::U16,
+                (2, true) => Number::I16,
+                (4, false) => Number::U32,
+                (4, true) => Number::I32,
+                (8, false) => Number::U64,
+                (8, true) => Number::I64,
+                _ => return None,
+            };
+            (number, byte_order)
+        }
+        Datatype::FloatingPoint { size: 4, byte_order } => (Number::F32, byte_order),
+        Datatype::FloatingPoint { size: 8, byte_order } => (Number::F64, byte_order),
+        _ => return None,
+    };
+    let order = match order {
+        hdf5_reader::ByteOrder::LittleEndian => ByteOrder::Little,
+        hdf5_reader::ByteOrder::BigEndian => ByteOrder::Big,
+    };
+    Some((number, order))
+}
+
+/// A number of any stored type, read as `f32`: one type, for which the reader's generic code is compiled once.
+#[derive(Clone)]
+struct Single(f32);
+
+impl H5Type for Single {
+    fn hdf5_type() -> Datatype {
+        f32::hdf5_type()
+    }
+
+    fn element_size(dtype: &Datatype) -> usize {
+        stored(dtype).map_or(0, |(number, _)| number.bytes())
+    }
+
+    fn from_bytes(bytes: &[u8], dtype: &Datatype) -> hdf5_reader::error::Result<Self> {
+        let one = Self::decode_vec(bytes, dtype, 1).transpose()?.and_then(|mut all| all.pop());
+        one.ok_or_else(|| hdf5_reader::error::Error::InvalidData("no number".into()))
+    }
+
+    fn decode_vec(raw: &[u8], dtype: &Datatype, count: usize) -> Option<hdf5_reader::error::Result<Vec<Self>>> {
+        let (number, order) = stored(dtype)?;
+        let mut all = Vec::with_capacity(count);
+        number.decode(order, raw.get(..count.checked_mul(number.bytes())?)?, &mut all, |x| Self(x as f32));
+        Some(Ok(all))
     }
 }

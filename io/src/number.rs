@@ -58,7 +58,8 @@ impl Number {
         self.decode(order, raw, out, |x| x);
     }
 
-    fn decode<T>(self, order: ByteOrder, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
+    /// Appends what `map` makes of the numbers in `raw` (a whole number of them) to `out`.
+    pub fn decode<T>(self, order: ByteOrder, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
         macro_rules! each {
             ($t:ty) => {{
                 let (raw, _) = raw.as_chunks::<{ size_of::<$t>() }>();

@@ -5,14 +5,12 @@
 //! v points towards +z, against the rows. `offOrigin` is the volume's centre. Projections are integrals over the file's
 //! lengths, whatever their unit.
 
-use crate::input::LONGEST_TEXT;
 use crate::orbit::{common_orbit, written};
 use crate::scan::DataSet;
-use crate::text::{self, parse_json, shortened, unread};
+use crate::text::{self, shortened, unread};
 use crate::unit::{self, Reading, Units};
 use crate::{ScanSize, folder, memory, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
 use conefield_core::error::ensure;
-use conefield_core::files::read_text;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::orbit::{Beam, CircularOrbit};
 use conefield_core::scan::{Scan, Unit, Volume};
@@ -84,7 +82,7 @@ pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
 
 fn warn_of_others(folder: &Path) -> Result<()> {
     let file = folder.join(META);
-    let meta = parse_json(&file, &read_text(&file, LONGEST_TEXT)?)?;
+    let meta = text::read(&file)?;
     text::warn(&file.display().to_string(), unread(&others(&meta)));
     Ok(())
 }
@@ -127,7 +125,7 @@ const SCANNER_KEYS: [&str; 11] = [
 fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
     let place = file.display().to_string();
-    let meta: Meta = parse_json(&file, &read_text(&file, LONGEST_TEXT)?)?;
+    let meta: Meta = text::read(&file)?;
     let s = &meta.scanner;
     for (field, x) in [("scanner.DSO", s.DSO), ("scanner.DSD", s.DSD)] {
         ensure(x.is_finite() && x > 0.0, &place, field, x, "a positive finite distance")?;
@@ -165,7 +163,7 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
 /// which is read to find the unit.
 pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
     let file = folder.join(META);
-    let meta: Meta = parse_json(&file, &read_text(&file, LONGEST_TEXT)?)?;
+    let meta: Meta = text::read(&file)?;
     let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
     let pixels_of = |frames: &[Frame]| product(&meta.scanner.nDetector).saturating_mul(frames.len() as u64);
     let (pixels, test_pixels) = (pixels_of(&meta.proj_train), pixels_of(&meta.proj_test));
@@ -460,7 +458,7 @@ mod tests {
             fs::write(&file, serde_json::to_string_pretty(&meta).unwrap()).unwrap();
             says(read_r2(&path), words);
         };
-        refused(&|m| m["scanner"]["DSO"] = json!("far"), &["line", "DSO", "far"]);
+        refused(&|m| m["scanner"]["DSO"] = json!("far"), &[".json:47:", "scanner.DSO", "far"]);
         refused(&|m| m["scanner"]["nDetector"] = json!([4, 7]), &["proj_train_0000.npy", "[4, 6]", "[4, 7]"]);
         refused(&|m| m["scanner"]["nVoxel"] = json!([1u64 << 40, 1u64 << 40, 1]), &["volume.shape"]);
         refused(&|m| m["scanner"]["sVoxel"] = json!(null), &["scanner.sVoxel", "nothing"]);

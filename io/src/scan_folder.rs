@@ -341,7 +341,7 @@ mod tests {
         fs::write(path.join("scan.json"), json.replace("\"dsd\"", "\"dds\"")).unwrap();
         let e = read_scan(&path).unwrap_err().to_string();
         let line = 1 + json[..json.find("\"dsd\"").unwrap()].matches('\n').count();
-        assert!(e.contains("scan.json") && e.contains(&format!("line {line}")) && e.contains("`dsd`"), "{e}");
+        assert!(e.contains("scan.json") && e.contains(&format!(":{line}:")) && e.contains("\"dsd\""), "{e}");
     }
 
     #[test]
@@ -360,13 +360,13 @@ mod tests {
         let line = 1 + text[..text.find("spacing").unwrap()].matches('\n').count();
         refused(
             |t| t.replace("spacing", "spacng"),
-            &["scan.toml", &format!("line {line}"), "spacng", "`spacing`", "shape"],
+            &["scan.toml", &format!(":{line}:"), "spacng", "\"spacing\"", "shape"],
         );
-        refused(|t| format!("protections = 1\n{t}"), &["line 1", "protections", "`projections`"]);
-        refused(|t| t.replace("rows = 4", "rows = -4"), &["line", "rows", "-4"]);
-        refused(|t| t.replace("rows = 4", "rows = \"four\""), &["line", "rows", "four"]);
-        refused(|t| t.replace("rows = 4\n", ""), &["line", "rows", "nothing"]);
-        refused(|t| t.replace("rows = 4", "rows = = 4"), &["line", "rows"]);
+        refused(|t| format!("protections = 1\n{t}"), &[":1:1:", "protections", "\"projections\""]);
+        refused(|t| t.replace("rows = 4", "rows = -4"), &["scan.toml:", "rows", "-4"]);
+        refused(|t| t.replace("rows = 4", "rows = \"four\""), &["scan.toml:", "rows", "four"]);
+        refused(|t| t.replace("rows = 4\n", ""), &["scan.toml:", "rows", "nothing"]);
+        refused(|t| t.replace("rows = 4", "rows = = 4"), &["scan.toml:", "syntax"]);
     }
 
     #[test]
@@ -376,7 +376,7 @@ mod tests {
         refused(|t| t.replace("rows = 4", "rows = 4611686018427387904"), &["detector"]);
         refused(|t| t.replace("\"projections.npy\"", "\"none.npy\""), &["projections", "none.npy"]);
         refused(|t| t.replace("dso = 5", "dso = -5"), &["orbit.dso", "-5"]);
-        refused(|t| t.replace("dso = 5", "dso = nan # 5"), &["orbit.dso", "NaN"]);
+        refused(|t| t.replace("dso = 5", "dso = nan # 5"), &["dso: found nan", "finite"]);
         refused(|t| t.replace("offset = [", "count = 9\noffset = ["), &["orbit.angles", "one way"]);
         refused(|t| t.replace("dsd =", "views = []\ndsd ="), &["views"]);
         refused(|t| t.replace("angles = [", "angles = [] # ["), &["views", "at least one"]);

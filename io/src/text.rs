@@ -1,29 +1,13 @@
-//! TOML and JSON with errors that name the line and, for an unknown key, the nearest valid one; texts of other
-//! programs in their encodings.
+//! Descriptions in TOML and JSON; texts of other programs in their encodings.
 
 use crate::input::LONGEST_TEXT;
 use conefield_core::error::ensure;
-use conefield_core::files::{BYTE_ORDER_MARK, read_text, read_text_bytes, toml_line};
-use conefield_core::{Error, Result, allowance};
+use conefield_core::files::{BYTE_ORDER_MARK, read_text, read_text_bytes};
+use conefield_core::{Error, Result, allowance, written};
 use roxmltree::{Document, ParsingOptions};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use std::path::Path;
-
-/// The notation of a text.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Notation {
-    Toml,
-    Json,
-}
-
-impl Notation {
-    /// JSON for the extension `.json`, else TOML.
-    fn of(path: &Path) -> Self {
-        let json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
-        if json { Self::Json } else { Self::Toml }
-    }
-}
 
 /// The keys that identify a description.
 #[derive(Default, Deserialize)]
@@ -34,22 +18,25 @@ struct Mark {
 
 /// The `format` that the file `path` states, if it is a description at all.
 pub(crate) fn format_of(path: &Path) -> Option<String> {
-    let mark: Mark = parse(path, &read_text(path, LONGEST_TEXT).ok()?, Notation::of(path)).ok()?;
-    mark.format
+    read::<Mark>(path).ok()?.format
+}
+
+/// Reads the JSON or TOML file `path`.
+pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<T> {
+    written::read(&path.display().to_string(), &read_text(path, LONGEST_TEXT)?)
 }
 
 /// Reads the description `path`, whose `format` and `version` must match.
 pub(crate) fn described<T: DeserializeOwned>(path: &Path, format: &str, version: u32) -> Result<T> {
     let text = read_text(path, LONGEST_TEXT)?;
     let place = path.display().to_string();
-    let notation = Notation::of(path);
     // Checked before the other keys, which may differ in a later version.
-    let mark: Mark = parse(path, &text, notation)?;
+    let mark: Mark = written::read(&place, &text)?;
     let found = mark.format.unwrap_or_else(|| "nothing".into());
     ensure(found == format, &place, "format", format!("\"{found}\""), format!("\"{format}\""))?;
     let found = mark.version.map_or("nothing".into(), |v| v.to_string());
     ensure(mark.version == Some(version), &place, "version", found, format!("{version}, which this build reads"))?;
-    parse(path, &text, notation)
+    written::read(&place, &text)
 }
 
 /// The start of a text file without its byte-order mark.
@@ -89,55 +76,6 @@ pub(crate) fn xml<'t>(place: &str, text: &'t str, expected: &str) -> Result<Docu
     Document::parse_with_options(text, options).map_err(|e| Error::invalid(place, "XML", e, expected))
 }
 
-/// Parses `text`, the content of `path`.
-fn parse<T: DeserializeOwned>(path: &Path, text: &str, notation: Notation) -> Result<T> {
-    match notation {
-        Notation::Toml => parse_toml(path, text),
-        Notation::Json => parse_json(path, text),
-    }
-}
-
-/// Parses `text`, the content of the JSON file `path`.
-pub(crate) fn parse_json<T: DeserializeOwned>(path: &Path, text: &str) -> Result<T> {
-    serde_json::from_str(text).map_err(|e| {
-        let full = e.to_string();
-        let message = full.rsplit_once(" at line ").map_or(full.as_str(), |(m, _)| m);
-        explain(path, text, (e.line() > 0).then(|| e.line()), message)
-    })
-}
-
-/// Parses `text`, the content of the TOML file `path`. Errors name the line and, for an unknown key, the nearest valid
-/// one.
-pub fn parse_toml<T: DeserializeOwned>(path: &Path, text: &str) -> Result<T> {
-    toml::from_str(text).map_err(|e| explain(path, text, toml_line(text, &e), e.message()))
-}
-
-fn explain(path: &Path, text: &str, line: Option<usize>, message: &str) -> Error {
-    let place = match line {
-        Some(n) => format!("{}: line {n}", path.display()),
-        None => path.display().to_string(),
-    };
-    let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
-    if message.starts_with("unknown field")
-        && let Some((unknown, valid)) = names.split_first()
-    {
-        return Error::invalid(place, *unknown, "a key that is not known here", suggestion(unknown, valid));
-    }
-    if let (true, Some(name)) = (message.starts_with("missing field"), names.first()) {
-        return Error::invalid(place, *name, "nothing", "a value");
-    }
-    let key = line
-        .and_then(|n| text.lines().nth(n - 1))
-        .and_then(|l| l.split_once(['=', ':']))
-        .map(|(k, _)| k.trim().trim_matches('"'))
-        .filter(|k| !k.is_empty() && !k.contains(['{', '[', '#']))
-        .unwrap_or("content");
-    match message.split_once(", expected ") {
-        Some((found, expected)) => Error::invalid(place, key, found.trim(), expected.trim()),
-        None => Error::invalid(place, key, message.trim(), "valid values"),
-    }
-}
-
 /// What to say of `keys` that are not read; `None` if there are none.
 pub(crate) fn unread(keys: &[String]) -> Option<String> {
     (!keys.is_empty()).then(|| format!("not read, though they may change the geometry: {}", keys.join(", ")))
@@ -153,17 +91,6 @@ pub(crate) fn shortened(text: &str) -> String {
     match text.char_indices().nth(80) {
         Some((at, _)) => format!("\"{}…\"", &text[..at]),
         None => format!("\"{text}\""),
-    }
-}
-
-/// "`spacing`, the nearest of: ...".
-fn suggestion(unknown: &str, valid: &[&str]) -> String {
-    let near = |name: &str| strsim::jaro_winkler(&unknown.to_lowercase(), name);
-    let best = valid.iter().max_by(|a, b| near(a).total_cmp(&near(b)));
-    match best {
-        Some(b) if valid.len() > 1 => format!("`{b}` (the nearest of: {})", valid.join(", ")),
-        Some(b) => format!("`{b}`"),
-        None => "no key at all".into(),
     }
 }
 

@@ -1,12 +1,13 @@
 //! The object's shadow on the detector.
 
+use conefield_core::finite::range;
 use conefield_core::scan::Scan;
 use ndarray::{Array2, ArrayView2};
 
 /// Upper limit of smoothed pixels in air: the noise's standard deviation, estimated from differences of neighbouring
 /// pixels, or 1/500 of the largest values, whichever is larger.
 pub fn air_level(scan: &Scan) -> f32 {
-    let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
+    let top = range(&scan.projections)[1].max(0.0);
     let mut differences: Vec<f32> = scan
         .projections
         .outer_iter()

@@ -3,7 +3,6 @@
 use super::trained::{OpenedField, Trained};
 use crate::boundary::{self, Inputs, refuse_existing};
 use crate::out;
-use crate::pca::Pca;
 use clap::{Args, ValueEnum};
 use conefield::tradeoff::statistics::pearson;
 use conefield_core::error::{Error, Result};
@@ -11,6 +10,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::host;
 use conefield_core::parts::Part;
 use conefield_core::trained::TrainedField;
+use conefield_evaluation::pca::Pca;
 use conefield_evaluation::report::MiddleSlices;
 use ndarray::Array3;
 use serde_json::json;

@@ -8,6 +8,7 @@ use clap::Args;
 use conefield::files;
 use conefield::memory::Memory;
 use conefield_backend_cpu::Cpu;
+use conefield_core::finite::range;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
@@ -139,8 +140,7 @@ fn volume(path: &Path, png: Option<&Path>) -> Result<Value> {
 
 /// Hints that the values are not attenuation, and that images may be views instead of slices.
 fn volume_warnings(path: &Path, v: &Volume) -> Vec<Value> {
-    let low = v.data.iter().copied().fold(f32::INFINITY, f32::min);
-    let high = v.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let [low, high] = range(&v.data);
     let advice = "simulate, pretrain and convert take --values hu:MU_WATER or clip:LO,HI for them";
     let hounsfield = low <= -500.0 && high > 0.0;
     let found = format!("values from {low} to {high} look like Hounsfield units, not attenuation");

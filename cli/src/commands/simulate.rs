@@ -8,6 +8,7 @@ use conefield::memory::Memory;
 use conefield::parse::{self, AnglesOption, Values};
 use conefield::simulation::{self, Changes};
 use conefield_core::Result;
+use conefield_core::finite::range;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Unit;
 use conefield_projectors::simulate::{DetectorExtent, DetectorNoise, Protocol};
@@ -116,7 +117,7 @@ impl SimulateArgs {
         let (scan, volume) = simulation::scan(volume, self.values, &protocol, &self.volume)?;
         conefield_io::write_scan(&self.output, &scan, Some(&volume))?;
         let g = &scan.geometry;
-        if scan.projections.iter().all(|a| *a == 0.0) {
+        if range(&scan.projections) == [0.0; 2] {
             warn!(
                 "every line integral is 0: no ray meets the object; lengths of the protocol are in its unit ({} mm)",
                 scan.unit.mm

@@ -27,7 +27,7 @@ pub use crate::study::written::Protocol;
 use crate::study::written::{Entry, Written, WrittenScan, WrittenSimulation, WrittenSpec, WrittenVolume};
 use conefield_core::backend::Backend;
 use conefield_core::error::ensure;
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, written};
 use conefield_evaluation::report::text::stem;
 use serde_json::Value;
 use std::collections::BTreeSet;
@@ -105,7 +105,7 @@ impl Study {
     /// file's.
     pub fn read(path: &Path) -> Result<Self> {
         let text = conefield_core::files::read_text(path, LONGEST)?;
-        let written: Written = conefield_io::parse_toml(path, &text)?;
+        let written: Written = written::read(&path.display().to_string(), &text)?;
         let folder = std::path::absolute(path).map_err(|e| Error::io(path, e))?;
         let folder = folder.parent().unwrap_or(Path::new("")).to_path_buf();
         Reading { path, text: &text, folder }.study(written)
@@ -336,10 +336,9 @@ impl Reading<'_> {
         self.folder.join(path).display().to_string()
     }
 
-    /// The file and the line on which something begins.
+    /// The file, line and column at which something begins.
     fn at<T>(&self, what: &Spanned<T>) -> String {
-        let before = &self.text.as_bytes()[..what.span().start.min(self.text.len())];
-        format!("{}: line {}", self.path.display(), 1 + before.iter().filter(|b| **b == b'\n').count())
+        written::location(&self.path.display().to_string(), self.text, what.span().start)
     }
 
     /// The same error, with the line of its entry.
@@ -398,26 +397,30 @@ mod tests {
     fn mistakes_are_reported_with_their_line() {
         // Lines at the top, then the two lines of TINY, then tables.
         for (top, tables, want) in [
-            ("seed = [1]\n", "", "line 1: seed: found a key that is not known here, expected `seeds`"),
-            ("", "[simulate]\nviews = 3\n", "line 4: views: found a key that is not known here"),
-            ("", "[[scans]]\nscan = 'a'\nreferense = 'truth'\n", "line 5: referense: found a key that is not known"),
-            ("", "[[scans]]\nscan = 'a'\n", "line 3: scans: found"),
-            ("", "[protocol]\nseconds = 'soon'\n", "line 4: seconds: found \"soon\", expected seconds (600s)"),
-            ("", "[protocol]\nbudget = 9\nsteps = 3\n", "line 3: budget: found another end beside it"),
-            ("seeds = [1,\n 1]\n", "", "line 1: seeds: found 1 twice"),
-            ("views = []\n", "", "line 1: views: found none"),
-            ("views = [0]\n", "", "line 1: views"),
+            ("seed = [1]\n", "", ":1:1: seed: found a key that is not known here, expected \"seeds\""),
+            ("", "[simulate]\nviews = 3\n", ":4:1: simulate.views: found a key that is not known here"),
+            (
+                "",
+                "[[scans]]\nscan = 'a'\nreferense = 'truth'\n",
+                ":5:1: scans.0.referense: found a key that is not known",
+            ),
+            ("", "[[scans]]\nscan = 'a'\n", ":3:1: scans: found"),
+            ("", "[protocol]\nseconds = 'soon'\n", ":4:11: protocol.seconds: found \"soon\", expected seconds (600s)"),
+            ("", "[protocol]\nbudget = 9\nsteps = 3\n", ":3:1: budget: found another end beside it"),
+            ("seeds = [1,\n 1]\n", "", ":1:9: seeds: found 1 twice"),
+            ("views = []\n", "", ":1:9: views: found none"),
+            ("views = [0]\n", "", ":1:10: views.0: found"),
             (
                 "baseline = 'sirt'\n",
                 "",
-                "line 1: baseline: found \"sirt\", expected the name of a method: one of fdk, SIRT",
+                ":1:12: baseline: found \"sirt\", expected the name of a method: one of fdk, SIRT",
             ),
-            ("window = [1.0, 0.5]\n", "", "line 1: window: found [1.0, 0.5]"),
-            ("", "[simulate]\nnoise = 'salt'\n", "line 4: noise: found \"salt\", expected"),
-            ("", "[simulate]\ndetector = 5\n", "line 4: detector: found \"5\", expected ROWSxCOLS"),
-            ("", "[simulate]\nprotocol = 'none.toml'\n", "line 1: volumes: "),
-            ("", "[protocol]\nhold_out = '99'\n", "line 1: volumes: "),
-            ("", "[protocol]\nset = ['stop.pases=3']\n", "line 2: specs: --set stop.pases=3"),
+            ("window = [1.0, 0.5]\n", "", ":1:10: window: found [1.0, 0.5]"),
+            ("", "[simulate]\nnoise = 'salt'\n", ":4:9: simulate.noise: found \"salt\", expected"),
+            ("", "[simulate]\ndetector = 5\n", ":4:12: simulate.detector: found \"5\", expected ROWSxCOLS"),
+            ("", "[simulate]\nprotocol = 'none.toml'\n", ":1:12: volumes: "),
+            ("", "[protocol]\nhold_out = '99'\n", ":1:12: volumes: "),
+            ("", "[protocol]\nset = ['stop.pases=3']\n", ":2:10: specs: --set stop.pases=3"),
             ("", "[protocol]\nreference = 'a.nii'\n", "found \"a.nii\" and no scans"),
         ] {
             let whole = format!("{top}{TINY}{tables}");
@@ -427,10 +430,10 @@ mod tests {
         for (text, want) in [
             ("specs = ['fdk']\n", "neither volumes nor scans"),
             ("volumes = ['phantom:head:16']\nspecs = []\n", "specs: found none"),
-            ("volumes = ['phantom:head:16']\nspecs = ['fkd']\n", "line 2: specs: spec: fkd: found neither"),
-            ("volumes = ['phantom:hand']\nspecs = ['fdk']\n", "line 1: volumes: "),
-            ("volumes = ['phantom:head:16', 'phantom:head:16']\nspecs = ['fdk']\n", "line 1: name: found \"head-16\""),
-            ("volumes = ['phantom:head:16']\nspecs = ['fdk', 'fdk']\n", "line 2: specs: fdk (shipped): name: "),
+            ("volumes = ['phantom:head:16']\nspecs = ['fkd']\n", ":2:10: specs: spec: fkd: found neither"),
+            ("volumes = ['phantom:hand']\nspecs = ['fdk']\n", ":1:12: volumes: "),
+            ("volumes = ['phantom:head:16', 'phantom:head:16']\nspecs = ['fdk']\n", ":1:31: name: found \"head-16\""),
+            ("volumes = ['phantom:head:16']\nspecs = ['fdk', 'fdk']\n", ":2:10: specs: fdk (shipped): name: "),
             ("volumes = ['phantom:head:16']\nspecs = [{ spec = 'fdk', name = '../fdk' }]\n", "a name for a folder"),
             ("volumes = ['phantom:head:16']\nspecs = [{ spec = 'fast', init = 'none.nii' }]\n", "none.nii"),
         ] {

@@ -258,6 +258,9 @@ impl<'de> Deserialize<'de> for Text {
             fn visit_str<E: Error>(self, text: &str) -> Result<Text, E> {
                 Ok(Text(text.into()))
             }
+            fn visit_u64<E: Error>(self, number: u64) -> Result<Text, E> {
+                Ok(Text(number.to_string()))
+            }
             fn visit_i64<E: Error>(self, number: i64) -> Result<Text, E> {
                 Ok(Text(number.to_string()))
             }

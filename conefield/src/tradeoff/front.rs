@@ -3,9 +3,9 @@
 
 use crate::shipped::FRONT;
 use crate::tradeoff::statistics::mean;
-use conefield_core::error::{Error, Result, ensure};
-use conefield_core::files::toml_line;
+use conefield_core::error::{Result, ensure};
 use conefield_core::method::Plan;
+use conefield_core::written;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -166,10 +166,7 @@ impl Front {
     }
 
     fn parse(text: &str, place: &str) -> Result<Self> {
-        let front: Self = toml::from_str(text).map_err(|e| {
-            let line = toml_line(text, &e).unwrap_or(1);
-            Error::invalid(format!("{place}:{line}"), "front", e.message(), "a front written by conefield tradeoff")
-        })?;
+        let front: Self = written::read(place, text)?;
         ensure(!front.scans.is_empty(), place, "scans", "none", "the scans that it was measured on")?;
         ensure(!front.points.is_empty(), place, "points", "none", "at least one method")?;
         for scan in &front.scans {
@@ -317,11 +314,11 @@ mod tests {
             assert_eq!(front.expected(&front.points[0], size), want);
         }
         for (from, to, says) in [
-            ("psnr = 30.0", "psnr = nan", "psnr or held_out"),
+            ("psnr = 30.0", "psnr = nan", "psnr: found nan"),
             ("steps = 4", "steps = 0", "points[0].runs"),
             ("made = \"test\"", "made = \"test\"\npass_s = 0", "pass_s"),
             ("psnr = 30.0", "psnr = 30.0\nbeside_s = -1.0", "points[0].runs"),
-            ("kind", "kinds", "a:9: front"),
+            ("kind", "kinds", "a:9:1: points.0.kinds: found a key that is not known here"),
             ("views = 10", "views = 0", "scans: a"),
             (
                 "[[points.runs]]",

@@ -1,6 +1,6 @@
 //! JSON of this program's files.
 
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, written};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::path::Path;
@@ -16,6 +16,10 @@ pub fn to_json(value: &impl Serialize) -> Result<String> {
 /// Reads JSON written by this program.
 pub fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T> {
     let text = conefield_core::files::read_text(path, LONGEST)?;
-    let expected = "the content that conefield writes; --force starts over";
-    serde_json::from_str(&text).map_err(|e| Error::invalid(path.display().to_string(), "JSON", e, expected))
+    written::read(&path.display().to_string(), &text).map_err(|e| match e {
+        Error::Invalid { place, field, found, expected } => {
+            Error::invalid(place, field, found, expected + ", as conefield writes it; --force starts over")
+        }
+        other => other,
+    })
 }

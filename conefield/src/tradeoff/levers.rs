@@ -7,8 +7,8 @@ use crate::tradeoff::front::Unknowns;
 use crate::{method, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::files::toml_line;
 use conefield_core::random::mix;
+use conefield_core::written;
 use conefield_evaluation::report::text::stem;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -86,11 +86,7 @@ impl Levers {
 
     /// Parses a levers file in `folder`; errors name `place`.
     pub fn parse(text: &str, place: &str, folder: &Path) -> Result<Self> {
-        let written: Written = toml::from_str(text).map_err(|e| {
-            let line = toml_line(text, &e).unwrap_or(1);
-            let expected = "a [[base]] with a spec and its [base.levers]; --show-levers prints an example";
-            Error::invalid(format!("{place}:{line}"), "levers", e.message(), expected)
-        })?;
+        let written: Written = written::read(place, text)?;
         let mut bases: Vec<Base> = vec![];
         for (i, base) in written.base.into_iter().enumerate() {
             let base = Base::of(base, &format!("base[{i}]"), place, folder)?;

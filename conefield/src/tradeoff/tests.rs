@@ -75,8 +75,11 @@ fn three_ways_to_write_a_key_are_one() {
 fn mistakes_are_reported_with_their_place() {
     for (text, want) in [
         ("", "levers.toml: base: found none"),
-        ("[[base]]\n", "levers.toml:1: levers: found missing field `spec`"),
-        ("[[base]]\nspec = 'fdk'\nlever = 3\n", "unknown field `lever`"),
+        ("[[base]]\n", "levers.toml:1:1: base.0.spec: found nothing"),
+        (
+            "[[base]]\nspec = 'fdk'\nlever = 3\n",
+            ":3:1: base.0.lever: found a key that is not known here, expected \"levers\"",
+        ),
         ("[[base]]\nspec = 'fdkk'\n", "base[0].spec: found \"fdkk\""),
         ("[[base]]\nspec = 'fdk'\n[[base]]\nspec = 'fdk'\n", "base[1].spec"),
         ("[[base]]\nspec = 'fdk'\nlevers.cutoff = 0.5\n", "base[0].levers.cutoff: found 0.5"),

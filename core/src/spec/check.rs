@@ -4,9 +4,9 @@
 use super::LABEL;
 use super::one_of;
 use super::schema::{NESTED, label, of_type};
-use super::tree::{At, Is, Node, parse_json};
 use crate::error::{Error, Result};
 use crate::registry::{Kind, find, names};
+use crate::written::{At, Is, Node, listed, parse, suggest};
 use serde_json::Value;
 
 /// Refuses unknown keys, unknown types and values of the wrong type.
@@ -22,7 +22,7 @@ pub(super) fn spec(root: &Node) -> Result<()> {
 
 /// Checks the settings of one stage, with their type, as those in a spec are checked; `source` names them in errors.
 pub fn settings(kind: Kind, table: &Value, source: &str) -> Result<()> {
-    stage(&parse_json(source, &table.to_string(), 0)?, kind, "").map_err(|e| match e {
+    stage(&parse(source, &table.to_string(), 0)?, kind, "").map_err(|e| match e {
         // They are one line: its columns say nothing.
         Error::Invalid { field, found, expected, .. } => {
             Error::Invalid { place: source.into(), field, found, expected }
@@ -285,27 +285,4 @@ pub(super) fn invalid(at: &At, path: &str, found: String, expected: String) -> E
 
 fn unknown(at: &At, path: &str, key: &str, known: &[&str]) -> Error {
     invalid(at, path, "an unknown key".into(), suggest(key, known))
-}
-
-/// The nearest of `known`, if one is near, followed by all.
-pub(super) fn suggest(name: &str, known: &[&str]) -> String {
-    let distance = |k: &str| strsim::osa_distance(&name.to_lowercase(), k);
-    let near = known
-        .iter()
-        .min_by_key(|k| distance(k))
-        .filter(|k| distance(k) <= (k.len() / 3).max(2) || k.starts_with(name) || name.starts_with(**k));
-    match (near, known) {
-        (_, []) => "none; this build has none".into(),
-        (Some(near), [_]) => format!("{near:?}"),
-        (Some(near), _) => format!("{near:?} (of {})", known.join(", ")),
-        (None, _) => listed(known),
-    }
-}
-
-pub(super) fn listed(known: &[&str]) -> String {
-    match known {
-        [] => "none is known here".into(),
-        [one] => (*one).into(),
-        _ => format!("one of {}", known.join(", ")),
-    }
 }

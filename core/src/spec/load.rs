@@ -4,11 +4,11 @@
 //! overrides single values. The result is checked against the settings of the registered stage types before it becomes
 //! a [`Spec`].
 
-use super::tree::{At, Entry, Is, Node, parse_json, parse_toml};
 use super::{LABEL, Spec, check, one_of};
 use crate::allowance::Work;
 use crate::error::{Error, Result, ensure};
 use crate::spec::marks::marked;
+use crate::written::{self, At, Entry, Is, Node};
 use crate::{files, input_file, registry};
 use serde_json::Value;
 use std::collections::BTreeSet;
@@ -93,11 +93,7 @@ impl Draft {
         let Self { mut written, source } = self;
         one_of::settle(&mut written);
         check::spec(&written)?;
-        let spec: Spec = serde_path_to_error::deserialize(written.to_json()).map_err(|e| {
-            let path: Vec<String> = steps(&e.path().to_string());
-            let at = &written.nearest(&path.iter().map(String::as_str).collect::<Vec<_>>()).at;
-            Error::invalid(at.to_string(), path.join("."), e.inner(), "a value that the setting can hold")
-        })?;
+        let spec: Spec = written::value(&written)?;
         let tree = serde_json::to_value(&spec).map_err(|e| Error::unsupported("writing the spec", e.to_string()))?;
         Ok(Loaded { spec, tree, source, written })
     }
@@ -120,7 +116,7 @@ pub fn to_toml(spec: &Spec) -> Result<String> {
     let tree = |s: &Spec| serde_json::to_value(s).map_err(|e| failed(&e));
     let whole = tree(spec)?;
     let text = toml::to_string_pretty(&without_nulls(whole.clone())).map_err(|e| failed(&e))?;
-    let back: Spec = toml::from_str(&text).map_err(|e| failed(&e.message()))?;
+    let back: Spec = written::read("spec.toml", &text)?;
     if whole != tree(&back)? {
         return Err(failed(&"a setting is null, but its default is not: set a value"));
     }
@@ -174,7 +170,7 @@ fn names(what: &str, shipped: &[Shipped]) -> String {
     let mut known: Vec<&str> = shipped.iter().map(|s| s.name).collect();
     let types = registry::names(registry::Kind::Method);
     known.extend(types.into_iter().filter(|t| !shipped.iter().any(|s| s.name == *t)));
-    format!("the name of a shipped spec or of a method: {}", check::suggest(what, &known))
+    format!("the name of a shipped spec or of a method: {}", written::suggest(what, &known))
 }
 
 /// Origin of a layer.
@@ -232,15 +228,9 @@ impl Layer {
     fn resolve(self, shipped: &[Shipped], above: &[Origin], work: &mut Work) -> Result<Node> {
         let label = self.label();
         work.spend(&label, "extends: specs that are read", 1)?;
-        let is_json = match &self.origin {
-            Origin::File(p) if p.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) => true,
-            Origin::File(p) if p.extension().is_some_and(|e| e.eq_ignore_ascii_case("toml")) => false,
-            _ => self.text.trim_start().starts_with('{'),
-        };
         // The `--set`s are above the first layer.
         let depth = 1 + above.len();
-        let parse = if is_json { parse_json } else { parse_toml };
-        let mut node = parse(&label, &self.text, depth)?;
+        let mut node = written::parse(&label, &self.text, depth)?;
         node.take("$schema");
         if let Origin::File(path) = &self.origin {
             anchor_plugins(&mut node, path);
@@ -341,7 +331,7 @@ impl Set {
         }
         let at = At::whole(&label);
         // A TOML value, or else a text without quotes; no text begins like a table or a list.
-        let parsed = match parse_toml("", &format!("value = {value}"), 0) {
+        let parsed = match written::parse("value.toml", &format!("value = {value}"), 0) {
             Err(Error::Invalid { field, found, expected, .. }) if value.starts_with(['{', '[']) => {
                 return Err(Error::invalid(label, field, found, expected));
             }
@@ -703,7 +693,7 @@ mod tests {
             ("normalizers.0.type=nothing", "no normalizer type"),
             ("normalizers.0=3", "normalizers.0: found 3, expected a table"),
             ("normalizers.0={type=x", "--set normalizers.0={type=x: syntax: found"),
-            ("normalizers.0={type='x',eps=inf}", "value: found inf, expected a finite number"),
+            ("normalizers.0={type='x',eps=inf}", "eps: found inf, expected a finite number"),
             ("name=1\nsteps=2", "name"),
         ] {
             match read("extends = 'plain'", &[set]) {

@@ -1,11 +1,11 @@
 //! Mutually exclusive keys of a table. A key of an upper layer replaces the alternatives of lower ones; one layer with
 //! two of them is refused.
 
-use super::check::{Context, invalid, join, listed};
+use super::check::{Context, invalid, join};
 use super::schema::{NESTED, ONE_OF, of_type};
-use super::tree::{Entry, Is, Node};
 use crate::error::Result;
 use crate::registry::{Kind, find};
+use crate::written::{Entry, Is, Node, listed};
 use serde_json::Value;
 
 /// Keeps, of mutually exclusive keys in the stages of `root`, only those of the uppermost layer.

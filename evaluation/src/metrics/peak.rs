@@ -1,5 +1,6 @@
 //! The default data range of scores.
 
+use conefield_core::finite::range;
 use ndarray::ArrayView3;
 
 /// Minimum of the largest value of volumes normalized to `[0, 1]`.
@@ -8,8 +9,7 @@ const REACH: f32 = 0.5;
 /// The data range of `reference`: 1 if its values lie in `[0, 1]` and exceed ½, as for normalized volumes; otherwise
 /// the difference of its largest and smallest value (1/mm, Hounsfield units). 1 if all values are equal.
 pub fn peak_of(reference: ArrayView3<f32>) -> f64 {
-    let low = reference.iter().copied().fold(f32::INFINITY, f32::min);
-    let high = reference.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let [low, high] = range(&reference);
     // Tolerance for interpolation and rounding beyond the ends.
     let unit = low >= -1e-3 && high <= 1.0 + 1e-3 && high > REACH;
     let range = f64::from(high) - f64::from(low);

@@ -3,18 +3,16 @@
 
 use crate::affine::{self, Affine};
 use crate::folder;
-use crate::input::{Input, LONGEST_TEXT, must_unpack};
+use crate::input::{Input, must_unpack};
 use crate::npy;
 use crate::number::{ByteOrder, Number};
-use crate::text::{parse_json, shortened};
-use conefield_core::files::read_text;
+use crate::text::{self, shortened};
 use conefield_core::finite::stray;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result, allowance};
 use ndarray::{Array3, ArrayView3, s};
 use serde::Deserialize;
-use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
 
 /// Files that mark a folder of Zarr, of any version.
@@ -140,10 +138,6 @@ struct Stored {
     packing: Packing,
 }
 
-fn json<T: DeserializeOwned>(path: &Path) -> Result<T> {
-    parse_json(path, &read_text(path, LONGEST_TEXT)?)
-}
-
 impl Stored {
     /// The level in the folder `name` of the pyramid at `path`.
     fn open(path: &Path, name: &str) -> Result<Self> {
@@ -151,7 +145,7 @@ impl Stored {
         let folder = folder::within(path, &attributes, "multiscales[0].datasets[0].path", name)?;
         let file = folder.join(".zarray");
         let place = file.display().to_string();
-        let array: LevelArray = json(&file)?;
+        let array: LevelArray = text::read(&file)?;
         let invalid = |field: &str, found: String, expected: &str| Error::invalid(&place, field, found, expected);
         if array.zarr_format != 2 {
             return Err(invalid("zarr_format", array.zarr_format.to_string(), "2"));
@@ -250,7 +244,7 @@ fn finest(path: &Path) -> Result<(Stored, VoxelGrid, Affine)> {
     }
     let file = path.join(".zattrs");
     let place = file.display().to_string();
-    let attributes: Attributes = json(&file)?;
+    let attributes: Attributes = text::read(&file)?;
     let (multiscale, level) = match &attributes.multiscales[..] {
         [one] if !one.datasets.is_empty() => (one, &one.datasets[0]),
         all => {
@@ -391,7 +385,7 @@ mod tests {
             ("\"compressor\": null", "\"compressor\": { \"id\": \"blosc\" }", &["compressor.id", "blosc", "zlib"]),
             ("\"compressor\": null", "\"compressor\": { \"id\": \"zlib\" }", &["0.0.0", "zlib stream"]),
             ("\"fill_value\"", "\"dimension_separator\": \"..\", \"fill_value\"", &["dimension_separator"]),
-            ("[3, 1, 2]", "[3, 1]", &[".zarray", "line 1"]),
+            ("[3, 1, 2]", "[3, 1]", &[".zarray:1:"]),
             ("[3, 1, 2]", "[5, 1, 2]", &["chunk", "2.0.0"]),
             ("[3, 1, 2]", "[4294967296, 4294967296, 4294967296]", &["shape", "addressed"]),
             ("[3, 1, 2]", "[0, 1, 2]", &["shape", "at least one"]),
@@ -409,7 +403,7 @@ mod tests {
             ("\"s0\"", "\"../b\"", &["datasets[0].path", "../b"]),
             ("\"s0\"", "\"s1\"", &["datasets[0].path", "s1"]),
             ("[4000, ", "[0, ", &["spacing", "positive"]),
-            ("\"scale\": [4000, ", "\"scale\": [", &[".zattrs", "line"]),
+            ("\"scale\": [4000, ", "\"scale\": [", &[".zattrs:4:"]),
             ("\"type\": \"scale\"", "\"type\": \"shear\"", &[".zattrs", "shear"]),
             (
                 "{ \"multi",

@@ -29,6 +29,7 @@ pub use project::project;
 pub use protocol::{Angles, DetectorExtent, Protocol};
 
 use conefield_core::Result;
+use conefield_core::finite::range;
 use conefield_core::geometry::Geometry;
 use conefield_core::parallel;
 use conefield_core::scan::{Scan, Volume};
@@ -43,7 +44,7 @@ pub fn simulate(volume: &Volume, protocol: &Protocol) -> Result<Scan> {
     let mut projections = project(volume, &geometry, protocol.samples_per_voxel)?;
     let units_per_mm = (1.0 / protocol.unit.mm) as f32;
     parallel::change_all(&mut projections, |a| a * units_per_mm);
-    let largest = projections.iter().copied().fold(0.0, f32::max);
+    let largest = range(&projections)[1].max(0.0);
     protocol.noise.add(&mut projections, protocol.seed);
     let provenance = json!({
         "simulated": {

@@ -1,6 +1,7 @@
 //! Photon counting noise of line integrals.
 
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::finite::range;
 use conefield_core::parallel;
 use ndarray::{Array3, ArrayViewMut2, Axis};
 use rand::SeedableRng;
@@ -45,7 +46,7 @@ impl DetectorNoise {
         let (scale, i0, sigma, least) = match *self {
             Self::None => return,
             Self::Tigre { i0, sigma } => {
-                let largest = projections.iter().copied().fold(0.0, f32::max);
+                let largest = range(projections)[1].max(0.0);
                 (f64::from(largest), i0, sigma, 0.0)
             }
             Self::Poisson { i0 } => (1.0, i0, 0.0, f64::NEG_INFINITY),

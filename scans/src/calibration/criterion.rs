@@ -3,6 +3,7 @@
 use crate::calibration::parameters::{Correction, Parameter};
 use crate::diagnosis::setup;
 use conefield_core::backend::Backend;
+use conefield_core::finite::range;
 use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, norm};
 use conefield_core::method::{Context, Job, Method, Observer, Reconstruction, Record};
 use conefield_core::parallel;
@@ -250,7 +251,7 @@ fn grid(scan: &Scan, width: usize, wide: bool) -> VoxelGrid {
 
 /// Whether the object reaches the first or last line of the views along `axis`: 1 for rows, 2 for columns.
 fn cut(scan: &Scan, axis: usize) -> bool {
-    let top = scan.projections.iter().copied().fold(0.0f32, f32::max);
+    let top = range(&scan.projections)[1].max(0.0);
     let last = scan.projections.len_of(ndarray::Axis(axis)) - 1;
     [0, last].into_iter().any(|i| {
         let line = scan.projections.index_axis(ndarray::Axis(axis), i);

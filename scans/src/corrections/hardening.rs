@@ -3,6 +3,7 @@
 use crate::corrections::Correct;
 use crate::corrections::spectrum::{Spectrum, VOLTAGES};
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::finite::range;
 use conefield_core::scan::Scan;
 use serde::{Deserialize, Serialize};
 
@@ -58,7 +59,7 @@ impl Correct for Hardening {
     }
 
     fn correct(&self, scan: &mut Scan) -> Result<String> {
-        let most = scan.projections.iter().copied().fold(0.0, f32::max);
+        let most = range(&scan.projections)[1].max(0.0);
         match self.water {
             Some(water) => {
                 let table = Table::of(water, most.into())?;
@@ -69,7 +70,7 @@ impl Correct for Hardening {
                 scan.projections.par_mapv_inplace(|a| polynomial(&self.polynomial, a.into()) as f32);
             }
         }
-        let now = scan.projections.iter().copied().fold(0.0, f32::max);
+        let now = range(&scan.projections)[1].max(0.0);
         Ok(format!("the largest line integral of {most:.3} became {now:.3}"))
     }
 }

@@ -6,8 +6,8 @@ use conefield::study::pictures::score_last;
 use conefield::tradeoff::json::read_json;
 use conefield::{method, specs};
 use conefield_backend_cpu::Cpu;
-use conefield_core::Result;
 use conefield_core::error::ensure;
+use conefield_core::{Result, written};
 use conefield_evaluation::report::page::{Notice, Page, PageRun, PageSpread};
 use conefield_evaluation::report::text::stem;
 use serde::Deserialize;
@@ -146,7 +146,7 @@ fn names(found: &[RunOnDisk]) -> Vec<String> {
     // An unfinished run has no record yet.
     let own = |run: &RunOnDisk| {
         let named = run.spec_name().map(str::to_owned);
-        let named = named.or_else(|| toml::from_str(run.spec()).ok().map(|n: Named| n.name));
+        let named = named.or_else(|| written::read("spec.toml", run.spec()).ok().map(|n: Named| n.name));
         named.unwrap_or_else(|| stem(&run.folder().display().to_string()))
     };
     let whole = |run: &RunOnDisk| run.folder().canonicalize().unwrap_or_default();

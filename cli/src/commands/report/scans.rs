@@ -7,6 +7,7 @@ use conefield::memory::Memory;
 use conefield::parse::HoldOut;
 use conefield::record::ScanRecord;
 use conefield::{input, projection};
+use conefield_core::finite::range;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::voxel::VoxelProjector;
@@ -243,7 +244,8 @@ impl Shown {
             return Err(Error::invalid("command line", "--views", v, format!("numbers below {n}")));
         }
         let some = if chosen.len() == n { scan.clone() } else { scan.split(&chosen)?.1 };
-        let (low, high) = some.projections.iter().fold((0f32, 0f32), |(l, h), x| (l.min(*x), h.max(*x)));
+        let [low, high] = range(&some.projections);
+        let (low, high) = (low.min(0.0), high.max(0.0));
         let window = if low < high { [low, high] } else { [low, low + 1.0] };
         let views = chosen.into_iter().map(|v| (v, held_out.contains(&v))).collect();
         Ok(Self { views, scan: some, window, residuals: vec![] })

@@ -1,6 +1,6 @@
 //! Principal components of features.
 
-use rayon::prelude::*;
+use conefield_core::parallel;
 
 /// Maximum sweeps of Jacobi's method; about ten suffice for hundreds of channels.
 const SWEEPS: usize = 50;
@@ -21,14 +21,13 @@ impl Pca {
         let channels: Vec<&[f32]> = features.chunks_exact(rows).collect();
         let n = rows as f64;
         let mean: Vec<f64> = channels.iter().map(|c| c.iter().map(|&x| f64::from(x)).sum::<f64>() / n).collect();
-        let covariance = (0..channels.len()).into_par_iter().map(|i| {
+        let lower: Vec<Vec<f64>> = parallel::map(0..channels.len(), |_, i| {
             let with = |j: usize| {
                 let (a, b) = (channels[i], channels[j]);
                 a.iter().zip(b).map(|(&a, &b)| (f64::from(a) - mean[i]) * (f64::from(b) - mean[j])).sum::<f64>() / n
             };
-            (0..=i).map(with).collect::<Vec<_>>()
+            (0..=i).map(with).collect()
         });
-        let lower: Vec<Vec<f64>> = covariance.collect();
         let whole = |i: usize| (0..lower.len()).map(|j| lower[i.max(j)][i.min(j)]).collect();
         let (variance, axes) = eigen((0..lower.len()).map(whole).collect());
         // Rounding may make a variance of 0 slightly negative.
