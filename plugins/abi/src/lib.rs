@@ -507,6 +507,9 @@ pub const ENTRY: &str = "conefield_plugin";
 /// The contract for C: the text of `conefield_plugin.h`.
 pub const HEADER: &str = include_str!("../include/conefield_plugin.h");
 
+/// What many stages in C need besides the contract: the text of `conefield_helpers.h`.
+pub const HELPERS: &str = include_str!("../include/conefield_helpers.h");
+
 impl ConefieldStr {
     /// `text`, which must outlive every use of this.
     pub const fn of(text: &str) -> Self {
