@@ -64,6 +64,16 @@ pub trait RowMap: Send + Sync + 'static {
     fn wgsl(&self) -> Option<Fragment> {
         None
     }
+
+    /// For a normalizer of independent channels: the map of the channels `keep` alone, and the parameters that it
+    /// keeps. See [`Normalizer::keep_inputs`].
+    fn keep(&self, keep: &[usize]) -> Option<(Self, Vec<Range<usize>>)>
+    where
+        Self: Sized,
+    {
+        let _ = keep;
+        None
+    }
 }
 
 /// Accumulator of parameter gradients.
@@ -225,8 +235,10 @@ impl<T: RowMap> Encoder for ByRow<T> {
 }
 
 impl<T: RowMap> Normalizer for ByRow<T> {
-    fn keep_inputs(&self, _: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        Err(Error::unsupported(self.describe(), "this normalizer does not support removing inputs"))
+    fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
+        let cannot = || Error::unsupported(self.describe(), "this normalizer does not support removing inputs");
+        let (map, params) = self.map.keep(keep).ok_or_else(cannot)?;
+        Ok(Reduced { stage: Box::new(Self::new(map)), params, channels: keep.to_vec() })
     }
 }
 

@@ -1,5 +1,6 @@
 //! Imports for authors of stages: `use conefield_core::prelude::*;`.
 
+pub use crate::arena::{Arena, InitReport, Layout, Weights};
 pub use crate::basis::{Basis, BasisOperator, BasisSpec, Expansion};
 pub use crate::by_row::{ByRow, RowMap, Sums};
 pub use crate::data_term::{DataTerm, DataTermSpec, Misfit};
@@ -11,11 +12,14 @@ pub use crate::prior::{Blocks, Prior};
 pub use crate::random::{mix, unit};
 pub use crate::regularizer::{Penalty, Regularizer, RegularizerSpec};
 pub use crate::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
+    EncoderSpec, FieldSpec, Initializer, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 pub use crate::simd::Real;
 pub use crate::space::Space;
-pub use crate::stage::{Encoder, Field, Grads, Normalizer, Projector, Samples, Stage, UnitRay};
+pub use crate::stage::{
+    Encoder, Field, GradKind, Grads, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Samples, Scope, Stage,
+    Tile, TileMut, UnitRay,
+};
 pub use crate::stage_type;
 pub use crate::wgsl::Fragment;
 pub use ndarray::{ArrayView3, ArrayViewMut3};

@@ -97,20 +97,22 @@ impl<'a, R> Grads<'a, R> {
 }
 
 /// The rows on which the result of a row may depend.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Scope {
     /// Its own row only.
+    #[default]
     Row,
     /// The rows of its ray: the host passes tiles of one whole ray, and of a single row for points off any ray.
     Ray,
 }
 
 /// How a stage accumulates parameter gradients.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum GradKind {
     /// It has no parameters.
+    #[default]
     None,
     /// Few parameters, each affected by every row: each worker sums its own copy, and copies are merged in order.
     Dense,
@@ -124,8 +126,8 @@ pub fn titled(name: &str, what: &str) -> String {
     format!("{name} ({})", what.split(':').next().unwrap_or(what))
 }
 
-/// Widths, counts and costs of a stage, for planning.
-#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+/// Widths, counts and costs of a stage, for planning. By default it has none: a map of single rows without parameters.
+#[derive(Debug, Clone, Default, PartialEq, serde::Serialize)]
 pub struct Info {
     /// Channels in.
     pub input: usize,

@@ -6,7 +6,7 @@
 //! Z)` at `t = p − ⌊p⌋`, and `B_0 … B_3` are `(1 − t)³/6`, `(3t³ − 6t² + 4)/6`, `(−3t³ + 3t² + 3t + 1)/6`, `t³/6`. It
 //! has two continuous derivatives; a trilinear grid has none.
 
-use crate::levels::{self, BLOCK, Cells, Levels, Pyramid, cube, fold, fours, stretch};
+use crate::levels::{self, BLOCK, Cells, Levels, Rows, cube, fold, fours, grid, stretch};
 use conefield_core::error::Result;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat};
@@ -35,18 +35,10 @@ impl Default for BSplineGrid {
     }
 }
 
-conefield_core::stage_type!(
-    EncoderSpec,
-    "b-spline-grid",
-    BSplineGrid,
+grid! {
+    "b-spline-grid", BSplineGrid of SplineLevel,
     "multi-resolution grid of cubic B-splines",
     example = r#"{"levels": 3, "base_resolution": 4}"#
-);
-
-impl EncoderSpec for BSplineGrid {
-    fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(Levels::<SplineLevel>::new(self)?))
-    }
 }
 
 /// Coefficients along an axis that affect a cell.
@@ -146,13 +138,8 @@ impl levels::Level for SplineLevel {
     type Settings = BSplineGrid;
     type Located<R: Real> = Located<R>;
 
-    const NAME: &'static str = "b-spline-grid";
     const BASE: (RangeInclusive<u32>, &'static str) = (1..=1 << 20, "1 to 2^20 cells per side");
     const WGSL: &'static [&'static str] = &[include_str!("b_spline_grid.wgsl")];
-
-    fn pyramid(s: &BSplineGrid) -> Pyramid {
-        Pyramid { levels: s.levels, features: s.features, base_resolution: s.base_resolution, growth: s.growth }
-    }
 
     fn parts(s: &BSplineGrid, number: usize, resolution: f64, before: usize) -> Result<Vec<Self>> {
         let resolution = resolution.round();
@@ -188,14 +175,8 @@ impl levels::Level for SplineLevel {
     }
 
     #[inline(always)]
-    fn gather<S: Simd, R: Real, const F: usize>(
-        &self,
-        s: S,
-        located: &Located<R>,
-        table: &[[R; F]],
-        out: &mut [[R; F]; BLOCK],
-        n: usize,
-    ) {
+    fn gather<S: Simd, R: Real, const F: usize>(&self, s: S, rows: &Rows<'_, Self, R, F>, out: &mut [[R; F]; BLOCK]) {
+        let &Rows { located, table, n } = rows;
         let (table, zero) = (table.as_flattened(), R::Four::<S>::splat(s, R::ZERO));
         for r in 0..n {
             let mut sums = [zero; 8];
@@ -223,13 +204,12 @@ impl levels::Level for SplineLevel {
     fn scatter<S: Simd, R: Real, const F: usize>(
         &self,
         s: S,
-        located: &Located<R>,
-        _: &[[R; F]],
+        rows: &Rows<'_, Self, R, F>,
         dy: &[[R; F]; BLOCK],
-        n: usize,
         grads: &mut [R],
         own: &Range<usize>,
     ) {
+        let &Rows { located, n, .. } = rows;
         for r in 0..n {
             // All coefficients that the row affects.
             let first = self.run(&located.cells, r, 0, 0, F);
@@ -252,14 +232,8 @@ impl levels::Level for SplineLevel {
     }
 
     #[inline(always)]
-    fn slope<R: Real, const F: usize>(
-        &self,
-        located: &Located<R>,
-        table: &[[R; F]],
-        dy: &[R; F],
-        x: [R; 3],
-        i: usize,
-    ) -> [R; 3] {
+    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
+        let &Rows { located, table, .. } = rows;
         let weight = located.weight.each_ref().map(|w| w[i]);
         let by = located.cells.fraction.each_ref().map(|f| slopes(f[i]));
         let table = table.as_flattened();

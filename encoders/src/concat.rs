@@ -4,7 +4,7 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::mix;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::Real;
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
 use conefield_core::wgsl::{Fragment, functions, hosted};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -65,16 +65,7 @@ impl ConcatStage {
     /// Concatenates parts, each with its index in the settings.
     fn new(stages: Vec<(usize, Arc<dyn Encoder>)>) -> Result<Self> {
         ensure(!stages.is_empty(), "spec", "encoders", "none", "at least one encoder")?;
-        let mut info = Info {
-            input: 3,
-            output: 0,
-            params: 0,
-            tape: 0,
-            scope: Scope::Row,
-            grads: GradKind::None,
-            macs: 0,
-            identity: false,
-        };
+        let mut info = Info { input: 3, output: 0, ..Info::default() };
         let mut parts = vec![];
         for (number, stage) in stages {
             let i = stage.info();

@@ -5,7 +5,7 @@
 //! A level with `r` cells per side has `(r + 1)³` vertices at the corners of its cells, which fill the cube exactly:
 //! `p = clamp(x, 0, 1)·r`.
 
-use crate::levels::{self, BLOCK, Levels, Pyramid, cube};
+use crate::levels::{self, BLOCK, Levels, Rows, cube, grid};
 use conefield_core::error::Result;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Real, Simd};
@@ -36,18 +36,10 @@ impl Default for DenseGrid {
     }
 }
 
-conefield_core::stage_type!(
-    EncoderSpec,
-    "dense-grid",
-    DenseGrid,
+grid! {
+    "dense-grid", DenseGrid of DenseLevel,
     "multi-resolution grid without hashing",
     example = r#"{"levels": 3, "base_resolution": 4}"#
-);
-
-impl EncoderSpec for DenseGrid {
-    fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(Levels::<DenseLevel>::new(self)?))
-    }
 }
 
 #[derive(Debug, Clone)]
@@ -61,13 +53,8 @@ impl levels::Level for DenseLevel {
     type Settings = DenseGrid;
     type Located<R: Real> = Located<R>;
 
-    const NAME: &'static str = "dense-grid";
     const BASE: (RangeInclusive<u32>, &'static str) = (1..=1 << 20, "1 to 2^20 cells per side");
     const WGSL: &'static [&'static str] = &[TRILINEAR, include_str!("dense_grid.wgsl")];
-
-    fn pyramid(s: &DenseGrid) -> Pyramid {
-        Pyramid { levels: s.levels, features: s.features, base_resolution: s.base_resolution, growth: s.growth }
-    }
 
     fn parts(s: &DenseGrid, number: usize, resolution: f64, before: usize) -> Result<Vec<Self>> {
         let resolution = resolution.round();
@@ -99,14 +86,8 @@ impl levels::Level for DenseLevel {
     }
 
     #[inline(always)]
-    fn gather<S: Simd, R: Real, const F: usize>(
-        &self,
-        _: S,
-        located: &Located<R>,
-        table: &[[R; F]],
-        out: &mut [[R; F]; BLOCK],
-        n: usize,
-    ) {
+    fn gather<S: Simd, R: Real, const F: usize>(&self, _: S, rows: &Rows<'_, Self, R, F>, out: &mut [[R; F]; BLOCK]) {
+        let &Rows { located, table, n } = rows;
         let offsets = self.offsets;
         for i in 0..n {
             out[i] = located.gather(i, &offsets, table);
@@ -117,13 +98,12 @@ impl levels::Level for DenseLevel {
     fn scatter<S: Simd, R: Real, const F: usize>(
         &self,
         _: S,
-        located: &Located<R>,
-        _: &[[R; F]],
+        rows: &Rows<'_, Self, R, F>,
         dy: &[[R; F]; BLOCK],
-        n: usize,
         grads: &mut [R],
         own: &Range<usize>,
     ) {
+        let &Rows { located, n, .. } = rows;
         let offsets = self.offsets;
         for i in 0..n {
             // A copy is in registers: the compiler cannot tell whether writing to `grads` changes the original.
@@ -133,14 +113,8 @@ impl levels::Level for DenseLevel {
     }
 
     #[inline(always)]
-    fn slope<R: Real, const F: usize>(
-        &self,
-        located: &Located<R>,
-        table: &[[R; F]],
-        dy: &[R; F],
-        _: [R; 3],
-        i: usize,
-    ) -> [R; 3] {
+    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], _: [R; 3], i: usize) -> [R; 3] {
+        let &Rows { located, table, .. } = rows;
         let cell = &table[located.base(i)..];
         let mut corners = [R::ZERO; 8];
         for c in 0..8 {

@@ -8,7 +8,7 @@
 use conefield_core::error::{Result, ensure};
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{Encoder, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
 use conefield_core::wgsl::{Fragment, functions};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -227,16 +227,7 @@ impl<R: Real> Kernel<R> for FrequencyStage {
 
 impl Stage for FrequencyStage {
     fn info(&self) -> Info {
-        Info {
-            input: 3,
-            output: self.outputs,
-            params: 0,
-            tape: 0,
-            scope: Scope::Row,
-            grads: GradKind::None,
-            macs: self.waves.len() * 16,
-            identity: false,
-        }
+        Info { input: 3, output: self.outputs, macs: self.waves.len() * 16, ..Info::default() }
     }
 
     fn parameters(&self) -> Vec<Parameter> {

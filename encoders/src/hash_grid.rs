@@ -4,7 +4,7 @@
 //! point's cell, trilinearly interpolated. A level whose vertices fit into the table is indexed directly, a finer one
 //! by `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
 
-use crate::levels::{self, BLOCK, Levels, Pyramid, finest, leaving, prefetch, primes, sizes, table_size};
+use crate::levels::{self, BLOCK, Levels, Rows, finest, grid, leaving, prefetch, primes, sizes, table_size};
 use conefield_core::error::Result;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
@@ -64,18 +64,10 @@ impl Default for HashGrid {
     }
 }
 
-conefield_core::stage_type!(
-    EncoderSpec,
-    "hash-grid",
-    HashGrid,
+grid! {
+    "hash-grid", HashGrid of HashLevel,
     "multi-resolution hash grid",
     example = r#"{"levels": 3, "log2_table_size": 8, "base_resolution": 4}"#
-);
-
-impl EncoderSpec for HashGrid {
-    fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(Levels::<HashLevel>::new(self)?))
-    }
 }
 
 /// Positions are `f32`: a finer grid leaves no fraction of a cell for interpolation.
@@ -274,13 +266,8 @@ impl levels::Level for HashLevel {
     type Settings = HashGrid;
     type Located<R: Real> = Located<R>;
 
-    const NAME: &'static str = "hash-grid";
     const BASE: (RangeInclusive<u32>, &'static str) = (2..=1 << 20, "2 to 2^20");
     const WGSL: &'static [&'static str] = &[include_str!("hash_grid.wgsl")];
-
-    fn pyramid(s: &HashGrid) -> Pyramid {
-        Pyramid { levels: s.levels, features: s.features, base_resolution: s.base_resolution, growth: s.growth }
-    }
 
     fn parts(s: &HashGrid, number: usize, resolution: f64, _: usize) -> Result<Vec<Self>> {
         let table = table_size(s.log2_table_size)?;
@@ -360,14 +347,8 @@ impl levels::Level for HashLevel {
     }
 
     #[inline(always)]
-    fn gather<S: Simd, R: Real, const F: usize>(
-        &self,
-        s: S,
-        located: &Located<R>,
-        table: &[[R; F]],
-        out: &mut [[R; F]; BLOCK],
-        n: usize,
-    ) {
+    fn gather<S: Simd, R: Real, const F: usize>(&self, s: S, rows: &Rows<'_, Self, R, F>, out: &mut [[R; F]; BLOCK]) {
+        let &Rows { located, table, n } = rows;
         assert_eq!(table.len(), self.entries as usize);
         if self.dense {
             interpolate::<S, R, F, true>(s, table, located, n, out);
@@ -381,13 +362,12 @@ impl levels::Level for HashLevel {
     fn scatter<S: Simd, R: Real, const F: usize>(
         &self,
         s: S,
-        located: &Located<R>,
-        _: &[[R; F]],
+        rows: &Rows<'_, Self, R, F>,
         dy: &[[R; F]; BLOCK],
-        n: usize,
         grads: &mut [R],
         _: &Range<usize>,
     ) {
+        let &Rows { located, n, .. } = rows;
         let (grads, _) = grads.as_chunks_mut::<F>();
         assert_eq!(grads.len(), self.entries as usize);
         if self.dense {
@@ -399,14 +379,8 @@ impl levels::Level for HashLevel {
     }
 
     #[inline(always)]
-    fn slope<R: Real, const F: usize>(
-        &self,
-        located: &Located<R>,
-        table: &[[R; F]],
-        dy: &[R; F],
-        x: [R; 3],
-        i: usize,
-    ) -> [R; 3] {
+    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
+        let &Rows { located, table, .. } = rows;
         let mut v = [R::ZERO; 8];
         for c in 0..8 {
             let entry = &table[located.ends(self.dense, c >> 1, i)[c & 1] as usize];
@@ -447,21 +421,9 @@ impl levels::Level for HashLevel {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::levels::Level as _;
-    use conefield_core::simd::{Op, run};
     use conefield_core::stage::{Grads, Kernel, Stage, TileMut};
 
     type HashGridStage = Levels<HashLevel>;
-
-    struct Locate<'a, R>(&'a mut Located<R>, &'a HashLevel, Tile<'a, R>);
-    impl<R: Real> Op for Locate<'_, R> {
-        type Number = R;
-        type Out = ();
-        #[inline(always)]
-        fn call<S: Simd>(self, s: S) {
-            self.1.locate(s, self.0, self.2, 0, 1);
-        }
-    }
 
     /// The published index, in exact arithmetic.
     fn index(level: &HashLevel, primes: [u64; 3], c: [u64; 3]) -> u64 {
@@ -481,9 +443,7 @@ mod tests {
         let primes = settings.convention.primes().map(u64::from);
         for level in stage.levels() {
             for p in [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.3, 0.71, 0.999], [0.5, 0.25, 0.125f64]] {
-                let mut located = Located::<f64>::default();
-                let data: Vec<f64> = p.to_vec();
-                run(Locate(&mut located, level, Tile::new(&data, 1)));
+                let located: Located<f64> = levels::located(level, p);
                 let cell = p.map(|x| (x * level.scale + 0.5).floor() as u64);
                 let mut total = 0.0;
                 for c in 0..8u64 {
@@ -513,8 +473,7 @@ mod tests {
             let up = (level.scale + 0.5) as f32;
             assert!(f64::from(up) > level.scale + 0.5 && up.fract() == 0.0, "{base_resolution} x {growth}");
             for x in [1.0f32, 2.0, f32::INFINITY] {
-                let mut located = Located::<f32>::default();
-                run(Locate(&mut located, level, Tile::new(&[x; 3], 1)));
+                let located: Located<f32> = levels::located(level, [x; 3]);
                 let mut ends = located.near.iter().chain(&located.far);
                 assert!(ends.all(|i| i[0] < level.entries), "{base_resolution} x {growth} at {x}");
                 let total: f32 = located.weight.iter().map(|w| w[0]).sum();

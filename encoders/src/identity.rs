@@ -3,7 +3,7 @@
 use conefield_core::error::{Result, ensure};
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::Real;
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{Encoder, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
 use conefield_core::wgsl::{Fragment, functions};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -54,16 +54,7 @@ impl<R: Real> Kernel<R> for IdentityStage {
 
 impl Stage for IdentityStage {
     fn info(&self) -> Info {
-        Info {
-            input: 3,
-            output: self.axes.len(),
-            params: 0,
-            tape: 0,
-            scope: Scope::Row,
-            grads: GradKind::None,
-            macs: 0,
-            identity: self.axes == [0, 1, 2],
-        }
+        Info { input: 3, output: self.axes.len(), identity: self.axes == [0, 1, 2], ..Info::default() }
     }
 
     fn parameters(&self) -> Vec<Parameter> {

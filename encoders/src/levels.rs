@@ -8,7 +8,7 @@
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
 use conefield_core::trilinear::slabs;
 use conefield_core::wgsl::{self, Fragment};
 use std::fmt::Write;
@@ -38,23 +38,61 @@ pub struct Pyramid {
     pub growth: f64,
 }
 
+/// The settings of an encoder of levels.
+pub trait Grid: Clone + Send + Sync + 'static {
+    /// The encoder's name.
+    const NAME: &'static str;
+
+    /// The settings that all these encoders have.
+    fn pyramid(&self) -> Pyramid;
+}
+
+/// Registers the settings of an encoder of levels, by its name, and what such a level is. They have all settings of
+/// [`Pyramid`].
+macro_rules! grid {
+    ($name:literal, $settings:ident of $level:ident, $about:literal, example = $example:literal) => {
+        conefield_core::stage_type!(EncoderSpec, $name, $settings, $about, example = $example);
+
+        impl EncoderSpec for $settings {
+            fn build(&self) -> Result<Box<dyn Encoder>> {
+                Ok(Box::new(Levels::<$level>::new(self)?))
+            }
+        }
+
+        impl levels::Grid for $settings {
+            const NAME: &'static str = $name;
+
+            fn pyramid(&self) -> levels::Pyramid {
+                let Self { levels, features, base_resolution, growth, .. } = *self;
+                levels::Pyramid { levels, features, base_resolution, growth }
+            }
+        }
+    };
+}
+pub(crate) use grid;
+
+/// The first rows of a block on a level.
+pub struct Rows<'a, L: Level, R: Real, const F: usize> {
+    /// Where they lie.
+    pub located: &'a L::Located<R>,
+    /// The features of the level.
+    pub table: &'a [[R; F]],
+    /// Number of rows.
+    pub n: usize,
+}
+
 /// A level, or a part of one: some levels have several tables, one per part. What works on rows must be
 /// `#[inline(always)]`: only then is it compiled with the instructions of `s`.
 pub trait Level: Clone + Send + Sync + 'static {
     /// The encoder's settings.
-    type Settings: Clone + Send + Sync;
+    type Settings: Grid;
     /// Where the rows of a block lie on a level.
     type Located<R: Real>: Default;
 
-    /// The encoder's name.
-    const NAME: &'static str;
     /// Base resolutions that are allowed, and the same in words.
     const BASE: (RangeInclusive<u32>, &'static str);
     /// WGSL of `stage_Level`, `stage_level_forward` and `stage_level_backward`.
     const WGSL: &'static [&'static str];
-
-    /// The settings that all these encoders have.
-    fn pyramid(settings: &Self::Settings) -> Pyramid;
 
     /// The parts of level `number`, with `resolution` cells along the cube's side. The levels before it have `before`
     /// parameters.
@@ -88,38 +126,22 @@ pub trait Level: Clone + Send + Sync + 'static {
     /// Locates rows `at..at + n` of `x`, `n` at most [`BLOCK`], on this level and thus on all its parts.
     fn locate<S: Simd, R: Real>(&self, s: S, to: &mut Self::Located<R>, x: Tile<'_, R>, at: usize, n: usize);
 
-    /// The features of the first `n` rows at `located`. If it adds, `out` holds those of the part before it.
-    fn gather<S: Simd, R: Real, const F: usize>(
-        &self,
-        s: S,
-        located: &Self::Located<R>,
-        table: &[[R; F]],
-        out: &mut [[R; F]; BLOCK],
-        n: usize,
-    );
+    /// The features of these rows. If it adds, `out` holds those of the part before it.
+    fn gather<S: Simd, R: Real, const F: usize>(&self, s: S, rows: &Rows<'_, Self, R, F>, out: &mut [[R; F]; BLOCK]);
 
-    /// Given the derivatives `dy` by the features of the first `n` rows at `located`, adds those by the numbers `own` of
-    /// the table to `grads`.
+    /// Given the derivatives `dy` by the features of these rows, adds those by the numbers `own` of the table to
+    /// `grads`.
     fn scatter<S: Simd, R: Real, const F: usize>(
         &self,
         s: S,
-        located: &Self::Located<R>,
-        table: &[[R; F]],
+        rows: &Rows<'_, Self, R, F>,
         dy: &[[R; F]; BLOCK],
-        n: usize,
         grads: &mut [R],
         own: &Range<usize>,
     );
 
-    /// Given the derivatives `dy` by the features of row `i` at `located`, those by its point `x`.
-    fn slope<R: Real, const F: usize>(
-        &self,
-        located: &Self::Located<R>,
-        table: &[[R; F]],
-        dy: &[R; F],
-        x: [R; 3],
-        i: usize,
-    ) -> [R; 3];
+    /// Given the derivatives `dy` by the features of row `i`, those by its point `x`.
+    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3];
 
     /// The fields of its `stage_Level` in WGSL but the last one, the first parameter.
     fn code(&self) -> String;
@@ -215,7 +237,7 @@ pub struct Levels<L: Level> {
 impl<L: Level> Levels<L> {
     /// Builds the stage, or names the setting that is out of range.
     pub fn new(settings: &L::Settings) -> Result<Self> {
-        let Pyramid { levels, features, base_resolution: base, growth } = L::pyramid(settings);
+        let Pyramid { levels, features, base_resolution: base, growth } = settings.pyramid();
         ensure((1..=32).contains(&levels), "spec", "levels", levels, "1 to 32")?;
         ensure([1, 2, 4, 8].contains(&features), "spec", "features", features, "1, 2, 4 or 8")?;
         let (bases, words) = L::BASE;
@@ -256,6 +278,23 @@ fn locate<S: Simd, L: Level, R: Real>(s: S, level: &L, to: &mut L::Located<R>, x
     );
 }
 
+/// Where a point lies on a level.
+#[cfg(test)]
+pub fn located<L: Level, R: Real>(level: &L, x: [R; 3]) -> L::Located<R> {
+    struct Locate<'a, L, R>(&'a L, [R; 3]);
+    impl<L: Level, R: Real> Op for Locate<'_, L, R> {
+        type Number = R;
+        type Out = L::Located<R>;
+        #[inline(always)]
+        fn call<S: Simd>(self, s: S) -> Self::Out {
+            let mut to = L::Located::default();
+            locate(s, self.0, &mut to, Tile::new(&self.1, 1), 0, 1);
+            to
+        }
+    }
+    run(Locate(level, x))
+}
+
 struct LevelsForward<'a, L: Level, R> {
     stage: &'a Levels<L>,
     parts: &'a [Part<L>],
@@ -275,7 +314,7 @@ impl<L: Level, R: Real> LevelsForward<'_, L, R> {
                 locate(s, &parts[0].level, &mut located, self.x, at, n);
                 for part in parts {
                     let (table, _) = self.params[part.range()].as_chunks::<F>();
-                    part.level.gather(s, &located, table, &mut out, n);
+                    part.level.gather(s, &Rows { located: &located, table, n }, &mut out);
                     // Of parts that are added, the last one writes the result.
                     part.put(&out, &mut self.y, at, n);
                 }
@@ -313,13 +352,14 @@ impl<L: Level, R: Real> LevelsBackward<'_, L, R> {
                 let n = BLOCK.min(self.x.rows - at);
                 part.take(self.dy, &mut dy, at, n);
                 locate(s, level, &mut located, self.x, at, n);
+                let rows = Rows { located: &located, table, n };
                 if !own.is_empty() {
-                    level.scatter(s, &located, table, &dy, n, grads, &own);
+                    level.scatter(s, &rows, &dy, grads, &own);
                 }
                 let Some(dx) = &mut self.dx else { continue };
                 let x = [0, 1, 2].map(|d| &self.x.channel(d)[at..at + n]);
                 for i in 0..n {
-                    slopes[i] = level.slope(&located, table, &dy[i], x.map(|x| x[i]), i);
+                    slopes[i] = level.slope(&rows, &dy[i], x.map(|x| x[i]), i);
                 }
                 for d in 0..3 {
                     for (dx, slope) in dx.channel(d)[at..at + n].iter_mut().zip(&slopes) {
@@ -386,11 +426,9 @@ impl<L: Level> Stage for Levels<L> {
             input: 3,
             output: self.outputs,
             params: self.params,
-            tape: 0,
-            scope: Scope::Row,
             grads: GradKind::Scatter,
             macs: self.parts.len() * L::macs(self.features),
-            identity: false,
+            ..Info::default()
         }
     }
 
@@ -449,7 +487,7 @@ impl<L: Level> Stage for Levels<L> {
         let cells = |part: Option<&Part<L>>| part.map_or(0.0, |p| p.level.resolution());
         format!(
             "{}: {} levels x {}{}, {:.0} to {:.0} cells per side, {}",
-            L::NAME,
+            L::Settings::NAME,
             by_level(&self.parts).count(),
             self.features,
             L::of(&self.settings),
@@ -462,7 +500,7 @@ impl<L: Level> Stage for Levels<L> {
 
 impl<L: Level> Encoder for Levels<L> {
     fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
-        ensure(!keep.is_empty(), L::NAME, "channels", "none kept", "at least one")?;
+        ensure(!keep.is_empty(), L::Settings::NAME, "channels", "none kept", "at least one")?;
         let settings = self.settings.clone();
         let mut stage = Self { settings, features: self.features, parts: vec![], params: 0, outputs: keep.len() };
         let mut params = vec![];

@@ -15,7 +15,8 @@
 //! 4, of `k`.
 
 use crate::levels::{
-    self, BLOCK, Levels, Pyramid, entry, entry_mut, finest, fold, fours, leaving, prefetch, primes, sizes, table_size,
+    self, BLOCK, Levels, Rows, entry, entry_mut, finest, fold, fours, grid, leaving, prefetch, primes, sizes,
+    table_size,
 };
 use conefield_core::error::Result;
 use conefield_core::settings::EncoderSpec;
@@ -48,18 +49,10 @@ impl Default for Permutohedral {
     }
 }
 
-conefield_core::stage_type!(
-    EncoderSpec,
-    "permutohedral",
-    Permutohedral,
+grid! {
+    "permutohedral", Permutohedral of SimplexLevel,
     "multi-resolution hash of a lattice of simplices: 4 corners instead of 8",
     example = r#"{"levels": 3, "log2_table_size": 8, "base_resolution": 4}"#
-);
-
-impl EncoderSpec for Permutohedral {
-    fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(Levels::<SimplexLevel>::new(self)?))
-    }
 }
 
 /// Positions are `f32`: a finer lattice leaves no fraction of a cell for interpolation.
@@ -175,13 +168,8 @@ impl levels::Level for SimplexLevel {
     type Settings = Permutohedral;
     type Located<R: Real> = Located<R>;
 
-    const NAME: &'static str = "permutohedral";
     const BASE: (RangeInclusive<u32>, &'static str) = (2..=1 << 20, "2 to 2^20");
     const WGSL: &'static [&'static str] = &[include_str!("permutohedral.wgsl")];
-
-    fn pyramid(s: &Permutohedral) -> Pyramid {
-        Pyramid { levels: s.levels, features: s.features, base_resolution: s.base_resolution, growth: s.growth }
-    }
 
     fn parts(s: &Permutohedral, number: usize, resolution: f64, _: usize) -> Result<Vec<Self>> {
         let table = table_size(s.log2_table_size)?;
@@ -272,14 +260,8 @@ impl levels::Level for SimplexLevel {
     }
 
     #[inline(always)]
-    fn gather<S: Simd, R: Real, const F: usize>(
-        &self,
-        s: S,
-        located: &Located<R>,
-        table: &[[R; F]],
-        out: &mut [[R; F]; BLOCK],
-        n: usize,
-    ) {
+    fn gather<S: Simd, R: Real, const F: usize>(&self, s: S, rows: &Rows<'_, Self, R, F>, out: &mut [[R; F]; BLOCK]) {
+        let &Rows { located, table, n } = rows;
         assert_eq!(table.len(), self.last as usize + 1);
         if self.side == 0 {
             prefetch(table, located.entry.iter(), n);
@@ -300,13 +282,12 @@ impl levels::Level for SimplexLevel {
     fn scatter<S: Simd, R: Real, const F: usize>(
         &self,
         s: S,
-        located: &Located<R>,
-        _: &[[R; F]],
+        rows: &Rows<'_, Self, R, F>,
         dy: &[[R; F]; BLOCK],
-        n: usize,
         grads: &mut [R],
         _: &Range<usize>,
     ) {
+        let &Rows { located, n, .. } = rows;
         let (grads, _) = grads.as_chunks_mut::<F>();
         assert_eq!(grads.len(), self.last as usize + 1);
         if self.side == 0 {
@@ -316,14 +297,8 @@ impl levels::Level for SimplexLevel {
     }
 
     #[inline(always)]
-    fn slope<R: Real, const F: usize>(
-        &self,
-        located: &Located<R>,
-        table: &[[R; F]],
-        dy: &[R; F],
-        x: [R; 3],
-        i: usize,
-    ) -> [R; 3] {
+    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
+        let &Rows { located, table, .. } = rows;
         let v: [R; 4] = located.corners(i).map(|c| (0..F).map(|f| table[c as usize][f] * dy[f]).sum());
         // With respect to a fraction: the corner that it adds to, minus the one before.
         let by = located.rank.each_ref().map(|rank| {
@@ -353,20 +328,8 @@ impl levels::Level for SimplexLevel {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::levels::Level as _;
-    use conefield_core::simd::{Op, run};
 
     type PermutohedralStage = Levels<SimplexLevel>;
-
-    struct Locate<'a, R>(&'a mut Located<R>, &'a SimplexLevel, Tile<'a, R>);
-    impl<R: Real> Op for Locate<'_, R> {
-        type Number = R;
-        type Out = ();
-        #[inline(always)]
-        fn call<S: Simd>(self, s: S) {
-            self.1.locate(s, self.0, self.2, 0, 1);
-        }
-    }
 
     fn stage(base_resolution: u32, growth: f64, log2_table_size: u32) -> PermutohedralStage {
         let settings =
@@ -392,8 +355,7 @@ mod tests {
             let mut owner = std::collections::BTreeMap::new();
             for n in 0..4000u64 {
                 let p = [0, 1, 2].map(|d| f64::from(conefield_core::random::unit(conefield_core::random::mix(d, n))));
-                let mut located = Located::<f64>::default();
-                run(Locate(&mut located, level, Tile::new(&p, 1)));
+                let located: Located<f64> = levels::located(level, p);
                 let corners: Vec<[i64; 3]> = (0..4).map(|c| vertex(&located, c)).collect();
                 for (c, v) in corners.iter().enumerate() {
                     assert!(v.iter().all(|x| (x - v[0]) % 2 == 0), "{v:?} is no vertex");
@@ -430,8 +392,7 @@ mod tests {
             for level in stage(base, growth, 22).levels() {
                 for bits in 0..27 {
                     let x = [0, 1, 2].map(|d| [0.0f32, 1.0, f32::INFINITY][bits / 3usize.pow(d) % 3]);
-                    let mut located = Located::<f32>::default();
-                    run(Locate(&mut located, level, Tile::new(&x, 1)));
+                    let located: Located<f32> = levels::located(level, x);
                     let k = located.cell.map(|c| i64::from(c[0]));
                     let total: f32 = located.weight.iter().map(|w| w[0]).sum();
                     assert!((total - 1.0).abs() < 1e-6, "{x:?}");

@@ -10,7 +10,7 @@
 //! A level with `r` cells per side has `r + 1` nodes along each axis, at the corners of its cells, which fill the cube
 //! exactly.
 
-use crate::levels::{self, BLOCK, Cells, Levels, Pyramid, finest, stretch};
+use crate::levels::{self, BLOCK, Cells, Levels, Rows, finest, grid, stretch};
 use conefield_core::error::Result;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::{Real, Simd};
@@ -51,18 +51,10 @@ impl Default for Planes {
     }
 }
 
-conefield_core::stage_type!(
-    EncoderSpec,
-    "planes",
-    Planes,
+grid! {
+    "planes", Planes of Factor,
     "planes and lines, or three planes, of features on several levels",
     example = r#"{"levels": 2, "base_resolution": 4}"#
-);
-
-impl EncoderSpec for Planes {
-    fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(Levels::<Factor>::new(self)?))
-    }
 }
 
 /// Resolution limit of the finest level.
@@ -171,13 +163,8 @@ impl levels::Level for Factor {
     type Settings = Planes;
     type Located<R: Real> = Cells<R>;
 
-    const NAME: &'static str = "planes";
     const BASE: (RangeInclusive<u32>, &'static str) = (1..=8192, "1 to 8192 cells per side");
     const WGSL: &'static [&'static str] = &[include_str!("planes.wgsl")];
-
-    fn pyramid(s: &Planes) -> Pyramid {
-        Pyramid { levels: s.levels, features: s.features, base_resolution: s.base_resolution, growth: s.growth }
-    }
 
     fn parts(s: &Planes, number: usize, resolution: f64, _: usize) -> Result<Vec<Self>> {
         let cells = resolution.round();
@@ -217,14 +204,8 @@ impl levels::Level for Factor {
     }
 
     #[inline(always)]
-    fn gather<S: Simd, R: Real, const F: usize>(
-        &self,
-        _: S,
-        located: &Cells<R>,
-        table: &[[R; F]],
-        out: &mut [[R; F]; BLOCK],
-        n: usize,
-    ) {
+    fn gather<S: Simd, R: Real, const F: usize>(&self, _: S, rows: &Rows<'_, Self, R, F>, out: &mut [[R; F]; BLOCK]) {
+        let &Rows { located, table, n } = rows;
         let (plane, line) = table.split_at(self.plane(1));
         for i in 0..n {
             let place = Place::of(located, self.orientation, self.nodes(), i);
@@ -247,13 +228,12 @@ impl levels::Level for Factor {
     fn scatter<S: Simd, R: Real, const F: usize>(
         &self,
         _: S,
-        located: &Cells<R>,
-        table: &[[R; F]],
+        rows: &Rows<'_, Self, R, F>,
         dy: &[[R; F]; BLOCK],
-        n: usize,
         grads: &mut [R],
         _: &Range<usize>,
     ) {
+        let &Rows { located, table, n } = rows;
         let (plane, line) = table.split_at(self.plane(1));
         let (plane_grads, line_grads) = grads.as_chunks_mut::<F>().0.split_at_mut(self.plane(1));
         for i in 0..n {
@@ -278,14 +258,8 @@ impl levels::Level for Factor {
     }
 
     #[inline(always)]
-    fn slope<R: Real, const F: usize>(
-        &self,
-        located: &Cells<R>,
-        table: &[[R; F]],
-        dy: &[R; F],
-        x: [R; 3],
-        i: usize,
-    ) -> [R; 3] {
+    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
+        let &Rows { located, table, .. } = rows;
         let (plane, line) = table.split_at(self.plane(1));
         let [a, b, c] = AXES[self.orientation];
         let place = Place::of(located, self.orientation, self.nodes(), i);

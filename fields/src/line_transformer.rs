@@ -299,7 +299,7 @@ impl Stage for LineTransformerStage {
             scope: Scope::Ray,
             grads: GradKind::Dense,
             macs: linear + self.blocks.len() * block.macs,
-            identity: false,
+            ..Info::default()
         }
     }
 

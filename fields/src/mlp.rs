@@ -12,7 +12,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::random::uniform;
 use conefield_core::settings::FieldSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
 use conefield_core::wgsl::Fragment;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -235,10 +235,9 @@ impl Stage for MlpStage {
             output: 1,
             params: self.layers.last().map_or(0, |l| l.all().end),
             tape: self.slope(self.layers.len() - 1).end,
-            scope: Scope::Row,
             grads: GradKind::Dense,
             macs: self.layers.iter().map(|l| l.weights().len()).sum(),
-            identity: false,
+            ..Info::default()
         }
     }
 

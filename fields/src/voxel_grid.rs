@@ -7,7 +7,7 @@ use conefield_core::activation::{self, Activation, activate};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::settings::FieldSpec;
 use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
 use conefield_core::wgsl::{Fragment, TRILINEAR};
 use schemars::JsonSchema;
@@ -205,16 +205,7 @@ impl<R: Real> Kernel<R> for VoxelGridStage {
 
 impl Stage for VoxelGridStage {
     fn info(&self) -> Info {
-        Info {
-            input: 3,
-            output: 1,
-            params: self.grid.entries(),
-            tape: 0,
-            scope: Scope::Row,
-            grads: GradKind::Scatter,
-            macs: 24,
-            identity: false,
-        }
+        Info { input: 3, output: 1, params: self.grid.entries(), grads: GradKind::Scatter, macs: 24, ..Info::default() }
     }
 
     fn parameters(&self) -> Vec<Parameter> {

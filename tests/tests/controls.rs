@@ -21,8 +21,8 @@ use conefield_core::settings::{Initializer, LossSpec};
 use conefield_core::simd::Real;
 use conefield_core::space::Space;
 use conefield_core::stage::{
-    Encoder, GradKind, Grads, Info, Kernel, Lengths, Parameter, Projector, Reduced, Samples, Scope, Stage, Tile,
-    TileMut, UnitRay,
+    Encoder, GradKind, Grads, Info, Kernel, Lengths, Parameter, Projector, Reduced, Samples, Stage, Tile, TileMut,
+    UnitRay,
 };
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use conefield_core::wgsl::Fragment;
@@ -205,11 +205,10 @@ impl Stage for Toy {
             input: 3,
             output: n,
             params: n,
-            tape: 0,
-            scope: Scope::Row,
             grads: GradKind::Scatter,
             macs: 2 * n,
             identity: self.fault == Fault::FalseIdentity,
+            ..Info::default()
         }
     }
 

@@ -1,5 +1,10 @@
 /* A basis for conefield in C: a coefficient for each block of voxels. */
-@head@
+#include "conefield_helpers.h"
+
+#define DOC "blocks of voxels"
+#define SCHEMA \
+    "{\"type\":\"object\",\"properties\":{" \
+    "\"edge\":{\"type\":\"integer\",\"minimum\":1,\"maximum\":64,\"default\":2,\"description\":\"Voxels along a block's edge.\"}}}"
 
 /* Settings in a spec. */
 struct Settings {
@@ -14,44 +19,26 @@ struct Blocks {
 
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)width; /* 0 for a basis */
-    (void)error;
-    struct Settings *s = malloc(sizeof *s);
-    if (s == NULL) return CONEFIELD_FAILED;
-    s->edge = (size_t)number(settings, "edge");
-    *stage = s;
-    return CONEFIELD_OK;
-}
-
-/* For settings and for results of `on`. */
-static void destroy(void *stage) {
-    free(stage);
+    struct Settings s = {.edge = (size_t)number(settings, "edge")};
+    return hand_over(&s, sizeof s, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
-    (void)stage;
     say(text, "blocks of voxels");
     return CONEFIELD_OK;
 }
 
 static ConefieldStatus on(const void *stage, const struct ConefieldGrid *voxels, void **expansion,
                           struct ConefieldText *error) {
-    struct Blocks *b = malloc(sizeof *b);
-    if (b == NULL) {
-        say(error, "no memory");
-        return CONEFIELD_FAILED;
-    }
-    *b = (struct Blocks){.voxels = *voxels, .blocks = *voxels, .edge = ((const struct Settings *)stage)->edge};
+    struct Blocks b = {.voxels = *voxels, .blocks = *voxels, .edge = ((const struct Settings *)stage)->edge};
     for (size_t k = 0; k < 3; k++) {
-        b->blocks.shape[k] = (voxels->shape[k] + b->edge - 1) / b->edge;
-        b->blocks.spacing[k] = voxels->spacing[k] * (double)b->edge;
+        b.blocks.shape[k] = (voxels->shape[k] + b.edge - 1) / b.edge;
+        b.blocks.spacing[k] = voxels->spacing[k] * (double)b.edge;
         /* At the far end a block may reach beyond the voxels. */
-        double beyond = (double)(b->blocks.shape[k] * b->edge - voxels->shape[k]) * voxels->spacing[k];
-        b->blocks.center[k] += 0.5 * beyond;
+        double beyond = (double)(b.blocks.shape[k] * b.edge - voxels->shape[k]) * voxels->spacing[k];
+        b.blocks.center[k] += 0.5 * beyond;
     }
-    *expansion = b;
-    return CONEFIELD_OK;
+    return hand_over(&b, sizeof b, expansion, error);
 }
 
 static ConefieldStatus info(const void *expansion, struct ConefieldExpansion *info) {
@@ -75,13 +62,11 @@ static size_t count(const struct ConefieldGrid *grid) {
 #define BOTH(real, expand, adjoint) \
     static ConefieldStatus expand(const void *expansion, const real *coefficients, real *voxels, struct ConefieldText *error) { \
         const struct Blocks *b = expansion; \
-        (void)error; \
         for (size_t i = 0; i < count(&b->voxels); i++) voxels[i] = coefficients[block(b, i)]; \
         return CONEFIELD_OK; \
     } \
     static ConefieldStatus adjoint(const void *expansion, const real *voxels, real *coefficients, struct ConefieldText *error) { \
         const struct Blocks *b = expansion; \
-        (void)error; \
         memset(coefficients, 0, count(&b->blocks) * sizeof(real)); \
         for (size_t i = 0; i < count(&b->voxels); i++) coefficients[block(b, i)] += voxels[i]; \
         return CONEFIELD_OK; \
@@ -90,8 +75,8 @@ static size_t count(const struct ConefieldGrid *grid) {
 BOTH(float, expand, adjoint)
 BOTH(double, expand_f64, adjoint_f64)
 
-static const struct ConefieldBasis BASIS = {
-    .size = sizeof BASIS,
+static const struct ConefieldBasis FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
     .on = on,
     .info = info,
     .expand = expand,
@@ -99,18 +84,5 @@ static const struct ConefieldBasis BASIS = {
     .expand_f64 = expand_f64,
     .adjoint_f64 = adjoint_f64,
 };
-
-static const struct ConefieldStage STAGES[] = {{
-    .kind = CONEFIELD_BASIS,
-    .name = TEXT("@name@"),
-    .doc = TEXT("blocks of voxels"),
-    .schema = TEXT(
-        "{\"type\":\"object\",\"properties\":{"
-        "\"edge\":{\"type\":\"integer\",\"minimum\":1,\"maximum\":64,\"default\":2,\"description\":\"Voxels along a block's edge.\"}}}"),
-    .create = create,
-    .destroy = destroy,
-    .describe = describe,
-    .basis = &BASIS,
-}};
 
 @plugin@

@@ -1,5 +1,10 @@
 /* A data term for conefield in C: quadratic for small residuals, linear for large ones. */
-@head@
+#include "conefield_helpers.h"
+
+#define DOC "quadratic for small residuals, linear for large ones"
+#define SCHEMA \
+    "{\"type\":\"object\",\"properties\":{" \
+    "\"from\":{\"type\":\"number\",\"exclusiveMinimum\":0,\"default\":3.0,\"description\":\"Residuals of at least this many standard deviations of the noise count by their size.\"}}}"
 
 /* Settings in a spec. */
 struct Settings {
@@ -13,23 +18,11 @@ struct Misfit {
 
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)width; /* 0 for a data term */
-    (void)error;
-    struct Settings *s = malloc(sizeof *s);
-    if (s == NULL) return CONEFIELD_FAILED;
-    s->from = number(settings, "from");
-    *stage = s;
-    return CONEFIELD_OK;
-}
-
-/* For settings and for results of `of`. */
-static void destroy(void *stage) {
-    free(stage);
+    struct Settings s = {.from = number(settings, "from")};
+    return hand_over(&s, sizeof s, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
-    (void)stage;
     say(text, "quadratic for small residuals, linear for large ones");
     return CONEFIELD_OK;
 }
@@ -43,11 +36,8 @@ static int order(const void *a, const void *b) {
 static ConefieldStatus of(const void *stage, const float *measured, const size_t *shape, void **misfit,
                           struct ConefieldText *error) {
     size_t rows = shape[0] * shape[1], columns = shape[2], count = 0;
-    struct Misfit *m = malloc(sizeof *m);
     float *all = malloc(rows * columns * sizeof *all + 1);
-    if (m == NULL || all == NULL) {
-        free(m);
-        free(all);
+    if (all == NULL) {
         say(error, "no memory");
         return CONEFIELD_FAILED;
     }
@@ -56,15 +46,13 @@ static ConefieldStatus of(const void *stage, const float *measured, const size_t
         for (size_t c = 1; c + 1 < columns; c++) all[count++] = fabsf(row[c - 1] - 2 * row[c] + row[c + 1]);
     }
     qsort(all, count, sizeof *all, order);
-    m->noise = count == 0 ? 0 : (double)all[count / 2] / 0.6745 / sqrt(6);
-    m->scale = fmax(((const struct Settings *)stage)->from * m->noise, 1e-6);
+    struct Misfit m = {.noise = count == 0 ? 0 : (double)all[count / 2] / 0.6745 / sqrt(6)};
+    m.scale = fmax(((const struct Settings *)stage)->from * m.noise, 1e-6);
     free(all);
-    *misfit = m;
-    return CONEFIELD_OK;
+    return hand_over(&m, sizeof m, misfit, error);
 }
 
 static void bytes(const void *stage, const size_t *shape, uint64_t *held, uint64_t *brief) {
-    (void)stage;
     *held = sizeof(struct Misfit);
     *brief = sizeof(float) * shape[0] * shape[1] * shape[2];
 }
@@ -76,9 +64,6 @@ static double noise(const void *misfit) {
 /* The sum over the pixels of a view; residuals become derivatives. */
 static ConefieldStatus differentiate(const void *misfit, size_t view, const float *measured, size_t count, float *residuals,
                                      double *sum, struct ConefieldText *error) {
-    (void)view;
-    (void)measured;
-    (void)error;
     double scale = ((const struct Misfit *)misfit)->scale;
     *sum = 0;
     for (size_t i = 0; i < count; i++) {
@@ -92,17 +77,11 @@ static ConefieldStatus differentiate(const void *misfit, size_t view, const floa
 /* The second derivative is at most 1, and derivatives scatter at most like the noise: values stay unchanged. */
 static ConefieldStatus as_they_are(const void *misfit, size_t view, const float *measured, size_t count, float *values,
                                    struct ConefieldText *error) {
-    (void)misfit;
-    (void)view;
-    (void)measured;
-    (void)count;
-    (void)values;
-    (void)error;
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldDataTerm DATA_TERM = {
-    .size = sizeof DATA_TERM,
+static const struct ConefieldDataTerm FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
     .bytes = bytes,
     .of = of,
     .noise = noise,
@@ -110,18 +89,5 @@ static const struct ConefieldDataTerm DATA_TERM = {
     .curve = as_they_are,
     .spread = as_they_are,
 };
-
-static const struct ConefieldStage STAGES[] = {{
-    .kind = CONEFIELD_DATA_TERM,
-    .name = TEXT("@name@"),
-    .doc = TEXT("quadratic for small residuals, linear for large ones"),
-    .schema = TEXT(
-        "{\"type\":\"object\",\"properties\":{"
-        "\"from\":{\"type\":\"number\",\"exclusiveMinimum\":0,\"default\":3.0,\"description\":\"Residuals of at least this many standard deviations of the noise count by their size.\"}}}"),
-    .create = create,
-    .destroy = destroy,
-    .describe = describe,
-    .data_term = &DATA_TERM,
-}};
 
 @plugin@

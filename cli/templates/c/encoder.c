@@ -3,39 +3,32 @@
  * This start has waves of doubling frequency along each axis, each with an amplitude that is learned:
  * y = a * sin(2^k * pi * x). `conefield plugins check` compares its gradients with finite differences.
  */
-@head@
+#include "conefield_helpers.h"
+
+#define DOC "waves of doubling frequency with learned amplitudes"
+#define SCHEMA \
+    "{\"type\":\"object\",\"properties\":{\"bands\":{\"type\":\"integer\",\"minimum\":1,\"maximum\":16,\"default\":6," \
+    "\"description\":\"Frequencies along each axis.\"}},\"examples\":[{\"bands\":1}]}"
 
 typedef struct {
     size_t bands;
     size_t shape[2];
 } Waves;
 
+/* `width` is 3 for an encoder. */
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)width; /* 3 for an encoder */
     double bands = number(settings, "bands");
     if (!(bands >= 1 && bands <= 16)) {
-        char line[80];
-        snprintf(line, sizeof line, "bands: found %g, expected 1 to 16", bands);
-        say(error, line);
+        say(error, "bands: found %g, expected 1 to 16", bands);
         return CONEFIELD_INVALID;
     }
-    Waves *w = malloc(sizeof *w);
-    if (w == NULL) return CONEFIELD_FAILED;
-    *w = (Waves){.bands = (size_t)bands, .shape = {3, (size_t)bands}};
-    *stage = w;
-    return CONEFIELD_OK;
-}
-
-static void destroy(void *stage) {
-    free(stage);
+    Waves w = {.bands = (size_t)bands, .shape = {3, (size_t)bands}};
+    return hand_over(&w, sizeof w, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
-    char line[80];
-    snprintf(line, sizeof line, "%zu waves along each axis", ((const Waves *)stage)->bands);
-    say(text, line);
+    say(text, "%zu waves along each axis", ((const Waves *)stage)->bands);
     return CONEFIELD_OK;
 }
 
@@ -46,16 +39,13 @@ static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
     return CONEFIELD_OK;
 }
 
+/* There is one block. */
 static ConefieldStatus parameter(const void *stage, size_t index, struct ConefieldParameter *out) {
-    (void)index; /* there is one block */
     *out = (struct ConefieldParameter){.name = TEXT("amplitude"), .shape = ((const Waves *)stage)->shape, .dimensions = 2};
     return CONEFIELD_OK;
 }
 
 static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
-    (void)stage;
-    (void)seed;
-    (void)error;
     for (size_t i = 0; i < length; i++) params[i] = 1.0f;
     return CONEFIELD_OK;
 }
@@ -67,8 +57,6 @@ static float frequency(const Waves *w, size_t c) {
 
 static ConefieldStatus forward(const void *stage, const float *params, struct ConefieldTile x,
                                struct ConefieldTileMut y, struct ConefieldTileMut tape, struct ConefieldText *error) {
-    (void)tape;
-    (void)error;
     const Waves *w = stage;
     for (size_t c = 0; c < 3 * w->bands; c++) {
         const float *from = x.data + (c / w->bands) * x.stride;
@@ -81,8 +69,6 @@ static ConefieldStatus forward(const void *stage, const float *params, struct Co
 static ConefieldStatus backward(const void *stage, const float *params, struct ConefieldTile x,
                                 struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
                                 struct ConefieldTileMut dx, struct ConefieldText *error) {
-    (void)tape;
-    (void)error;
     const Waves *w = stage;
     for (size_t c = 0; c < dx.channels; c++) memset(dx.data + c * dx.stride, 0, dx.rows * sizeof(float));
     for (size_t c = 0; c < 3 * w->bands; c++) {
@@ -93,20 +79,19 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
             sum += d[i] * sinf(f * from[i]);
             if (dx.data != NULL) dx.data[axis * dx.stride + i] += d[i] * params[c] * f * cosf(f * from[i]);
         }
-        if (c >= grads.start && c - grads.start < grads.length) grads.data[c - grads.start] += sum;
+        add_gradient(grads, c, sum);
     }
     return CONEFIELD_OK;
 }
 
 /* For `step_cells` of a projector, as in the spec balanced: resolving a period takes two cells. */
 static ConefieldStatus resolutions(const void *stage, double *cells, size_t count, struct ConefieldText *error) {
-    (void)error;
     for (size_t c = 0; c < count; c++) cells[c] = 1u << (c % ((const Waves *)stage)->bands);
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldMap MAP = {
-    .size = sizeof MAP,
+static const struct ConefieldMap FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
     .info = info,
     .parameter = parameter,
     .init = init,
@@ -114,18 +99,5 @@ static const struct ConefieldMap MAP = {
     .backward = backward,
     .resolutions = resolutions,
 };
-
-static const struct ConefieldStage STAGES[] = {{
-    .kind = CONEFIELD_ENCODER,
-    .name = TEXT("@name@"),
-    .doc = TEXT("waves of doubling frequency with learned amplitudes"),
-    .schema = TEXT(
-        "{\"type\":\"object\",\"properties\":{\"bands\":{\"type\":\"integer\",\"minimum\":1,\"maximum\":16,\"default\":6,"
-        "\"description\":\"Frequencies along each axis.\"}},\"examples\":[{\"bands\":1}]}"),
-    .create = create,
-    .destroy = destroy,
-    .describe = describe,
-    .map = &MAP,
-}};
 
 @plugin@

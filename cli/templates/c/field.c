@@ -3,7 +3,12 @@
  * This start is a weighted sum through a softplus, which is never negative: y = log(1 + exp(w * x + b)).
  * `conefield plugins check` compares its gradients with finite differences.
  */
-@head@
+#include "conefield_helpers.h"
+
+#define DOC "a weighted sum through a softplus"
+#define SCHEMA \
+    "{\"type\":\"object\",\"properties\":{\"bias\":{\"type\":\"number\",\"default\":-1.0," \
+    "\"description\":\"The shift that training starts from.\"}}}"
 
 typedef struct {
     size_t width, one;
@@ -12,23 +17,12 @@ typedef struct {
 
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)error;
-    Sum *s = malloc(sizeof *s);
-    if (s == NULL) return CONEFIELD_FAILED;
-    *s = (Sum){.width = width, .one = 1, .bias = number(settings, "bias")};
-    *stage = s;
-    return CONEFIELD_OK;
-}
-
-static void destroy(void *stage) {
-    free(stage);
+    Sum s = {.width = width, .one = 1, .bias = number(settings, "bias")};
+    return hand_over(&s, sizeof s, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
-    char line[80];
-    snprintf(line, sizeof line, "softplus of a sum of %zu channels", ((const Sum *)stage)->width);
-    say(text, line);
+    say(text, "softplus of a sum of %zu channels", ((const Sum *)stage)->width);
     return CONEFIELD_OK;
 }
 
@@ -48,20 +42,14 @@ static ConefieldStatus parameter(const void *stage, size_t index, struct Conefie
 }
 
 static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
-    (void)error;
     const Sum *s = stage;
-    float bound = 1.0f / sqrtf((float)s->width);
-    for (size_t i = 0; i < length; i++) {
-        seed = seed * 6364136223846793005u + 1442695040888963407u;
-        params[i] = bound * (2.0f * (float)(seed >> 40) / 16777216.0f - 1.0f);
-    }
+    for (size_t i = 0; i < length; i++) params[i] = uniform(&seed) / sqrtf((float)s->width);
     params[s->width] = (float)s->bias;
     return CONEFIELD_OK;
 }
 
 static ConefieldStatus forward(const void *stage, const float *params, struct ConefieldTile x,
                                struct ConefieldTileMut y, struct ConefieldTileMut tape, struct ConefieldText *error) {
-    (void)error;
     const Sum *s = stage;
     for (size_t i = 0; i < x.rows; i++) y.data[i] = params[s->width];
     for (size_t c = 0; c < s->width; c++)
@@ -74,15 +62,9 @@ static ConefieldStatus forward(const void *stage, const float *params, struct Co
     return CONEFIELD_OK;
 }
 
-/* Adds to the gradient of parameter `at`, if it is requested. */
-static void add(struct ConefieldGrads grads, size_t at, float sum) {
-    if (at >= grads.start && at - grads.start < grads.length) grads.data[at - grads.start] += sum;
-}
-
 static ConefieldStatus backward(const void *stage, const float *params, struct ConefieldTile x,
                                 struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
                                 struct ConefieldTileMut dx, struct ConefieldText *error) {
-    (void)error;
     const Sum *s = stage;
     float bias = 0;
     /* From here on the tape holds the gradient of the sum. */
@@ -93,32 +75,19 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
             weight += x.data[c * x.stride + i] * tape.data[i];
             if (dx.data != NULL) dx.data[c * dx.stride + i] = params[c] * tape.data[i];
         }
-        add(grads, c, weight);
+        add_gradient(grads, c, weight);
     }
-    add(grads, s->width, bias);
+    add_gradient(grads, s->width, bias);
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldMap MAP = {
-    .size = sizeof MAP,
+static const struct ConefieldMap FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
     .info = info,
     .parameter = parameter,
     .init = init,
     .forward = forward,
     .backward = backward,
 };
-
-static const struct ConefieldStage STAGES[] = {{
-    .kind = CONEFIELD_FIELD,
-    .name = TEXT("@name@"),
-    .doc = TEXT("a weighted sum through a softplus"),
-    .schema = TEXT(
-        "{\"type\":\"object\",\"properties\":{\"bias\":{\"type\":\"number\",\"default\":-1.0,"
-        "\"description\":\"The shift that training starts from.\"}}}"),
-    .create = create,
-    .destroy = destroy,
-    .describe = describe,
-    .map = &MAP,
-}};
 
 @plugin@

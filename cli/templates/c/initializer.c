@@ -3,7 +3,12 @@
  * This start fills every block of the encoder with uniform numbers; every other block keeps the initialization by its
  * own stage.
  */
-@head@
+#include "conefield_helpers.h"
+
+#define DOC "uniform numbers in the encoder"
+#define SCHEMA \
+    "{\"type\":\"object\",\"properties\":{\"bound\":{\"type\":\"number\",\"minimum\":0,\"default\":0.0001," \
+    "\"description\":\"Numbers lie between plus and minus this.\"}}}"
 
 typedef struct {
     double bound;
@@ -11,65 +16,36 @@ typedef struct {
 
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)width;
     double bound = number(settings, "bound");
     if (!(bound >= 0 && bound < 1e30)) {
-        say(error, "bound: found a number below 0, expected at least 0");
+        say(error, "bound: found %g, expected at least 0", bound);
         return CONEFIELD_INVALID;
     }
-    Uniform *u = malloc(sizeof *u);
-    if (u == NULL) return CONEFIELD_FAILED;
-    u->bound = bound;
-    *stage = u;
-    return CONEFIELD_OK;
-}
-
-static void destroy(void *stage) {
-    free(stage);
+    Uniform u = {.bound = bound};
+    return hand_over(&u, sizeof u, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
-    char line[80];
-    snprintf(line, sizeof line, "the encoder within %g", ((const Uniform *)stage)->bound);
-    say(text, line);
+    say(text, "the encoder within %g", ((const Uniform *)stage)->bound);
     return CONEFIELD_OK;
 }
 
 static ConefieldStatus apply(const void *stage, const struct ConefieldBlock *blocks, size_t block_count, float *params,
                              size_t length, uint8_t *filled, struct ConefieldText *error) {
-    (void)length;
-    (void)error;
     float bound = (float)((const Uniform *)stage)->bound;
     uint64_t seed = 1;
     for (size_t b = 0; b < block_count; b++) {
         struct ConefieldStr name = blocks[b].name;
         if (name.length < 8 || memcmp(name.data, "encoder.", 8) != 0) continue;
-        for (size_t i = 0; i < blocks[b].length; i++) {
-            seed = seed * 6364136223846793005u + 1442695040888963407u;
-            params[blocks[b].start + i] = bound * (2.0f * (float)(seed >> 40) / 16777216.0f - 1.0f);
-        }
+        for (size_t i = 0; i < blocks[b].length; i++) params[blocks[b].start + i] = bound * uniform(&seed);
         filled[b] = 1;
     }
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldInitializer INITIALIZER = {
-    .size = sizeof INITIALIZER,
+static const struct ConefieldInitializer FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
     .apply = apply,
 };
-
-static const struct ConefieldStage STAGES[] = {{
-    .kind = CONEFIELD_INITIALIZER,
-    .name = TEXT("@name@"),
-    .doc = TEXT("uniform numbers in the encoder"),
-    .schema = TEXT(
-        "{\"type\":\"object\",\"properties\":{\"bound\":{\"type\":\"number\",\"minimum\":0,\"default\":0.0001,"
-        "\"description\":\"Numbers lie between plus and minus this.\"}}}"),
-    .create = create,
-    .destroy = destroy,
-    .describe = describe,
-    .initializer = &INITIALIZER,
-}};
 
 @plugin@

@@ -3,7 +3,12 @@
  * This start scales and shifts every channel by numbers that are learned: y = w * x + b. `conefield plugins check` compares
  * its gradients with finite differences.
  */
-@head@
+#include "conefield_helpers.h"
+
+#define DOC "a learned scale and shift of every channel"
+#define SCHEMA \
+    "{\"type\":\"object\",\"properties\":{\"scale\":{\"type\":\"number\",\"default\":1.0," \
+    "\"description\":\"The scale that training starts from.\"}}}"
 
 typedef struct {
     size_t width;
@@ -12,23 +17,12 @@ typedef struct {
 
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)error;
-    Affine *a = malloc(sizeof *a);
-    if (a == NULL) return CONEFIELD_FAILED;
-    *a = (Affine){.width = width, .scale = number(settings, "scale")};
-    *stage = a;
-    return CONEFIELD_OK;
-}
-
-static void destroy(void *stage) {
-    free(stage);
+    Affine a = {.width = width, .scale = number(settings, "scale")};
+    return hand_over(&a, sizeof a, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
-    char line[80];
-    snprintf(line, sizeof line, "%zu channels, each with a scale and a shift", ((const Affine *)stage)->width);
-    say(text, line);
+    say(text, "%zu channels, each with a scale and a shift", ((const Affine *)stage)->width);
     return CONEFIELD_OK;
 }
 
@@ -46,8 +40,6 @@ static ConefieldStatus parameter(const void *stage, size_t index, struct Conefie
 }
 
 static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
-    (void)seed;
-    (void)error;
     const Affine *a = stage;
     for (size_t i = 0; i < length; i++) params[i] = i < a->width ? (float)a->scale : 0.0f;
     return CONEFIELD_OK;
@@ -55,8 +47,6 @@ static ConefieldStatus init(const void *stage, uint64_t seed, float *params, siz
 
 static ConefieldStatus forward(const void *stage, const float *params, struct ConefieldTile x,
                                struct ConefieldTileMut y, struct ConefieldTileMut tape, struct ConefieldText *error) {
-    (void)tape;
-    (void)error;
     size_t n = ((const Affine *)stage)->width;
     for (size_t c = 0; c < n; c++)
         for (size_t i = 0; i < x.rows; i++)
@@ -64,16 +54,9 @@ static ConefieldStatus forward(const void *stage, const float *params, struct Co
     return CONEFIELD_OK;
 }
 
-/* Adds to the gradient of parameter `at`, if it is requested. */
-static void add(struct ConefieldGrads grads, size_t at, float sum) {
-    if (at >= grads.start && at - grads.start < grads.length) grads.data[at - grads.start] += sum;
-}
-
 static ConefieldStatus backward(const void *stage, const float *params, struct ConefieldTile x,
                                 struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
                                 struct ConefieldTileMut dx, struct ConefieldText *error) {
-    (void)tape;
-    (void)error;
     size_t n = ((const Affine *)stage)->width;
     for (size_t c = 0; c < n; c++) {
         const float *d = dy.data + c * dy.stride, *from = x.data + c * x.stride;
@@ -83,8 +66,8 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
             shift += d[i];
             if (dx.data != NULL) dx.data[c * dx.stride + i] = params[c] * d[i];
         }
-        add(grads, c, scale);
-        add(grads, n + c, shift);
+        add_gradient(grads, c, scale);
+        add_gradient(grads, n + c, shift);
     }
     return CONEFIELD_OK;
 }
@@ -93,8 +76,6 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
  * behind it in the same memory and live as long as it does. */
 static ConefieldStatus reduce(const void *stage, uint32_t side, const size_t *keep, size_t count,
                               struct ConefieldReduced *out, struct ConefieldText *error) {
-    (void)side;
-    (void)error;
     const Affine *a = stage;
     Affine *smaller = malloc(sizeof *smaller + 2 * count * sizeof(struct ConefieldRange) + count * sizeof(size_t));
     if (smaller == NULL) return CONEFIELD_FAILED;
@@ -110,8 +91,8 @@ static ConefieldStatus reduce(const void *stage, uint32_t side, const size_t *ke
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldMap MAP = {
-    .size = sizeof MAP,
+static const struct ConefieldMap FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
     .info = info,
     .parameter = parameter,
     .init = init,
@@ -119,18 +100,5 @@ static const struct ConefieldMap MAP = {
     .backward = backward,
     .reduce = reduce,
 };
-
-static const struct ConefieldStage STAGES[] = {{
-    .kind = CONEFIELD_NORMALIZER,
-    .name = TEXT("@name@"),
-    .doc = TEXT("a learned scale and shift of every channel"),
-    .schema = TEXT(
-        "{\"type\":\"object\",\"properties\":{\"scale\":{\"type\":\"number\",\"default\":1.0,"
-        "\"description\":\"The scale that training starts from.\"}}}"),
-    .create = create,
-    .destroy = destroy,
-    .describe = describe,
-    .map = &MAP,
-}};
 
 @plugin@

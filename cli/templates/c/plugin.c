@@ -1,3 +1,14 @@
+static const struct ConefieldStage STAGES[] = {{
+    .kind = @kind@,
+    .name = TEXT("@name@"),
+    .doc = TEXT(DOC),
+    .schema = TEXT(SCHEMA),
+    .create = create,
+    .destroy = free,
+    .describe = describe,
+    .@table@ = &FUNCTIONS,
+}};
+
 static const struct ConefieldPlugin PLUGIN = {
     .size = sizeof PLUGIN,
     .abi_major = CONEFIELD_ABI_MAJOR,

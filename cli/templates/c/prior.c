@@ -1,28 +1,24 @@
 /* A prior for conefield in C: half the squared differences of neighbouring points, in small blocks placed at random. */
-@head@
+#include "conefield_helpers.h"
 
+#define DOC "squared differences of neighbouring points"
+#define SCHEMA \
+    "{\"type\":\"object\",\"properties\":{" \
+    "\"weight\":{\"type\":\"number\",\"minimum\":0,\"default\":0.1,\"description\":\"Weight against the mean loss of a ray.\"}," \
+    "\"blocks\":{\"type\":\"integer\",\"minimum\":1,\"default\":32,\"description\":\"Blocks a step.\"}," \
+    "\"edge\":{\"type\":\"integer\",\"minimum\":2,\"maximum\":32,\"default\":8,\"description\":\"Points along a block's edge.\"}," \
+    "\"spacing\":{\"type\":\"number\",\"default\":1.0,\"description\":\"Distance of the points in voxels.\"}}}"
+
+/* The host refuses invalid blocks. */
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)width; /* 0 for a prior */
-    (void)error;
-    struct ConefieldBlocks *b = malloc(sizeof *b);
-    if (b == NULL) return CONEFIELD_FAILED;
-    /* The host refuses invalid blocks. */
-    *b = (struct ConefieldBlocks){.edge = (size_t)number(settings, "edge"), .count = (size_t)number(settings, "blocks"),
-                                  .spacing = number(settings, "spacing"), .weight = number(settings, "weight")};
-    *stage = b;
-    return CONEFIELD_OK;
-}
-
-static void destroy(void *stage) {
-    free(stage);
+    struct ConefieldBlocks b = {.edge = (size_t)number(settings, "edge"), .count = (size_t)number(settings, "blocks"),
+                                .spacing = number(settings, "spacing"), .weight = number(settings, "weight")};
+    return hand_over(&b, sizeof b, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
-    char line[80];
-    snprintf(line, sizeof line, "squared differences, weight %g", ((const struct ConefieldBlocks *)stage)->weight);
-    say(text, line);
+    say(text, "squared differences, weight %g", ((const struct ConefieldBlocks *)stage)->weight);
     return CONEFIELD_OK;
 }
 
@@ -34,7 +30,6 @@ static ConefieldStatus blocks(const void *stage, struct ConefieldBlocks *out) {
 /* The penalty. Adds `scale` times its derivatives to `gradient`. */
 static ConefieldStatus block(const void *stage, const double *values, size_t count, double scale, double *gradient,
                              double *penalty, struct ConefieldText *error) {
-    (void)error;
     size_t edge = ((const struct ConefieldBlocks *)stage)->edge;
     const size_t steps[] = {edge * edge, edge, 1};
     double sum = 0;
@@ -52,26 +47,10 @@ static ConefieldStatus block(const void *stage, const double *values, size_t cou
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldPrior PRIOR = {
-    .size = sizeof PRIOR,
+static const struct ConefieldPrior FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
     .blocks = blocks,
     .block = block,
 };
-
-static const struct ConefieldStage STAGES[] = {{
-    .kind = CONEFIELD_PRIOR,
-    .name = TEXT("@name@"),
-    .doc = TEXT("squared differences of neighbouring points"),
-    .schema = TEXT(
-        "{\"type\":\"object\",\"properties\":{"
-        "\"weight\":{\"type\":\"number\",\"minimum\":0,\"default\":0.1,\"description\":\"Weight against the mean loss of a ray.\"},"
-        "\"blocks\":{\"type\":\"integer\",\"minimum\":1,\"default\":32,\"description\":\"Blocks a step.\"},"
-        "\"edge\":{\"type\":\"integer\",\"minimum\":2,\"maximum\":32,\"default\":8,\"description\":\"Points along a block's edge.\"},"
-        "\"spacing\":{\"type\":\"number\",\"default\":1.0,\"description\":\"Distance of the points in voxels.\"}}}"),
-    .create = create,
-    .destroy = destroy,
-    .describe = describe,
-    .prior = &PRIOR,
-}};
 
 @plugin@

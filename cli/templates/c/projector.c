@@ -3,7 +3,12 @@
  * This start takes the middles of equal intervals within the reconstruction box. The line integral is the sum of
  * attenuation times length; the host computes it and its adjoint if `integrate` and `adjoint` are NULL.
  */
-@head@
+#include "conefield_helpers.h"
+
+#define DOC "equal intervals within the box"
+#define SCHEMA \
+    "{\"type\":\"object\",\"properties\":{\"samples\":{\"type\":\"integer\",\"minimum\":1,\"default\":128," \
+    "\"description\":\"Samples of every ray that meets the box.\"}}}"
 
 typedef struct {
     size_t samples;
@@ -11,30 +16,17 @@ typedef struct {
 
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)width;
     double samples = number(settings, "samples");
     if (!(samples >= 1 && samples <= 65536)) {
-        char line[80];
-        snprintf(line, sizeof line, "samples: found %g, expected 1 to 65536", samples);
-        say(error, line);
+        say(error, "samples: found %g, expected 1 to 65536", samples);
         return CONEFIELD_INVALID;
     }
-    March *m = malloc(sizeof *m);
-    if (m == NULL) return CONEFIELD_FAILED;
-    m->samples = (size_t)samples;
-    *stage = m;
-    return CONEFIELD_OK;
-}
-
-static void destroy(void *stage) {
-    free(stage);
+    March m = {.samples = (size_t)samples};
+    return hand_over(&m, sizeof m, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
-    char line[80];
-    snprintf(line, sizeof line, "%zu samples per ray", ((const March *)stage)->samples);
-    say(text, line);
+    say(text, "%zu samples per ray", ((const March *)stage)->samples);
     return CONEFIELD_OK;
 }
 
@@ -42,11 +34,9 @@ static size_t max_samples(const void *stage, const struct ConefieldRay *ray) {
     return ray->inside[1] > ray->inside[0] ? ((const March *)stage)->samples : 0;
 }
 
+/* Nothing is random here. `capacity` is the result of max_samples. */
 static ConefieldStatus sample(const void *stage, const struct ConefieldRay *ray, const uint64_t *seed, float *points,
                               float *weights, size_t capacity, size_t *count, struct ConefieldText *error) {
-    (void)seed; /* nothing is random here */
-    (void)capacity; /* the result of max_samples */
-    (void)error;
     size_t n = max_samples(stage, ray);
     float near = ray->inside[0], length = n > 0 ? (ray->inside[1] - near) / (float)n : 0.0f;
     for (size_t i = 0; i < n; i++) {
@@ -58,23 +48,10 @@ static ConefieldStatus sample(const void *stage, const struct ConefieldRay *ray,
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldProjector PROJECTOR = {
-    .size = sizeof PROJECTOR,
+static const struct ConefieldProjector FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
     .max_samples = max_samples,
     .sample = sample,
 };
-
-static const struct ConefieldStage STAGES[] = {{
-    .kind = CONEFIELD_PROJECTOR,
-    .name = TEXT("@name@"),
-    .doc = TEXT("equal intervals within the box"),
-    .schema = TEXT(
-        "{\"type\":\"object\",\"properties\":{\"samples\":{\"type\":\"integer\",\"minimum\":1,\"default\":128,"
-        "\"description\":\"Samples of every ray that meets the box.\"}}}"),
-    .create = create,
-    .destroy = destroy,
-    .describe = describe,
-    .projector = &PROJECTOR,
-}};
 
 @plugin@

@@ -1,5 +1,11 @@
 /* A regularizer for conefield in C: quadratic smoothness, half the squared differences of neighbouring coefficients. */
-@head@
+#include "conefield_helpers.h"
+
+#define DOC "squared differences of neighbours"
+#define SCHEMA \
+    "{\"type\":\"object\",\"properties\":{" \
+    "\"weight\":{\"type\":\"number\",\"minimum\":0,\"default\":100.0,\"description\":\"Times the noise, for differences of 1/mm.\"}," \
+    "\"inner\":{\"type\":\"integer\",\"minimum\":1,\"maximum\":1000,\"default\":4,\"description\":\"Steps for each update.\"}}}"
 
 /* Settings in a spec. */
 struct Settings {
@@ -9,23 +15,11 @@ struct Settings {
 
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)width; /* 0 for a regularizer */
-    (void)error;
-    struct Settings *s = malloc(sizeof *s);
-    if (s == NULL) return CONEFIELD_FAILED;
-    *s = (struct Settings){.weight = number(settings, "weight"), .inner = (size_t)number(settings, "inner")};
-    *stage = s;
-    return CONEFIELD_OK;
-}
-
-/* For settings and for penalties: both are one allocation. */
-static void destroy(void *stage) {
-    free(stage);
+    struct Settings s = {.weight = number(settings, "weight"), .inner = (size_t)number(settings, "inner")};
+    return hand_over(&s, sizeof s, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
-    (void)stage;
     say(text, "squared differences of neighbours");
     return CONEFIELD_OK;
 }
@@ -40,7 +34,6 @@ struct Penalty {
 };
 
 static uint64_t bytes(const void *stage, const struct ConefieldGrid *grid) {
-    (void)stage;
     return sizeof(struct Penalty) + 2 * sizeof(float) * grid->shape[0] * grid->shape[1] * grid->shape[2];
 }
 
@@ -65,8 +58,6 @@ static ConefieldStatus on(const void *stage, const struct ConefieldGrid *grid, v
 /* The weight, as a multiple of the scan's noise in the gradient of the data term. */
 static ConefieldStatus weight(const void *stage, const struct ConefieldGrid *grid, double (*noise)(void *, double),
                               void *context, double *weight, struct ConefieldText *error) {
-    (void)grid;
-    (void)error;
     *weight = noise(context, ((const struct Settings *)stage)->weight);
     return CONEFIELD_OK;
 }
@@ -90,15 +81,12 @@ static double differences(const struct Penalty *p, const float *x, float *slope)
 }
 
 static ConefieldStatus value(const void *penalty, const float *x, size_t count, double *value, struct ConefieldText *error) {
-    (void)count;
-    (void)error;
     *value = differences(penalty, x, NULL);
     return CONEFIELD_OK;
 }
 
 /* Takes some gradient steps towards the minimum of half the squared distance from `v` plus tau times the penalty. */
 static ConefieldStatus prox(void *penalty, const float *v, size_t count, float tau, float *u, struct ConefieldText *error) {
-    (void)error;
     struct Penalty *p = penalty;
     float *at = p->numbers, *slope = p->numbers + count;
     float share = 1 / (1 + tau * 4 * (p->strength[0] + p->strength[1] + p->strength[2]));
@@ -123,8 +111,8 @@ static ConefieldStatus state(void *penalty, size_t index, struct ConefieldState 
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldRegularizer REGULARIZER = {
-    .size = sizeof REGULARIZER,
+static const struct ConefieldRegularizer FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
     .bytes = bytes,
     .on = on,
     .weight = weight,
@@ -132,19 +120,5 @@ static const struct ConefieldRegularizer REGULARIZER = {
     .prox = prox,
     .state = state,
 };
-
-static const struct ConefieldStage STAGES[] = {{
-    .kind = CONEFIELD_REGULARIZER,
-    .name = TEXT("@name@"),
-    .doc = TEXT("squared differences of neighbours"),
-    .schema = TEXT(
-        "{\"type\":\"object\",\"properties\":{"
-        "\"weight\":{\"type\":\"number\",\"minimum\":0,\"default\":100.0,\"description\":\"Times the noise, for differences of 1/mm.\"},"
-        "\"inner\":{\"type\":\"integer\",\"minimum\":1,\"maximum\":1000,\"default\":4,\"description\":\"Steps for each update.\"}}}"),
-    .create = create,
-    .destroy = destroy,
-    .describe = describe,
-    .regularizer = &REGULARIZER,
-}};
 
 @plugin@

@@ -3,15 +3,10 @@
 //! This start fills every block whose name begins with `prefix` with uniform numbers; every other block keeps the
 //! initialization by its own stage.
 
-use conefield_plugin::arena::{Arena, InitReport, Layout, Weights};
-use conefield_plugin::error::{Result, ensure};
-use conefield_plugin::random::{mix, unit};
-use conefield_plugin::settings::{Initializer, InitializerSpec};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(InitializerSpec, "@name@", Settings, "uniform numbers in the blocks of one stage");
+stage_type!(InitializerSpec, "@name@", Settings, "uniform numbers in the blocks of one stage");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]

@@ -3,15 +3,10 @@
 //! This start takes the middles of equal intervals within the reconstruction box. The line integral is the sum of
 //! attenuation times length, and its adjoint comes with the trait.
 
-use conefield_plugin::error::{Result, ensure};
-use conefield_plugin::random::{mix, unit};
-use conefield_plugin::settings::ProjectorSpec;
-use conefield_plugin::stage::{Projector, Samples, UnitRay};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(ProjectorSpec, "@name@", Settings, "equal intervals within the box");
+stage_type!(ProjectorSpec, "@name@", Settings, "equal intervals within the box");
 
 /// Settings in a spec.
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]

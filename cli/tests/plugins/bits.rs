@@ -86,6 +86,18 @@ impl Place {
     }
 }
 
+/// Runs the command with `args`, and kills it after its first checkpoint.
+fn kill_after(checkpoint: &Path, args: &[&str]) {
+    let mut command = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"));
+    let mut child = command.arg("--quiet").args(args).spawn().unwrap();
+    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(checkpoint.exists(), "it was over before it could be killed");
+}
+
 #[test]
 fn as_built_in() {
     let place = place();
@@ -136,18 +148,8 @@ fn a_regularizer_as_built_in() {
     let solution = spec.method.plan(&Context::new(&backend)).unwrap().run(&job, &mut Silent).unwrap();
     assert!(read(&short) == solution.result.volume(&backend).unwrap().data, "the volumes differ");
 
-    let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"))
-        .arg("--quiet")
-        .args([&args(&broken)[..], &["--checkpoint-every", "0.01s"]].concat())
-        .spawn()
-        .unwrap();
     let checkpoint = Path::new(&broken).join("checkpoint.safetensors");
-    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
-        std::thread::sleep(std::time::Duration::from_millis(1));
-    }
-    child.kill().unwrap();
-    child.wait().unwrap();
-    assert!(checkpoint.exists(), "it was over before it could be killed");
+    kill_after(&checkpoint, &[&args(&broken)[..], &["--checkpoint-every", "0.01s"]].concat());
     let kept = conefield_io::read_checkpoint(&checkpoint).unwrap();
     assert!(["prior.dual.x", "prior.dual.y", "prior.dual.z"].iter().all(|name| kept.tensors.contains_key(*name)));
     done(&[&args(&broken)[..], &["--resume"]].concat());
@@ -161,17 +163,7 @@ fn killed_and_resumed() {
     done(&place.reconstruct(&whole, "1500", &[]));
     let checkpoint = Path::new(&killed).join("checkpoint.safetensors");
     let arguments = place.reconstruct(&killed, "1500", &["--checkpoint-every", "0.02s"]);
-    let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"))
-        .arg("--quiet")
-        .args(&arguments)
-        .spawn()
-        .unwrap();
-    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
-        std::thread::sleep(std::time::Duration::from_millis(5));
-    }
-    child.kill().unwrap();
-    child.wait().unwrap();
-    assert!(checkpoint.exists(), "it was over before it could be killed");
+    kill_after(&checkpoint, &arguments);
 
     // Without the plugins the spec is refused.
     let mut bare = arguments[4..].to_vec();

@@ -14,7 +14,7 @@ fn rust_examples_pass_their_own_tests() {
 fn every_example_is_checked_and_reconstructs() {
     let dir = tempfile::tempdir().unwrap();
     let dense = dir.path().join("dense.so");
-    cc(&sources().join("plugins/examples/dense/dense.c"), &["NDEBUG"], &dense);
+    cc(&sources().join("plugins/examples/dense/dense.c"), &dense);
     let scan = text(&dir.path().join("scan"));
     done(&["simulate", "phantom:head:32", "-o", &scan, "--views", "16", "--detector", "32x32"]);
     for (library, sets) in [

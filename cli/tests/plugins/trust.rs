@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 fn dense(dir: &Path) -> PathBuf {
     let out = dir.join("dense.so");
-    cc(&sources().join("plugins/examples/dense/dense.c"), &["NDEBUG"], &out);
+    cc(&sources().join("plugins/examples/dense/dense.c"), &out);
     out
 }
 
@@ -136,7 +136,7 @@ fn a_plugin_that_never_comes_back_does_not_hang_its_check() {
     let (source, library) = (dir.path().join("hangs.c"), dir.path().join("hangs.so"));
     std::fs::write(&source, "#include <unistd.h>\nconst void *conefield_plugin(void) { for (;;) sleep(1); }\n")
         .unwrap();
-    cc(&source, &[], &library);
+    cc(&source, &library);
     let begin = std::time::Instant::now();
     let (fine, _, err) = run(&mut conefield(&["plugins", "check", &text(&library)]));
     assert!(!fine && err.contains("its entry function did not return within 10"), "{err}");

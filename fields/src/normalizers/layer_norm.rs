@@ -10,9 +10,7 @@ use conefield_core::dense::total;
 use conefield_core::error::{Result, ensure};
 use conefield_core::settings::NormalizerSpec;
 use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{
-    GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
+use conefield_core::stage::{GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Stage, Tile, TileMut};
 use conefield_core::wgsl::{Fragment, Sum, declare};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -241,10 +239,9 @@ impl Stage for LayerNormStage {
             output: self.width,
             params: if self.settings.affine { 2 * self.width } else { 0 },
             tape: TAPE,
-            scope: Scope::Row,
             grads: if self.settings.affine { GradKind::Dense } else { GradKind::None },
             macs: 4 * self.width,
-            identity: false,
+            ..Info::default()
         }
     }
 

@@ -14,9 +14,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::random::{mix, unit};
 use conefield_core::settings::NormalizerSpec;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{
-    GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
+use conefield_core::stage::{GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Stage, Tile, TileMut};
 use conefield_core::wgsl::{Fragment, Sum, declare, functions};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -208,10 +206,9 @@ impl Stage for LevelAttentionStage {
             output: width,
             params: self.weights() + self.levels,
             tape: self.levels,
-            scope: Scope::Row,
             grads: GradKind::Dense,
             macs: self.weights() + 2 * width + 10 * self.levels,
-            identity: false,
+            ..Info::default()
         }
     }
 

@@ -496,7 +496,7 @@ impl Stage for LineAttentionStage {
             scope: Scope::Ray,
             grads: GradKind::Dense,
             macs: self.macs(),
-            identity: false,
+            ..Info::default()
         }
     }
 

@@ -1,4 +1,5 @@
-//! The contract between conefield and a plugin, in C. `include/conefield_plugin.h` is generated from this file.
+//! The contract between conefield and a plugin, in C. `include/conefield_plugin.h` is generated from this file and
+//! `tables.rs`.
 //!
 //! A plugin is a shared library that exports [`conefield_plugin`](ConefieldEntry), which returns a table of its
 //! contents. Rules beyond the types:
@@ -20,6 +21,36 @@
 //! - **Determinism.** Results must not depend on threads, on time, or on how rows are divided into tiles.
 
 use std::ffi::c_void;
+
+/// Defines tables of functions, each a pointer that is NULL if the function is absent. A plugin without one that is
+/// `required` is refused.
+macro_rules! tables {
+    ($(
+        $(#[$about:meta])*
+        $table:ident {
+            $($(#[$doc:meta])* $need:ident $name:ident($($argument:ident: $type:ty),*) $(-> $result:ty)?;)*
+        }
+    )*) => {$(
+        $(#[$about])*
+        #[repr(C)]
+        #[derive(Debug, Clone, Copy)]
+        pub struct $table {
+            /// Bytes of this table.
+            pub size: usize,
+            $($(#[$doc])* pub $name: Option<unsafe extern "C" fn($($argument: $type),*) $(-> $result)?>,)*
+        }
+
+        impl $table {
+            /// The first required function that is absent.
+            pub fn missing(&self) -> Option<&'static str> {
+                let all = [$((stringify!($name), stringify!($need), self.$name.is_some())),*];
+                all.into_iter().find(|(_, need, there)| *need == "required" && !there).map(|(name, ..)| name)
+            }
+        }
+    )*};
+}
+
+include!("tables.rs");
 
 /// Major version of this contract. Plugins with another one are refused.
 pub const CONEFIELD_ABI_MAJOR: u32 = 4;
@@ -60,22 +91,22 @@ pub const CONEFIELD_DATA_TERM: u32 = 8;
 /// Coefficients to voxels, for iterative methods.
 pub const CONEFIELD_BASIS: u32 = 9;
 
-/// Hands the macro `$then` every kind: for each table of functions its type, its field in [`ConefieldStage`], the
-/// functions that it must have, and the kinds that use it, by conefield's name and by their code. The host's dispatch, its
-/// checks and the exports of Rust plugins are made from this list.
+/// Hands the macro `$then` every kind: for each table of functions its type, its field in [`ConefieldStage`], and the
+/// kinds that use it, by conefield's name and by their code. The host's dispatch, the exports of Rust plugins and new
+/// plugins in C are made from this list.
 #[macro_export]
 macro_rules! kinds {
     ($then:ident) => {
         $then! {
-            ConefieldMap map [info forward backward]:
+            ConefieldMap map:
                 Encoder CONEFIELD_ENCODER, Normalizer CONEFIELD_NORMALIZER, Field CONEFIELD_FIELD;
-            ConefieldProjector projector [max_samples sample]: Projector CONEFIELD_PROJECTOR;
-            ConefieldInitializer initializer [apply]: Initializer CONEFIELD_INITIALIZER;
-            ConefieldLoss loss [at]: Loss CONEFIELD_LOSS;
-            ConefieldPrior prior [blocks block]: Prior CONEFIELD_PRIOR;
-            ConefieldRegularizer regularizer [on weight value prox]: Regularizer CONEFIELD_REGULARIZER;
-            ConefieldDataTerm data_term [of noise differentiate curve spread]: DataTerm CONEFIELD_DATA_TERM;
-            ConefieldBasis basis [on info expand adjoint]: Basis CONEFIELD_BASIS;
+            ConefieldProjector projector: Projector CONEFIELD_PROJECTOR;
+            ConefieldInitializer initializer: Initializer CONEFIELD_INITIALIZER;
+            ConefieldLoss loss: Loss CONEFIELD_LOSS;
+            ConefieldPrior prior: Prior CONEFIELD_PRIOR;
+            ConefieldRegularizer regularizer: Regularizer CONEFIELD_REGULARIZER;
+            ConefieldDataTerm data_term: DataTerm CONEFIELD_DATA_TERM;
+            ConefieldBasis basis: Basis CONEFIELD_BASIS;
         }
     };
 }
@@ -201,7 +232,7 @@ pub struct ConefieldGrads64 {
 
 /// Widths, counts and cost of an encoder, normalizer or field.
 #[repr(C)]
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct ConefieldInfo {
     /// Input channels.
     pub input: usize,
@@ -244,7 +275,7 @@ pub struct ConefieldParameter {
 
 /// A range `start..end` of parameters or channels.
 #[repr(C)]
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct ConefieldRange {
     /// The first.
     pub start: usize,
@@ -266,127 +297,6 @@ pub struct ConefieldReduced {
     pub channels: *const usize,
     /// Channels in `channels`.
     pub channels_count: usize,
-}
-
-/// Functions of an encoder, normalizer or field. `stage` is the result of `create`.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct ConefieldMap {
-    /// Bytes of this table.
-    pub size: usize,
-    /// Widths and counts; constant for a stage.
-    pub info: Option<unsafe extern "C" fn(stage: *const c_void, info: *mut ConefieldInfo) -> ConefieldStatus>,
-    /// Block `index` of the parameters. NULL if there are none.
-    pub parameter: Option<
-        unsafe extern "C" fn(stage: *const c_void, index: usize, parameter: *mut ConefieldParameter) -> ConefieldStatus,
-    >,
-    /// Initializes all parameters, reproducible by `seed`. NULL if there are none.
-    pub init: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            seed: u64,
-            params: *mut f32,
-            length: usize,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Overwrites `y` with f(x; params), and `tape` with the data for backward.
-    pub forward: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            params: *const f32,
-            x: ConefieldTile,
-            y: ConefieldTileMut,
-            tape: ConefieldTileMut,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Given `dy` = ∂L/∂y, adds ∂L/∂params to `grads` and, unless its data is NULL, overwrites `dx` with ∂L/∂x. `tape`
-    /// holds the values of forward and may be used as scratch; it has no channels for a stage with scattered gradients.
-    /// The summation order of a parameter's gradient must not depend on the range in `grads`.
-    pub backward: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            params: *const f32,
-            x: ConefieldTile,
-            tape: ConefieldTileMut,
-            dy: ConefieldTile,
-            grads: ConefieldGrads,
-            dx: ConefieldTileMut,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// `forward` in double precision, for checking gradients; NULL if there is none.
-    pub forward_f64: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            params: *const f64,
-            x: ConefieldTile64,
-            y: ConefieldTileMut64,
-            tape: ConefieldTileMut64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// `backward` in double precision; NULL if there is none.
-    pub backward_f64: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            params: *const f64,
-            x: ConefieldTile64,
-            tape: ConefieldTileMut64,
-            dy: ConefieldTile64,
-            grads: ConefieldGrads64,
-            dx: ConefieldTileMut64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Range `index` of the parameters that a worker may own; ranges are disjoint, ascending and cover all parameters.
-    /// NULL: one range.
-    pub partition:
-        Option<unsafe extern "C" fn(stage: *const c_void, index: usize, range: *mut ConefieldRange) -> ConefieldStatus>,
-    /// Creates a smaller stage. With `side` [`CONEFIELD_OUTPUTS`], an encoder that computes only the outputs `keep`;
-    /// with [`CONEFIELD_INPUTS`], a normalizer or field with only the inputs `keep`. `keep` is ascending. NULL: not
-    /// supported; masks that need it are refused.
-    pub reduce: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            side: u32,
-            keep: *const usize,
-            keep_count: usize,
-            reduced: *mut ConefieldReduced,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// WGSL of the same formula: functions `stage_forward` and `stage_backward` of a row; see
-    /// docs/guide/writing-stages.md. NULL: CPU only.
-    pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
-    /// Number of passes of `forward`, each over a table of its own; constant for a stage. A host with many tiles runs
-    /// one pass for all of them before the next, while its table is in the cache. NULL: one pass.
-    pub passes: Option<unsafe extern "C" fn(stage: *const c_void) -> usize>,
-    /// Pass `pass` of `forward`, from 0; all passes in order give the same bits as `forward`. A pass keeps the output
-    /// of the other passes. NULL if `passes` is NULL.
-    pub forward_pass: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            pass: usize,
-            params: *const f32,
-            x: ConefieldTile,
-            y: ConefieldTileMut,
-            tape: ConefieldTileMut,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// For an encoder: writes the resolution of each of its `count` channels in cells along the unit cube's side,
-    /// finite numbers above 0. Projectors may count in the finest cell, and channels finer than the data can be left
-    /// out. Returns [`CONEFIELD_UNSUPPORTED`] if unknown. NULL: unknown.
-    pub resolutions: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            cells: *mut f64,
-            count: usize,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
 }
 
 /// A ray in the unit cube: `origin + t * direction`, where `t` counts cube sides.
@@ -413,52 +323,6 @@ pub struct ConefieldLengths {
     pub voxel_mm: f64,
     /// The side of the encoder's finest cell, mm; 0 if the encoder does not report its resolution.
     pub cell_mm: f64,
-}
-
-/// Functions of a projector.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct ConefieldProjector {
-    /// Bytes of this table.
-    pub size: usize,
-    /// Maximum number of samples that `sample` writes for `ray`; 0 if it misses the scene.
-    pub max_samples: Option<unsafe extern "C" fn(stage: *const c_void, ray: *const ConefieldRay) -> usize>,
-    /// Writes the samples of `ray`: positions `x, y, z` in the unit cube to `points`, the length of each in cube sides
-    /// to `weights`, and their number (at most `capacity`) to `count`. `seed` determines random positions; with NULL
-    /// (rendering) none are random.
-    pub sample: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            ray: *const ConefieldRay,
-            seed: *const u64,
-            points: *mut f32,
-            weights: *mut f32,
-            capacity: usize,
-            count: *mut usize,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// The line integral of `count` attenuations. NULL: their sum, weighted by the lengths.
-    pub integrate:
-        Option<unsafe extern "C" fn(stage: *const c_void, weights: *const f32, mu: *const f64, count: usize) -> f64>,
-    /// The exact adjoint of `integrate`: overwrites `dmu` with its derivatives times `dline`. NULL if `integrate` is
-    /// NULL.
-    pub adjoint: Option<
-        unsafe extern "C" fn(stage: *const c_void, weights: *const f32, dline: f64, dmu: *mut f64, count: usize),
-    >,
-    /// Creates the projector for a scene with these lengths and sets `fitted` to it. A projector whose settings do not
-    /// depend on them leaves `fitted` unchanged. NULL: the settings never depend on them.
-    pub fitted: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            lengths: *const ConefieldLengths,
-            fitted: *mut *mut c_void,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// WGSL of `sample`, for a projector that integrates like one without `integrate`: a function `stage_sample`; see
-    /// docs/guide/writing-stages.md. NULL: CPU only.
-    pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
 }
 
 /// A named block of all parameters of a pipeline.
@@ -493,54 +357,6 @@ pub struct ConefieldTensor {
     pub length: usize,
 }
 
-/// Functions of an initializer. Optional functions may be NULL.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct ConefieldInitializer {
-    /// Bytes of this table.
-    pub size: usize,
-    /// Initializes some of `params`, after every stage's own initialization, and sets the entry of each initialized
-    /// block in `filled` to 1.
-    pub apply: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            blocks: *const ConefieldBlock,
-            block_count: usize,
-            params: *mut f32,
-            length: usize,
-            filled: *mut u8,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Optional. Refuses parameters that do not fit, before a run begins.
-    pub check: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            blocks: *const ConefieldBlock,
-            block_count: usize,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Optional. The weights file named by the settings; [`CONEFIELD_UNSUPPORTED`] if there is none. The
-    /// host reads the file and continues with the stage that `with_weights` creates.
-    pub weights: Option<unsafe extern "C" fn(stage: *const c_void, path: *mut ConefieldStr) -> ConefieldStatus>,
-    /// Required together with `weights`. Creates a stage with these weights, which are valid during the
-    /// call.
-    pub with_weights: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            tensors: *const ConefieldTensor,
-            count: usize,
-            out: *mut *mut c_void,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Optional. The file of a known volume that the field learns in `steps` steps after weights are
-    /// initialized; [`CONEFIELD_UNSUPPORTED`] if there is none.
-    pub volume:
-        Option<unsafe extern "C" fn(stage: *const c_void, path: *mut ConefieldStr, steps: *mut u64) -> ConefieldStatus>,
-}
-
 /// The noise of a scan, in the scale of the stages: a line integral `p` has the variance `sigma² · exp(growth · p)`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
@@ -555,45 +371,9 @@ pub struct ConefieldNoise {
     pub count: usize,
 }
 
-/// Functions of a loss.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct ConefieldLoss {
-    /// Bytes of this table.
-    pub size: usize,
-    /// Compares `count` predicted values with measured ones: writes the loss of each pair to `loss`, and its derivative
-    /// with respect to the predicted value to `slope`. A loss is 0 if both values agree, never negative, and NaN if a
-    /// value is NaN.
-    pub at: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            predicted: *const f64,
-            measured: *const f64,
-            count: usize,
-            loss: *mut f64,
-            slope: *mut f64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// 1 if the loss is fitted to the scan: training then uses the result of `fitted`. NULL: it is not.
-    pub needs_scan: Option<unsafe extern "C" fn(stage: *const c_void) -> u32>,
-    /// Creates the loss for a scan with this noise and sets `fitted` to it; a loss that does not depend on the noise
-    /// leaves `fitted` unchanged. NULL if `needs_scan` is NULL.
-    pub fitted: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            noise: *const ConefieldNoise,
-            fitted: *mut *mut c_void,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// WGSL of `at`: a function `stage_at`; see docs/guide/writing-stages.md. NULL: CPU only.
-    pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
-}
-
 /// Blocks and weight of a prior.
 #[repr(C)]
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct ConefieldBlocks {
     /// Points along a block's edge, 2 to 32.
     pub edge: usize,
@@ -605,35 +385,9 @@ pub struct ConefieldBlocks {
     pub weight: f64,
 }
 
-/// Functions of a prior.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct ConefieldPrior {
-    /// Bytes of this table.
-    pub size: usize,
-    /// Its blocks; constant for a stage.
-    pub blocks: Option<unsafe extern "C" fn(stage: *const c_void, blocks: *mut ConefieldBlocks) -> ConefieldStatus>,
-    /// Writes the non-negative penalty of one block to `penalty`. `values` are those of its `count = edge³` points, z
-    /// fastest. Adds `scale` times the derivative with respect to each of them to `gradient`. The penalty is NaN if a
-    /// value is NaN.
-    pub block: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            values: *const f64,
-            count: usize,
-            scale: f64,
-            gradient: *mut f64,
-            penalty: *mut f64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// WGSL of `block`: a function `stage_at`; see docs/guide/writing-stages.md. NULL: CPU only.
-    pub wgsl: Option<unsafe extern "C" fn(stage: *const c_void, source: *mut ConefieldText) -> ConefieldStatus>,
-}
-
 /// A grid of voxels or of coefficients. Arrays on it are row-major, z fastest.
 #[repr(C)]
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct ConefieldGrid {
     /// Number of points along x, y and z.
     pub shape: [usize; 3],
@@ -655,137 +409,9 @@ pub struct ConefieldState {
     pub length: usize,
 }
 
-/// Functions of a regularizer: a convex penalty R of coefficients, for any grid. The result of `on` is a stage of its
-/// own, which `destroy` frees; it is the argument of `value`, `prox`, `adapt` and `state`.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct ConefieldRegularizer {
-    /// Bytes of this table.
-    pub size: usize,
-    /// Bytes held by the penalty on `grid`. NULL: negligible.
-    pub bytes: Option<unsafe extern "C" fn(stage: *const c_void, grid: *const ConefieldGrid) -> u64>,
-    /// Creates the penalty on `grid`.
-    pub on: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            grid: *const ConefieldGrid,
-            penalty: *mut *mut c_void,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// The weight λ, 0 or more, for attenuation in 1/mm and lengths in mm. `noise(context, k)` returns k times the root
-    /// mean square of the scan's noise in the gradient of the data term; it takes a back-projection.
-    pub weight: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            grid: *const ConefieldGrid,
-            noise: Option<unsafe extern "C" fn(context: *mut c_void, k: f64) -> f64>,
-            context: *mut c_void,
-            weight: *mut f64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// R(x), 0 or more, of the `count` coefficients of the grid.
-    pub value: Option<
-        unsafe extern "C" fn(
-            penalty: *const c_void,
-            x: *const f32,
-            count: usize,
-            value: *mut f64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Overwrites `u` with the coefficients ≥ 0 that minimize `½‖u − v‖² + tau·R(u)`, or approaches them with each call
-    /// for the same `v`.
-    pub prox: Option<
-        unsafe extern "C" fn(
-            penalty: *mut c_void,
-            v: *const f32,
-            count: usize,
-            tau: f32,
-            u: *mut f32,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Entry `index` of the state from which the next `prox` starts, for checkpoints; [`CONEFIELD_UNSUPPORTED`] past
-    /// the last. NULL: no state.
-    pub state:
-        Option<unsafe extern "C" fn(penalty: *mut c_void, index: usize, state: *mut ConefieldState) -> ConefieldStatus>,
-    /// Adapts the penalty to the coefficients `x`, before each pass over the scan. The result depends on `x` only and
-    /// is not part of `state`. Writes the new R(x); returns [`CONEFIELD_UNSUPPORTED`] if the penalty does not change.
-    /// NULL: it never changes.
-    pub adapt: Option<
-        unsafe extern "C" fn(
-            penalty: *mut c_void,
-            x: *const f32,
-            count: usize,
-            value: *mut f64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-}
-
-/// Functions of a data term `Σ φ(r)` of residuals `r = measured − predicted`. The result of `of` is a stage of its own,
-/// which `destroy` frees; it is the argument of all functions except `bytes` and `of`. Each call is for one image:
-/// `count` pixels of view `view`, with its line integrals `measured`, row by row.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct ConefieldDataTerm {
-    /// Bytes of this table.
-    pub size: usize,
-    /// Bytes held for a scan of `shape` (views, rows, columns), and temporary bytes of `of`. NULL: negligible.
-    pub bytes: Option<unsafe extern "C" fn(stage: *const c_void, shape: *const usize, held: *mut u64, brief: *mut u64)>,
-    /// Creates the data term for the line integrals `measured`, which it does not keep.
-    pub of: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            measured: *const f32,
-            shape: *const usize,
-            misfit: *mut *mut c_void,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Standard deviation of the noise of line integrals near 0.
-    pub noise: Option<unsafe extern "C" fn(misfit: *const c_void) -> f64>,
-    /// Overwrites residuals with the derivatives φ'(r), and `sum` with the sum of all φ(r).
-    pub differentiate: Option<
-        unsafe extern "C" fn(
-            misfit: *const c_void,
-            view: usize,
-            measured: *const f32,
-            count: usize,
-            residuals: *mut f32,
-            sum: *mut f64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Multiplies each value by an upper bound of φ''.
-    pub curve: Option<
-        unsafe extern "C" fn(
-            misfit: *const c_void,
-            view: usize,
-            measured: *const f32,
-            count: usize,
-            values: *mut f32,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Multiplies each value by the standard deviation of φ' under noise, in units of `noise`.
-    pub spread: Option<
-        unsafe extern "C" fn(
-            misfit: *const c_void,
-            view: usize,
-            measured: *const f32,
-            count: usize,
-            values: *mut f32,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-}
-
 /// A basis on one grid of voxels.
 #[repr(C)]
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct ConefieldExpansion {
     /// Positions of the coefficients.
     pub coefficients: ConefieldGrid,
@@ -795,62 +421,6 @@ pub struct ConefieldExpansion {
     pub samples: u32,
     /// 1 if it also works in double precision.
     pub double_precision: u32,
-}
-
-/// Functions of a basis: a matrix B from coefficients to voxels. Its entries are non-negative, unless coefficients are
-/// samples. The result of `on` is a stage of its own, which `destroy` frees; it is the argument of all other functions.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct ConefieldBasis {
-    /// Bytes of this table.
-    pub size: usize,
-    /// Creates the basis for the voxels of a grid. The number of coefficients depends on the grid's shape only.
-    pub on: Option<
-        unsafe extern "C" fn(
-            stage: *const c_void,
-            voxels: *const ConefieldGrid,
-            expansion: *mut *mut c_void,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Its properties on this grid; constant.
-    pub info: Option<unsafe extern "C" fn(expansion: *const c_void, info: *mut ConefieldExpansion) -> ConefieldStatus>,
-    /// Overwrites `voxels` with `B·coefficients`.
-    pub expand: Option<
-        unsafe extern "C" fn(
-            expansion: *const c_void,
-            coefficients: *const f32,
-            voxels: *mut f32,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// Overwrites `coefficients` with `Bᵀ·voxels`, the exact adjoint.
-    pub adjoint: Option<
-        unsafe extern "C" fn(
-            expansion: *const c_void,
-            voxels: *const f32,
-            coefficients: *mut f32,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// `expand` in double precision, for checks. NULL: there is none.
-    pub expand_f64: Option<
-        unsafe extern "C" fn(
-            expansion: *const c_void,
-            coefficients: *const f64,
-            voxels: *mut f64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
-    /// `adjoint` in double precision. NULL if `expand_f64` is NULL.
-    pub adjoint_f64: Option<
-        unsafe extern "C" fn(
-            expansion: *const c_void,
-            voxels: *const f64,
-            coefficients: *mut f64,
-            error: *mut ConefieldText,
-        ) -> ConefieldStatus,
-    >,
 }
 
 /// A stage type of a plugin.
@@ -936,6 +506,9 @@ pub const ENTRY: &str = "conefield_plugin";
 
 /// The contract for C: the text of `conefield_plugin.h`.
 pub const HEADER: &str = include_str!("../include/conefield_plugin.h");
+
+/// What many stages in C need besides the contract: the text of `conefield_helpers.h`.
+pub const HELPERS: &str = include_str!("../include/conefield_helpers.h");
 
 impl ConefieldStr {
     /// `text`, which must outlive every use of this.

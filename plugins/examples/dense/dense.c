@@ -4,70 +4,32 @@
  * to its faces. Each parameter is affected by few rows, so gradients are scattered; a call adds only to the parameters in the
  * range that it gets.
  */
-#include "conefield_plugin.h"
-
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
-#define TEXT(literal) { (const uint8_t *)(literal), sizeof(literal) - 1 }
+#include "conefield_helpers.h"
 
 typedef struct {
     size_t resolution, features;
     size_t shape[4];
 } Grid;
 
-static void say(struct ConefieldText *out, const char *line) {
-    if (out == NULL) return;
-    out->length = strlen(line);
-    memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
-}
-
-/* The number under `key` of flat settings, which the host has checked and completed. */
-static double number(struct ConefieldStr settings, const char *key) {
-    char text[1024], quoted[64];
-    size_t n = settings.length < sizeof text - 1 ? settings.length : sizeof text - 1;
-    memcpy(text, settings.data, n);
-    text[n] = 0;
-    snprintf(quoted, sizeof quoted, "\"%s\":", key);
-    const char *at = strstr(text, quoted);
-    return at == NULL ? 0.0 : strtod(at + strlen(quoted), NULL);
-}
-
 static ConefieldStatus create(const void *context, struct ConefieldStr settings, size_t width, void **stage,
                               struct ConefieldText *error) {
-    (void)context;
-    (void)width;
     double resolution = number(settings, "resolution"), features = number(settings, "features");
     if (!(resolution >= 2 && resolution <= 512)) {
-        char line[80];
-        snprintf(line, sizeof line, "resolution: found %g, expected 2 to 512", resolution);
-        say(error, line);
+        say(error, "resolution: found %g, expected 2 to 512", resolution);
         return CONEFIELD_INVALID;
     }
     if (!(features >= 1 && features <= 32)) {
-        char line[80];
-        snprintf(line, sizeof line, "features: found %g, expected 1 to 32", features);
-        say(error, line);
+        say(error, "features: found %g, expected 1 to 32", features);
         return CONEFIELD_INVALID;
     }
-    Grid *g = malloc(sizeof *g);
-    if (g == NULL) return CONEFIELD_FAILED;
     size_t r = (size_t)resolution, f = (size_t)features;
-    *g = (Grid){r, f, {r, r, r, f}};
-    *stage = g;
-    return CONEFIELD_OK;
-}
-
-static void destroy(void *stage) {
-    free(stage);
+    Grid g = {r, f, {r, r, r, f}};
+    return hand_over(&g, sizeof g, stage, error);
 }
 
 static ConefieldStatus describe(const void *stage, struct ConefieldText *text) {
     const Grid *g = stage;
-    char line[80];
-    snprintf(line, sizeof line, "one grid of %zu nodes a side, %zu channels", g->resolution, g->features);
-    say(text, line);
+    say(text, "one grid of %zu nodes a side, %zu channels", g->resolution, g->features);
     return CONEFIELD_OK;
 }
 
@@ -96,7 +58,6 @@ static ConefieldStatus info(const void *stage, struct ConefieldInfo *out) {
 }
 
 static ConefieldStatus parameter(const void *stage, size_t index, struct ConefieldParameter *out) {
-    (void)index;
     *out = (struct ConefieldParameter){.name = TEXT("grid"), .shape = ((const Grid *)stage)->shape, .dimensions = 4};
     return CONEFIELD_OK;
 }
@@ -110,12 +71,7 @@ static ConefieldStatus partition(const void *stage, size_t index, struct Conefie
 }
 
 static ConefieldStatus init(const void *stage, uint64_t seed, float *params, size_t length, struct ConefieldText *error) {
-    (void)stage;
-    (void)error;
-    for (size_t i = 0; i < length; i++) {
-        seed = seed * 6364136223846793005u + 1442695040888963407u;
-        params[i] = 1e-2f * (2.0f * (float)(seed >> 40) / 16777216.0f - 1.0f);
-    }
+    for (size_t i = 0; i < length; i++) params[i] = 1e-2f * uniform(&seed);
     return CONEFIELD_OK;
 }
 
@@ -164,8 +120,6 @@ static void corners_of(const Grid *g, struct ConefieldTile x, size_t row, Corner
 
 static ConefieldStatus forward(const void *stage, const float *params, struct ConefieldTile x,
                                struct ConefieldTileMut y, struct ConefieldTileMut tape, struct ConefieldText *error) {
-    (void)tape;
-    (void)error;
     const Grid *g = stage;
     for (size_t row = 0; row < x.rows; row++) {
         Corner corners[8];
@@ -182,8 +136,6 @@ static ConefieldStatus forward(const void *stage, const float *params, struct Co
 static ConefieldStatus backward(const void *stage, const float *params, struct ConefieldTile x,
                                 struct ConefieldTileMut tape, struct ConefieldTile dy, struct ConefieldGrads grads,
                                 struct ConefieldTileMut dx, struct ConefieldText *error) {
-    (void)tape;
-    (void)error;
     const Grid *g = stage;
     size_t slice = params_of(g) / g->resolution;
     for (size_t row = 0; row < x.rows; row++) {
@@ -199,8 +151,7 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
             for (size_t c = 0; c < g->features; c++) {
                 float d = dy.data[c * dy.stride + row];
                 size_t at = corners[i].at + c;
-                if (at >= grads.start && at - grads.start < grads.length)
-                    grads.data[at - grads.start] += d * corners[i].weight;
+                add_gradient(grads, at, d * corners[i].weight);
                 for (size_t k = 0; k < 3; k++) slope[k] += d * params[at] * corners[i].slope[k];
             }
         }
@@ -232,7 +183,7 @@ static const struct ConefieldStage STAGES[] = {{
         "\"description\":\"Channels.\"}},"
         "\"examples\":[{\"resolution\":2,\"features\":1},{\"resolution\":7,\"features\":3}]}"),
     .create = create,
-    .destroy = destroy,
+    .destroy = free,
     .describe = describe,
     .map = &MAP,
 }};

@@ -69,7 +69,7 @@ unsafe impl Sync for Type {}
 
 /// Makes the functions of a stage, and their checks, from the list of the contract.
 macro_rules! tables {
-    ($($table:ident $field:ident [$($needed:ident)*]: $($kind:ident $code:ident),+;)*) => {
+    ($($table:ident $field:ident: $($kind:ident $code:ident),+;)*) => {
         /// The functions of a stage.
         #[derive(Clone, Copy)]
         #[allow(non_camel_case_types)]
@@ -96,7 +96,9 @@ macro_rules! tables {
                         let least = size_of::<$table>();
                         // SAFETY: see the top of this file.
                         let table = unsafe { sized(t.$field, place, &format!("{at}: functions"), least)? };
-                        $(ensure(table.$needed.is_some(), place, at, concat!("no function ", stringify!($needed)), "one")?;)*
+                        if let Some(missing) = table.missing() {
+                            return Err(Error::invalid(place, at, format!("no function {missing}"), "one"));
+                        }
                         kind.map(|(_, kind)| (kind, Self::$field(table)))
                     })*
                     _ => None,

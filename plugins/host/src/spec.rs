@@ -9,18 +9,8 @@ use crate::stage::prior::PriorStage;
 use crate::stage::projector::ProjectorStage;
 use crate::stage::regularizer::RegularizerStage;
 use crate::stage::{build, initializer};
-use conefield_core::arena::Weights;
-use conefield_core::basis::{Basis, BasisSpec};
-use conefield_core::data_term::{DataTerm, DataTermSpec};
-use conefield_core::error::{Error, Result};
-use conefield_core::loss::Loss;
-use conefield_core::prior::Prior;
+use conefield_core::prelude::*;
 use conefield_core::registry::{self, Kind, Make, NewType, Registered};
-use conefield_core::regularizer::{Regularizer, RegularizerSpec};
-use conefield_core::settings::{
-    EncoderSpec, FieldSpec, Initializer, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
-};
-use conefield_core::stage::{Encoder, Field, Normalizer, Projector};
 use serde_json::Value;
 use std::sync::Arc;
 

@@ -13,10 +13,8 @@ pub mod regularizer;
 
 use crate::library::{FunctionsOf, Handle, Text, Type, whole_text};
 use crate::trial;
-use conefield_core::error::{Error, Result};
-use conefield_core::geometry::VoxelGrid;
-use conefield_core::stage::UnitRay;
-use conefield_core::wgsl::{FOREIGN, Fragment};
+use conefield_core::prelude::*;
+use conefield_core::wgsl::FOREIGN;
 use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::ffi::c_void;
@@ -133,13 +131,9 @@ impl<F: FunctionsOf> Foreign<F> {
         }
     }
 
-    /// As [`Foreign::make`], for a call that always returns a stage.
-    fn must_make(
-        &self,
-        call: &str,
-        f: impl FnOnce(*mut c_void, *mut *mut c_void, *mut ConefieldText) -> ConefieldStatus,
-    ) -> Result<Handle> {
-        self.make(call, f)?.ok_or_else(|| Error::invalid(self.ty().words(), call, "nothing", "a new stage"))
+    /// The stage that `call` must have derived.
+    fn derived(&self, call: &str, made: Option<Handle>) -> Result<Self> {
+        Self::new(made.ok_or_else(|| Error::invalid(self.ty().words(), call, "nothing", "a new stage"))?)
     }
 }
 
@@ -155,6 +149,30 @@ macro_rules! call {
     };
 }
 use call;
+
+/// As [`call`], for a function without a buffer for the reason.
+macro_rules! ask {
+    ($own:expr, $function:ident($($argument:expr),*)) => {
+        match $own.functions.$function {
+            // SAFETY: the stage is alive; the rest is as for `call`.
+            Some(f) => $own.run(stringify!($function), |stage, _| unsafe { f(stage, $($argument),*) }),
+            None => Err($own.wrong(stringify!($function), "there is no such function")),
+        }
+    };
+}
+use ask;
+
+/// As [`call`], for a function that derives another stage; `None` if it is absent or derives none.
+macro_rules! make {
+    ($own:expr, $function:ident($($argument:expr),*)) => {
+        match $own.functions.$function {
+            // SAFETY: the stage is alive; the rest is as for `call`.
+            Some(f) => $own.make(stringify!($function), |stage, out, error| unsafe { f(stage, $($argument,)* out, error) }),
+            None => Ok(None),
+        }
+    };
+}
+use make;
 
 /// Methods of a stage's trait whose answers its `Foreign` holds.
 macro_rules! said {

@@ -4,14 +4,10 @@
 
 use crate::library::Type;
 use bytemuck::Pod;
-use conefield_core::basis::{BasisOperator, Expansion};
-use conefield_core::data_term::Misfit;
-use conefield_core::error::{Error, Result};
 use conefield_core::pages::Pages;
-use conefield_core::random::{mix, unit};
-use conefield_core::simd::Real;
-use conefield_core::stage::{GradKind, Grads, Stage, TILE_ROWS, Tile, TileMut, UnitRay};
-use ndarray::{Array3, ArrayView3, ArrayViewMut3};
+use conefield_core::prelude::*;
+use conefield_core::stage::TILE_ROWS;
+use ndarray::Array3;
 use std::ops::Range;
 use std::sync::mpsc;
 use std::thread;
@@ -133,84 +129,57 @@ fn settled(ty: &Type, complaint: Option<String>) -> Result<()> {
 
 /// Tries an encoder, normalizer or field of type `ty`.
 pub(crate) fn map(ty: &Type, stage: &dyn Stage) -> Result<()> {
-    settled(ty, try_map(stage)?)
-}
-
-/// The first complaint about a stage.
-fn try_map(stage: &dyn Stage) -> Result<Option<String>> {
     let info = stage.info();
     let mut params = Guarded::zeroed(info.params);
     if info.params <= MANY {
         stage.init(1, params.inner());
         stage.fault()?;
-        if let Some(c) = params.broken("parameters").or_else(|| params.unsound("initial parameters")) {
-            return Ok(Some(c));
-        }
+        settled(ty, params.broken("parameters").or_else(|| params.unsound("initial parameters")))?;
     }
-    try_kernel(stage, &mut params)
+    for rows in [1, 3, TILE_ROWS] {
+        tile(ty, stage, &mut params, rows)?;
+    }
+    Ok(())
 }
 
-/// The first complaint about the kernel of a stage.
-fn try_kernel(stage: &dyn Stage, params: &mut Guarded<f32>) -> Result<Option<String>> {
+/// Tries the kernel of a stage on a tile.
+fn tile(ty: &Type, stage: &dyn Stage, params: &mut Guarded<f32>, rows: usize) -> Result<()> {
     let (info, kernel) = (stage.info(), stage.kernel());
     let range: Range<usize> = match info.grads {
         GradKind::Scatter => stage.partition().into_iter().min_by_key(Range::len).unwrap_or(0..info.params),
         _ => 0..info.params,
     };
-    for rows in [1, 3, TILE_ROWS] {
-        let mut x = Guarded::new(info.input * rows);
-        for (i, x) in x.inner().iter_mut().enumerate() {
-            *x = unit(mix(7, i as u64));
-        }
-        let [mut y, mut tape, mut dx] = [info.output, info.tape, info.input].map(|c| Guarded::new(c * rows));
-        let mut grads = Guarded::zeroed(range.len());
-        kernel.forward(
-            params.inner(),
-            Tile::new(x.inner(), rows),
-            TileMut::new(y.inner(), rows),
-            TileMut::new(tape.inner(), rows),
-        );
-        stage.fault()?;
-        let mut complaint = y.broken("output").or_else(|| tape.broken("tape"));
-        complaint = complaint.or_else(|| y.unsound("output")).or_else(|| {
-            (info.identity && y.inner() != x.inner()).then(|| "an identity must return its input unchanged".into())
-        });
-        if complaint.is_some() {
-            return Ok(complaint);
-        }
-        if kernel.passes() > 1 {
-            let [mut again, mut left] = [info.output, info.tape].map(|c| Guarded::new(c * rows));
-            for pass in 0..kernel.passes() {
-                let (y, tape) = (TileMut::new(again.inner(), rows), TileMut::new(left.inner(), rows));
-                kernel.forward_pass(pass, params.inner(), Tile::new(x.inner(), rows), y, tape);
-            }
-            stage.fault()?;
-            let complaint = again.broken("output in passes").or_else(|| left.broken("tape in passes"));
-            let same = again.inner() == y.inner() && left.inner() == tape.inner();
-            let complaint = complaint.or_else(|| (!same).then(|| "its passes together are not its forward".into()));
-            if complaint.is_some() {
-                return Ok(complaint);
-            }
-        }
-        let dy = vec![1.0; info.output * rows];
-        kernel.backward(
-            params.inner(),
-            Tile::new(x.inner(), rows),
-            TileMut::new(tape.inner(), rows),
-            Tile::new(&dy, rows),
-            Grads { values: grads.inner(), range: range.clone() },
-            Some(TileMut::new(dx.inner(), rows)),
-        );
-        stage.fault()?;
-        let complaint = grads.broken("gradients").or_else(|| dx.broken("input gradient"));
-        let complaint = complaint.or_else(|| tape.broken("tape")).or_else(|| x.broken("input"));
-        let complaint = complaint.or_else(|| params.broken("parameters"));
-        let complaint = complaint.or_else(|| grads.unsound("gradients")).or_else(|| dx.unsound("input gradient"));
-        if complaint.is_some() {
-            return Ok(complaint);
-        }
+    let mut x = Guarded::new(info.input * rows);
+    for (i, x) in x.inner().iter_mut().enumerate() {
+        *x = unit(mix(7, i as u64));
     }
-    Ok(None)
+    let [mut y, mut tape, mut dx] = [info.output, info.tape, info.input].map(|c| Guarded::new(c * rows));
+    let (to, left) = (TileMut::new(y.inner(), rows), TileMut::new(tape.inner(), rows));
+    kernel.forward(params.inner(), Tile::new(x.inner(), rows), to, left);
+    stage.fault()?;
+    settled(ty, y.broken("output").or_else(|| tape.broken("tape")).or_else(|| y.unsound("output")))?;
+    let changed = info.identity && y.inner() != x.inner();
+    settled(ty, changed.then(|| "an identity must return its input unchanged".into()))?;
+    if kernel.passes() > 1 {
+        let [mut again, mut left] = [info.output, info.tape].map(|c| Guarded::new(c * rows));
+        for pass in 0..kernel.passes() {
+            let (y, tape) = (TileMut::new(again.inner(), rows), TileMut::new(left.inner(), rows));
+            kernel.forward_pass(pass, params.inner(), Tile::new(x.inner(), rows), y, tape);
+        }
+        stage.fault()?;
+        settled(ty, again.broken("output in passes").or_else(|| left.broken("tape in passes")))?;
+        let same = again.inner() == y.inner() && left.inner() == tape.inner();
+        settled(ty, (!same).then(|| "its passes together are not its forward".into()))?;
+    }
+    let dy = vec![1.0; info.output * rows];
+    let mut grads = Guarded::zeroed(range.len());
+    let (into, to) = (Grads { values: grads.inner(), range }, TileMut::new(dx.inner(), rows));
+    let (from, left) = (Tile::new(x.inner(), rows), TileMut::new(tape.inner(), rows));
+    kernel.backward(params.inner(), from, left, Tile::new(&dy, rows), into, Some(to));
+    stage.fault()?;
+    settled(ty, grads.broken("gradients").or_else(|| dx.broken("input gradient")))?;
+    settled(ty, tape.broken("tape").or_else(|| x.broken("input")).or_else(|| params.broken("parameters")))?;
+    settled(ty, grads.unsound("gradients").or_else(|| dx.unsound("input gradient")))
 }
 
 /// Rays along an axis, across the cube, in the opposite direction, and past the cube.
@@ -281,8 +250,8 @@ pub(crate) fn prior(ty: &Type, points: usize, block: impl Fn(&[f64], &mut [f64])
     let values: Vec<f64> = drawn(points).map(f64::from).collect();
     let mut gradient = Guarded::zeroed(points);
     let penalty = block(&values, gradient.inner())?;
-    let complaint = gradient.broken("gradient").or_else(|| below_zero("the penalty of a block", penalty));
-    settled(ty, complaint.or_else(|| gradient.unsound("gradient")))
+    settled(ty, gradient.broken("gradient").or_else(|| below_zero("the penalty of a block", penalty)))?;
+    settled(ty, gradient.unsound("gradient"))
 }
 
 /// Tries a regularizer of type `ty` on `count` coefficients: `prox` applies its proximal map and returns the penalty.
@@ -295,10 +264,10 @@ pub(crate) fn regularizer(
     for _ in 0..2 {
         let mut u = Guarded::<f32>::new(count);
         let value = prox(v.inner(), u.inner().as_mut_ptr())?;
-        let complaint = u.complaint("coefficients").or_else(|| v.broken("input"));
-        let complaint = complaint.or_else(|| below_zero("the penalty", value));
+        settled(ty, u.complaint("coefficients").or_else(|| v.broken("input")))?;
+        settled(ty, below_zero("the penalty", value))?;
         let negative = u.inner().iter().find(|u| **u < 0.0).map(|u| format!("its proximal map gives {u}"));
-        settled(ty, complaint.or(negative))?;
+        settled(ty, negative)?;
     }
     Ok(())
 }
@@ -317,9 +286,8 @@ pub(crate) fn data_term<M: Misfit>(ty: &Type, of: impl Fn(ArrayView3<'_, f32>) -
         misfit.curve(view, &measured, curve.inner());
         misfit.spread(view, &measured, spread.inner());
         misfit.fault()?;
-        let complaint = residuals.complaint("derivatives").or_else(|| curve.complaint("curvatures"));
-        let complaint = complaint.or_else(|| spread.complaint("spread of noise"));
-        settled(ty, complaint.or_else(|| below_zero("the misfit", sum)))?;
+        settled(ty, residuals.complaint("derivatives").or_else(|| curve.complaint("curvatures")))?;
+        settled(ty, spread.complaint("spread of noise").or_else(|| below_zero("the misfit", sum)))?;
     }
     Ok(())
 }

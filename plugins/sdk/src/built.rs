@@ -1,19 +1,9 @@
 //! The stage behind the pointer that the host holds.
 
-use conefield_core::arena::Weights;
-use conefield_core::basis::{Basis, BasisSpec, Expansion};
-use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
-use conefield_core::error::{Error, Result};
-use conefield_core::loss::Loss;
-use conefield_core::prior::Prior;
+use conefield_core::prelude::*;
 use conefield_core::registry::read;
 use conefield_core::registry::{Kind, StageType};
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec};
-use conefield_core::settings::{
-    EncoderSpec, FieldSpec, Initializer, InitializerSpec, KnownVolume, LossSpec, NormalizerSpec, PriorSpec,
-    ProjectorSpec,
-};
-use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
+use conefield_core::settings::KnownVolume;
 use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::cell::RefCell;

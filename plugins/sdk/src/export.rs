@@ -76,7 +76,7 @@ fn stage(t: &'static StageType) -> Option<ConefieldStage> {
         basis: ptr::null(),
     };
     macro_rules! filled {
-        ($($table:ident $field:ident [$($needed:ident)*]: $($kind:ident $code:ident),+;)*) => {
+        ($($table:ident $field:ident: $($kind:ident $code:ident),+;)*) => {
             match t.kind {
                 $($(Kind::$kind => (stage.kind, stage.$field) = ($code, &shims::$field::TABLE),)+)*
                 _ => return None,

@@ -14,18 +14,28 @@ use serde_json::Value;
 use std::fmt::Debug;
 
 /// Settings of a callback.
-pub trait CallbackSpec: Registered + Debug + Send + Sync {
+pub trait CallbackSpec: Copied + Registered + Debug + Send + Sync {
     /// The callback, or why the settings are invalid.
     fn build(&self) -> Result<Box<dyn Callback>>;
+}
+
+/// Settings of a callback that can be copied.
+pub trait Copied {
     /// A copy of the settings.
-    fn copy(&self) -> Box<dyn CallbackSpec>;
+    fn copied(&self) -> Box<dyn CallbackSpec>;
+}
+
+impl<T: CallbackSpec + Clone + 'static> Copied for T {
+    fn copied(&self) -> Box<dyn CallbackSpec> {
+        Box::new(self.clone())
+    }
 }
 
 conefield_core::settings_of!(Callback, CallbackSpec);
 
 impl Clone for Box<dyn CallbackSpec> {
     fn clone(&self) -> Self {
-        self.copy()
+        (**self).copied()
     }
 }
 

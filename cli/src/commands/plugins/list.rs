@@ -4,9 +4,9 @@ use crate::out;
 use clap::Args;
 use conefield::plugins;
 use conefield_core::Result;
+use conefield_plugins::Found;
 use conefield_plugins::search::{PATH_VARIABLE, user_folder};
-use conefield_plugins::{Found, Place};
-use serde::Serialize;
+use serde_json::{Value, json};
 
 /// List the plugins with their stages, or why one was refused.
 #[derive(Args)]
@@ -16,79 +16,49 @@ pub struct List {
     json: bool,
 }
 
-#[derive(Serialize)]
-struct ListedFile {
-    path: String,
-    place: Place,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    plugin: Option<ListedPlugin>,
-    /// The reason for refusing it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    refused: Option<String>,
-}
-
-#[derive(Serialize)]
-struct ListedPlugin {
-    name: String,
-    version: String,
-    licence: String,
-    abi: String,
-    stages: Vec<ListedStage>,
-}
-
-#[derive(Serialize)]
-struct ListedStage {
-    kind: String,
-    #[serde(rename = "type")]
-    name: String,
-    doc: String,
-}
-
-impl ListedFile {
-    fn of(found: &Found) -> Self {
-        let plugin = found.library.as_ref().ok().map(|l| ListedPlugin {
-            name: l.name.clone(),
-            version: l.version.clone(),
-            licence: l.licence.clone(),
-            abi: format!("{}.{}", l.abi.0, l.abi.1),
-            stages: l
-                .types
-                .iter()
-                .map(|t| ListedStage { kind: t.kind.to_string(), name: t.name.clone(), doc: t.doc.clone() })
-                .collect(),
-        });
-        Self {
-            path: found.path.display().to_string(),
-            place: found.place,
-            plugin,
-            refused: found.library.as_ref().err().map(ToString::to_string),
+/// A plugin, or the reason for refusing it.
+fn object(Found { path, place, library }: &Found) -> Value {
+    let path = path.display().to_string();
+    match library {
+        Ok(l) => {
+            let stage = |kind: String, name: &str, doc: &str| json!({ "kind": kind, "type": name, "doc": doc });
+            let stages: Vec<Value> = l.types.iter().map(|t| stage(t.kind.to_string(), &t.name, &t.doc)).collect();
+            let abi = format!("{}.{}", l.abi.0, l.abi.1);
+            let plugin =
+                json!({ "name": l.name, "version": l.version, "licence": l.licence, "abi": abi, "stages": stages });
+            json!({ "path": path, "place": place, "plugin": plugin })
         }
+        Err(e) => json!({ "path": path, "place": place, "refused": e.to_string() }),
     }
+}
 
-    fn lines(&self) -> Vec<String> {
-        let place = format!("{} ({})", self.path, self.place.words());
-        let mut lines = vec![];
-        if let Some(p) = &self.plugin {
-            lines.push(format!("{} {}, {}, ABI {}: {place}", p.name, p.version, p.licence, p.abi));
+/// The same for people.
+fn lines(Found { path, place, library }: &Found) -> String {
+    let place = format!("{} ({})", path.display(), place.words());
+    match library {
+        Ok(l) => {
             let rows: Vec<Vec<String>> =
-                p.stages.iter().map(|s| vec![format!("  {}", s.kind), s.name.clone(), s.doc.clone()]).collect();
-            lines.push(out::table(&rows, &[]));
+                l.types.iter().map(|t| vec![format!("  {}", t.kind), t.name.clone(), t.doc.clone()]).collect();
+            let (major, minor) = l.abi;
+            let about = format!("{} {}, {}, ABI {major}.{minor}: {place}", l.name, l.version, l.licence);
+            format!("{about}\n{}", out::table(&rows, &[]))
         }
-        lines.extend(self.refused.iter().map(|e| format!("refused: {place}\n  {e}")));
-        lines
+        Err(e) => format!("refused: {place}\n  {e}"),
     }
 }
 
 impl List {
     pub fn run(self) -> Result<()> {
-        let rows: Vec<ListedFile> = plugins::with(|p| p.found.iter().map(ListedFile::of).collect());
-        if self.json {
-            return out::json(&serde_json::json!({ "plugins": rows }));
-        }
-        if rows.is_empty() {
-            let folder = user_folder().map_or("no folder of this user".into(), |f| f.display().to_string());
-            return out::say(&format!("no plugins: none by --plugin or {PATH_VARIABLE}, none in {folder}"));
-        }
-        out::say(&rows.iter().flat_map(ListedFile::lines).collect::<Vec<_>>().join("\n"))
+        plugins::with(|plugins| {
+            let found = &plugins.found;
+            if self.json {
+                return out::json(&json!({ "plugins": found.iter().map(object).collect::<Vec<_>>() }));
+            }
+            if found.is_empty() {
+                let folder = user_folder().map_or("no folder of this user".into(), |f| f.display().to_string());
+                return out::say(&format!("no plugins: none by --plugin or {PATH_VARIABLE}, none in {folder}"));
+            }
+            out::say(&found.iter().map(lines).collect::<Vec<_>>().join("\n"))
+        })
     }
 }

@@ -58,7 +58,22 @@ struct Start {
     build: &'static str,
 }
 
-/// Kinds of stages and their templates: the stage in C, without the common start and end, and in Rust.
+/// Makes a function from the list of the contract.
+macro_rules! tables {
+    ($($table:ident $field:ident: $($kind:ident $code:ident),+;)*) => {
+        /// Where a stage of this kind has its functions in C, and the kind's code.
+        fn tables(kind: Kind) -> (&'static str, &'static str) {
+            match kind {
+                $($(Kind::$kind => (stringify!($field), stringify!($code)),)+)*
+                other => unreachable!("a {other} cannot come from a plugin"),
+            }
+        }
+    };
+}
+
+conefield_plugin_abi::kinds! { tables }
+
+/// Kinds of stages and their templates: the stage in C, without its tables, and in Rust.
 macro_rules! kinds {
     ($($kind:ident $file:literal,)*) => {
         #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -158,11 +173,13 @@ impl New {
     }
 
     fn c(&self) -> Start {
-        let [head, plugin] = [template!("c/head.c"), template!("c/plugin.c")].map(str::trim_end);
-        let named = |text: &str| text.replace("@head@", head).replace("@plugin@", plugin).replace("@name@", &self.name);
+        let (table, code) = tables(self.kind.kind());
+        let plugin = template!("c/plugin.c").trim_end().replace("@kind@", code).replace("@table@", table);
+        let named = |text: &str| text.replace("@plugin@", &plugin).replace("@name@", &self.name);
         let files = vec![
             (format!("{}.c", self.name), named(self.kind.template(Language::C))),
             ("conefield_plugin.h".into(), conefield_plugin_abi::HEADER.into()),
+            ("conefield_helpers.h".into(), conefield_plugin_abi::HELPERS.into()),
             ("Makefile".into(), named(template!("c/Makefile"))),
             ("spec.toml".into(), self.spec()),
         ];

@@ -2,17 +2,11 @@
 //! activation functions", 2020): `h₁ = sin(ω·(W₁x + b₁))`, `hₖ = sin(ω·(Wₖhₖ₋₁ + bₖ))`, and `μ = softplus(w·h + b)`,
 //! which is never negative.
 
-use conefield_plugin::error::{Result, ensure};
-use conefield_plugin::random::{mix, unit};
-use conefield_plugin::settings::FieldSpec;
-use conefield_plugin::simd::Real;
-use conefield_plugin::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
-use conefield_plugin::wgsl::{Fragment, Sum, declare};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_plugin::prelude::*;
+use conefield_plugin::wgsl::{Sum, declare};
 use std::fmt::Write;
 
-conefield_plugin::stage_type!(FieldSpec, "siren", Siren, "multi-layer perceptron of sines");
+stage_type!(FieldSpec, "siren", Siren, "multi-layer perceptron of sines");
 
 /// Settings of `siren`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -172,10 +166,9 @@ impl Stage for SirenField {
             output: 1,
             params: self.params(),
             tape: 2 * self.settings.depth * self.settings.width + 1,
-            scope: Scope::Row,
             grads: GradKind::Dense,
             macs: self.layers.iter().map(|l| l.input * l.output).sum(),
-            identity: false,
+            ..Info::default()
         }
     }
 

@@ -1,16 +1,9 @@
 //! Smooths features along each ray: `yᵢ = (1 − s)·xᵢ + s·(xᵢ₋₁ + xᵢ₊₁)/2`, with the ends repeated. A point off any ray
 //! is a ray of one sample and does not change.
 
-use conefield_plugin::error::{Result, ensure};
-use conefield_plugin::settings::NormalizerSpec;
-use conefield_plugin::simd::Real;
-use conefield_plugin::stage::{
-    GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_plugin::prelude::*;
 
-conefield_plugin::stage_type!(NormalizerSpec, "ray-smooth", RaySmooth, "features smoothed along each ray");
+stage_type!(NormalizerSpec, "ray-smooth", RaySmooth, "features smoothed along each ray");
 
 /// Settings of `ray-smooth`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -81,12 +74,10 @@ impl Stage for RaySmoothStage {
         Info {
             input: self.width,
             output: self.width,
-            params: 0,
-            tape: 0,
             scope: Scope::Ray,
-            grads: GradKind::None,
             macs: 3 * self.width,
             identity: self.strength == 0.0,
+            ..Info::default()
         }
     }
 

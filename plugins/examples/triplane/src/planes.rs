@@ -3,18 +3,10 @@
 //! two coordinates, and L a line, interpolated linearly at the third. `R²·F + R·F` numbers per orientation instead of
 //! `R³·F`.
 
-use conefield_plugin::error::{Result, ensure};
-use conefield_plugin::random::{mix, unit};
-use conefield_plugin::settings::EncoderSpec;
-use conefield_plugin::simd::Real;
-use conefield_plugin::stage::{
-    Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_plugin::prelude::*;
 use std::ops::Range;
 
-conefield_plugin::stage_type!(EncoderSpec, "triplane", Triplane, "products of planes and lines");
+stage_type!(EncoderSpec, "triplane", Triplane, "products of planes and lines");
 
 /// Settings of `triplane`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -259,11 +251,9 @@ impl Stage for TriplaneStage {
             input: 3,
             output: self.outputs,
             params: self.params(),
-            tape: 0,
-            scope: Scope::Row,
             grads: GradKind::Scatter,
             macs: 7 * self.outputs,
-            identity: false,
+            ..Info::default()
         }
     }
 

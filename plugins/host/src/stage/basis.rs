@@ -2,15 +2,12 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, SMALL, call, raw_grid, said};
+use super::{Foreign, SMALL, ask, call, make, raw_grid, said};
 use crate::library::Handle;
 use crate::trial;
-use conefield_core::basis::{Basis, BasisOperator, Expansion};
-use conefield_core::error::Result;
-use conefield_core::geometry::VoxelGrid;
-use conefield_core::simd::Real;
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
-use ndarray::{Array3, ArrayView3, ArrayViewMut3};
+use ndarray::Array3;
 
 /// Maximum number of coefficients per voxel.
 const MOST: usize = 64;
@@ -28,15 +25,9 @@ impl BasisStage {
 
     /// The basis of one grid.
     fn made_on(&self, grid: &VoxelGrid) -> Result<ExpansionOn> {
-        let on = self.0.functions.on;
-        let handle = self.0.must_make("on", |stage, out, error| {
-            // SAFETY: the stage is alive; all arguments live during the call.
-            on.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &raw_grid(grid), out, error) })
-        })?;
-        let own = Foreign::<ConefieldBasis>::new(handle)?;
-        let mut info = ConefieldExpansion { coefficients: raw_grid(grid), scratch: 0, samples: 0, double_precision: 0 };
-        // SAFETY: the stage is alive, `info` is writable.
-        own.run("info", |stage, _| own.functions.info.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &mut info) }))?;
+        let own = self.0.derived("on", make!(self.0, on(&raw_grid(grid)))?)?;
+        let mut info = ConefieldExpansion::default();
+        ask!(own, info(&mut info))?;
         let ConefieldGrid { shape, spacing, center } = info.coefficients;
         let coefficients = VoxelGrid { shape, spacing, center };
         coefficients.validate("coefficients").map_err(|e| own.wrong("info", &e.to_string()))?;

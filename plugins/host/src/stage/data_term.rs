@@ -2,14 +2,12 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call, said};
+use super::{Foreign, call, make, said};
 use crate::library::Handle;
 use crate::trial;
-use conefield_core::data_term::{DataTerm, Misfit};
-use conefield_core::error::Result;
+use conefield_core::prelude::*;
 use conefield_core::scan::ScanHeader;
 use conefield_plugin_abi::*;
-use ndarray::ArrayView3;
 
 /// A data term from a library.
 pub struct DataTermStage(Foreign<ConefieldDataTerm>);
@@ -26,12 +24,7 @@ impl DataTermStage {
     fn made_of(&self, measured: ArrayView3<'_, f32>) -> Result<MisfitOn> {
         let shape: [usize; 3] = measured.dim().into();
         let measured = measured.as_standard_layout();
-        let of = self.0.functions.of;
-        let handle = self.0.must_make("of", |stage, out, error| {
-            // SAFETY: the stage is alive; all arguments live during the call and have that shape.
-            of.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, measured.as_ptr(), shape.as_ptr(), out, error) })
-        })?;
-        Ok(MisfitOn(Foreign::new(handle)?))
+        Ok(MisfitOn(self.0.derived("of", make!(self.0, of(measured.as_ptr(), shape.as_ptr()))?)?))
     }
 
     /// Memory held for a scan, and temporary memory, in bytes.

@@ -2,12 +2,12 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call, said};
+use super::{Foreign, call, make, said};
 use crate::library::{self, Handle, Type};
 use crate::trial::{UNTOUCHED, timed};
-use conefield_core::arena::{Arena, Block, InitReport, Layout, Weights};
-use conefield_core::error::Result;
-use conefield_core::settings::{Initializer, KnownVolume};
+use conefield_core::arena::Block;
+use conefield_core::prelude::*;
+use conefield_core::settings::KnownVolume;
 use conefield_plugin_abi::*;
 use serde_json::Value;
 use std::ptr;
@@ -37,7 +37,7 @@ pub(crate) fn build(
     let read = path.map(|p| weights(&p)).transpose()?;
     timed(ty, move || {
         let own = match read {
-            Some(weights) => Foreign::new(with_weights(&own, &weights)?)?,
+            Some(weights) => with_weights(&own, &weights)?,
             None => own,
         };
         let mut steps = 0;
@@ -65,7 +65,7 @@ fn named(
 }
 
 /// The stage with these weights.
-fn with_weights(own: &Foreign<ConefieldInitializer>, weights: &Weights) -> Result<Handle> {
+fn with_weights(own: &Foreign<ConefieldInitializer>, weights: &Weights) -> Result<Foreign<ConefieldInitializer>> {
     let tensor = |(name, (shape, values)): (&String, &(Vec<usize>, Vec<f32>))| ConefieldTensor {
         name: ConefieldStr::of(name),
         shape: shape.as_ptr(),
@@ -74,12 +74,7 @@ fn with_weights(own: &Foreign<ConefieldInitializer>, weights: &Weights) -> Resul
         length: values.len(),
     };
     let tensors: Vec<ConefieldTensor> = weights.tensors.iter().map(tensor).collect();
-    own.must_make("with_weights", |stage, out, error| {
-        own.functions.with_weights.map_or(CONEFIELD_FAILED, |f| {
-            // SAFETY: the stage is alive; all arguments live during the call and have the accompanying lengths.
-            unsafe { f(stage, tensors.as_ptr(), tensors.len(), out, error) }
-        })
-    })
+    own.derived("with_weights", make!(own, with_weights(tensors.as_ptr(), tensors.len()))?)
 }
 
 /// Blocks in the format of the ABI.

@@ -2,11 +2,10 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call, said};
+use super::{Foreign, call, make, said};
 use crate::library::Handle;
 use crate::trial;
-use conefield_core::error::Result;
-use conefield_core::loss::{Loss, NoiseModel};
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 
 /// A loss from a library.
@@ -38,12 +37,12 @@ impl LossStage {
 
     /// [`Loss::fitted`] with its error.
     fn try_fitted(&self, noise: &NoiseModel<'_>) -> Result<Option<Box<dyn Loss>>> {
-        let Some(fitted) = self.own.functions.fitted.filter(|_| self.needs_scan) else { return Ok(None) };
+        if !self.needs_scan {
+            return Ok(None);
+        }
         let NoiseModel { sigma, growth, measured } = *noise;
         let noise = ConefieldNoise { sigma, growth, measured: measured.as_ptr(), count: measured.len() };
-        // SAFETY: the stage is alive; all arguments live during the call.
-        let made = self.own.make("fitted", |stage, out, error| unsafe { fitted(stage, &noise, out, error) })?;
-        let Some(handle) = made else { return Ok(None) };
+        let Some(handle) = make!(self.own, fitted(&noise))? else { return Ok(None) };
         Ok(Some(Box::new(trial::timed(self.own.ty(), move || Self::tried(handle))?)))
     }
 }

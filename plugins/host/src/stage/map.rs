@@ -2,14 +2,11 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call, said};
+use super::{Foreign, ask, call, said};
 use crate::library::Handle;
 use crate::trial::{self, GUARD, UNTOUCHED_64};
-use conefield_core::error::{Error, Result, ensure};
+use conefield_core::prelude::*;
 use conefield_core::registry::Kind;
-use conefield_core::stage::{
-    Encoder, Field, GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
 use conefield_plugin_abi::*;
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -36,16 +33,16 @@ pub struct MapStage {
 impl MapStage {
     /// The stage of `handle` for `width` channels, after a trial.
     pub(crate) fn tried(handle: Handle, width: usize) -> Result<Self> {
-        let stage = Self::new(handle)?;
+        let stage = Self::of(Foreign::new(handle)?)?;
         let found = format!("{width} channels for a stage that takes {}", stage.info.input);
         ensure(stage.info.input == width, "spec", "", found, "as many as it was made for")?;
         trial::map(stage.own.ty(), &stage)?;
         Ok(stage)
     }
 
-    fn new(handle: Handle) -> Result<Self> {
-        let own = Foreign::<ConefieldMap>::new(handle)?;
-        let said = said(&own)?;
+    fn of(own: Foreign<ConefieldMap>) -> Result<Self> {
+        let mut said = ConefieldInfo::default();
+        ask!(own, info(&mut said))?;
         let info = sound(&said).map_err(|what| own.wrong("info", &what))?;
         able(&own, &said).map_err(|what| own.wrong("info", what))?;
         let parameters = parameters(&own, &said)?;
@@ -62,14 +59,14 @@ impl MapStage {
         };
         let (params, channels) = (ptr::null(), ptr::null());
         let mut r = ConefieldReduced { stage: ptr::null_mut(), params, params_count: 0, channels, channels_count: 0 };
-        let handle = self.own.must_make("reduce", |stage, out, error| {
+        let made = self.own.make("reduce", |stage, out, error| {
             // SAFETY: the stage is alive; all arguments live during the call.
             let status = unsafe { reduce(stage, side, keep.as_ptr(), keep.len(), &mut r, error) };
             // SAFETY: `out` is writable.
             unsafe { *out = r.stage };
             status
         })?;
-        let smaller = Self::new(handle)?;
+        let smaller = Self::of(self.own.derived("reduce", made)?)?;
         if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
             return Err(self.own.wrong("reduce", "it keeps more than there is"));
         }
@@ -97,27 +94,6 @@ impl MapStage {
 unsafe fn many<'a, T>(data: *const T, n: usize) -> &'a [T] {
     // SAFETY: the caller guarantees that this many items are valid.
     if n == 0 || data.is_null() { &[] } else { unsafe { slice::from_raw_parts(data, n) } }
-}
-
-/// Properties of a stage as reported by the library.
-fn said(own: &Foreign<ConefieldMap>) -> Result<ConefieldInfo> {
-    let mut i = ConefieldInfo {
-        input: 0,
-        output: 0,
-        params: 0,
-        blocks: 0,
-        partitions: 0,
-        tape: 0,
-        macs: 0,
-        scope: 0,
-        grads: 0,
-        identity: 0,
-        coarse_to_fine: 0,
-        double_precision: 0,
-    };
-    // SAFETY: the stage is alive, `i` is writable.
-    own.run("info", |stage, _| own.functions.info.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &mut i) }))?;
-    Ok(i)
 }
 
 /// The reported properties, if they make sense.
@@ -219,7 +195,7 @@ fn partition(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Range
     let mut all = vec![];
     let mut end = 0;
     for index in 0..i.partitions {
-        let mut r = ConefieldRange { start: 0, end: 0 };
+        let mut r = ConefieldRange::default();
         // SAFETY: the stage is alive, `r` is writable.
         let status = unsafe { f(own.handle.stage, index, &mut r) };
         if status != CONEFIELD_OK || r.start != end || r.end < r.start || r.end > i.params {

@@ -2,11 +2,10 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call, said};
+use super::{Foreign, ask, call, said};
 use crate::library::Handle;
 use crate::trial;
-use conefield_core::error::Result;
-use conefield_core::prior::{Blocks, Prior};
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 
 /// A prior from a library.
@@ -19,9 +18,8 @@ impl PriorStage {
     /// The prior of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let own = Foreign::<ConefieldPrior>::new(handle)?;
-        let mut b = ConefieldBlocks { edge: 0, count: 0, spacing: 0.0, weight: 0.0 };
-        // SAFETY: the stage is alive, `b` is writable.
-        own.run("blocks", |stage, _| own.functions.blocks.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &mut b) }))?;
+        let mut b = ConefieldBlocks::default();
+        ask!(own, blocks(&mut b))?;
         let blocks = Blocks { edge: b.edge, count: b.count, spacing: b.spacing, weight: b.weight };
         blocks.validate().map_err(|e| own.wrong("blocks", &e.to_string()))?;
         let stage = Self { own, blocks };

@@ -2,11 +2,11 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call, raw_ray, said};
+use super::{Foreign, call, make, raw_ray, said};
 use crate::library::Handle;
 use crate::trial;
-use conefield_core::error::Result;
-use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
+use conefield_core::prelude::*;
+use conefield_core::stage::Lengths;
 use conefield_plugin_abi::*;
 use std::ptr;
 
@@ -109,12 +109,9 @@ impl Projector for ProjectorStage {
     }
 
     fn fitted(&self, lengths: Lengths) -> Result<Option<Box<dyn Projector>>> {
-        let Some(fitted) = self.0.functions.fitted else { return Ok(None) };
         let Lengths { voxel_mm, cell_mm } = lengths;
         let lengths = ConefieldLengths { voxel_mm, cell_mm: cell_mm.unwrap_or(0.0) };
-        // SAFETY: the stage is alive; all arguments live during the call.
-        let made = self.0.make("fitted", |stage, out, error| unsafe { fitted(stage, &lengths, out, error) })?;
-        let Some(handle) = made else { return Ok(None) };
+        let Some(handle) = make!(self.0, fitted(&lengths))? else { return Ok(None) };
         Ok(Some(Box::new(trial::timed(self.0.ty(), move || Self::tried(handle))?)))
     }
 

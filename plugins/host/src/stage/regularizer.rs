@@ -2,16 +2,11 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, SMALL, call, raw_grid, said};
+use super::{Foreign, SMALL, call, make, raw_grid, said};
 use crate::library::{Handle, text};
 use crate::trial;
-use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::VoxelGrid;
-use conefield_core::place::StatePart;
-use conefield_core::regularizer::{Penalty, Regularizer};
-use conefield_core::space::Space;
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
-use ndarray::ArrayView3;
 use std::collections::BTreeSet;
 use std::ffi::c_void;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -38,13 +33,8 @@ impl RegularizerStage {
 
     /// The penalty on a grid.
     fn made_on(&self, grid: &VoxelGrid) -> Result<PenaltyOn> {
-        let on = self.0.functions.on;
-        let handle = self.0.must_make("on", |stage, out, error| {
-            // SAFETY: the stage is alive; all arguments live during the call.
-            on.map_or(CONEFIELD_FAILED, |f| unsafe { f(stage, &raw_grid(grid), out, error) })
-        })?;
-        let count = grid.shape.iter().product();
-        let mut made = PenaltyOn { own: Foreign::new(handle)?, count, state: vec![] };
+        let own = self.0.derived("on", make!(self.0, on(&raw_grid(grid)))?)?;
+        let mut made = PenaltyOn { own, count: grid.shape.iter().product(), state: vec![] };
         made.state = made.read_state()?;
         Ok(made)
     }

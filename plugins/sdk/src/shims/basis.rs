@@ -2,10 +2,7 @@
 
 use super::{array, array_mut, grid, guard, hand_over_on, shims, table};
 use crate::built::Built;
-use conefield_core::basis::{BasisOperator, Expansion};
-use conefield_core::error::{Error, Result};
-use conefield_core::geometry::VoxelGrid;
-use conefield_core::simd::Real;
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
 

@@ -2,8 +2,8 @@
 
 use super::{guard, hand_over, many, many_mut, shims, table, text};
 use crate::built::AnyStage;
-use conefield_core::arena::{Arena, Block, Layout, Weights};
-use conefield_core::error::{Error, Result};
+use conefield_core::arena::Block;
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
 
@@ -42,7 +42,7 @@ shims! {
     fn weights(built: any, path: *mut ConefieldStr) {
         match &built.stage {
             // The stage owns the text.
-            AnyStage::Waiting(w) => *path = ConefieldStr { data: w.path.as_ptr(), length: w.path.len() },
+            AnyStage::Waiting(w) => *path = ConefieldStr::of(&w.path),
             _ => return Err(Error::unsupported("this stage", "it names no weights file")),
         }
     }
@@ -61,6 +61,6 @@ shims! {
 
     fn volume(built: any, path: *mut ConefieldStr, steps: *mut u64) {
         let known = built.volume.as_ref().ok_or_else(|| Error::unsupported("this stage", "it names no volume"))?;
-        (*path, *steps) = (ConefieldStr { data: known.path.as_ptr(), length: known.path.len() }, known.steps);
+        (*path, *steps) = (ConefieldStr::of(&known.path), known.steps);
     }
 }

@@ -2,9 +2,7 @@
 
 use super::{guard, many, many_mut, shims, table, wgsl};
 use crate::built::MapInfo;
-use conefield_core::error::{Error, Result, ensure};
-use conefield_core::simd::Real;
-use conefield_core::stage::{Grads, Kernel, Stage, Tile, TileMut};
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::borrow::Cow;
 use std::ffi::c_void;
@@ -19,7 +17,7 @@ shims! {
 
     fn parameter(map: map, index: usize, out: *mut ConefieldParameter) {
         let p = map.1.blocks.get(index).ok_or_else(|| Error::unsupported("parameters", "the index is too large"))?;
-        let name = ConefieldStr { data: p.name.as_ptr(), length: p.name.len() };
+        let name = ConefieldStr::of(&p.name);
         *out = ConefieldParameter { name, shape: p.shape.as_ptr(), dimensions: p.shape.len() };
     }
 
@@ -162,51 +160,41 @@ unsafe fn run_backward<R: Real>(
     stage.fault()
 }
 
-unsafe fn grads<'a>(g: ConefieldGrads) -> Grads<'a, f32> {
-    // SAFETY: see `shims/mod.rs`.
-    Grads { values: unsafe { many_mut(g.data, g.length) }, range: g.start..g.start + g.length }
+/// The kernel of a stage.
+fn single(stage: &dyn Stage) -> Result<&dyn Kernel<f32>> {
+    Ok(stage.kernel())
 }
 
-unsafe fn grads64<'a>(g: ConefieldGrads64) -> Grads<'a, f64> {
-    // SAFETY: see `shims/mod.rs`.
-    Grads { values: unsafe { many_mut(g.data, g.length) }, range: g.start..g.start + g.length }
+/// The same in double precision.
+fn double(stage: &dyn Stage) -> Result<&dyn Kernel<f64>> {
+    stage.reference().ok_or_else(|| Error::unsupported("this stage", "it has no kernel in double precision"))
 }
 
-/// Unwraps an optional part of a stage.
-fn have<T>(part: Option<T>, what: &str) -> Result<T> {
-    part.ok_or_else(|| Error::unsupported("this stage", format!("it has no {what}")))
+/// `forward` and `backward` in one precision.
+macro_rules! kernel {
+    ($real:ty, $tile:ident $tile_mut:ident $grads:ident, $forward:ident $backward:ident, $kernel:expr) => {
+        shims! {
+            fn $forward(map: map, params: *const $real, x: $tile, y: $tile_mut, tape: $tile_mut; error) {
+                run_forward(map, $kernel(map.0)?, None, params, [x.into(), y.into(), tape.into()])?;
+            }
+
+            fn $backward(
+                map: map, params: *const $real, x: $tile, tape: $tile_mut, dy: $tile, to: $grads, dx: $tile_mut; error
+            ) {
+                let grads = Grads { values: many_mut(to.data, to.length), range: to.start..to.start + to.length };
+                run_backward(map, $kernel(map.0)?, params, [x.into(), tape.into(), dy.into(), dx.into()], grads)?;
+            }
+        }
+    };
 }
+
+kernel! { f32, ConefieldTile ConefieldTileMut ConefieldGrads, forward backward, single }
+kernel! { f64, ConefieldTile64 ConefieldTileMut64 ConefieldGrads64, forward_f64 backward_f64, double }
 
 shims! {
-    fn forward(map: map, params: *const f32, x: ConefieldTile, y: ConefieldTileMut, tape: ConefieldTileMut; error) {
-        run_forward(map, map.0.kernel(), None, params, [x.into(), y.into(), tape.into()])?;
-    }
-
     fn forward_pass(
         map: map, pass: usize, params: *const f32, x: ConefieldTile, y: ConefieldTileMut, tape: ConefieldTileMut; error
     ) {
         run_forward(map, map.0.kernel(), Some(pass), params, [x.into(), y.into(), tape.into()])?;
-    }
-
-    fn backward(
-        map: map, params: *const f32, x: ConefieldTile, tape: ConefieldTileMut, dy: ConefieldTile, to: ConefieldGrads,
-        dx: ConefieldTileMut; error
-    ) {
-        run_backward(map, map.0.kernel(), params, [x.into(), tape.into(), dy.into(), dx.into()], grads(to))?;
-    }
-
-    fn forward_f64(
-        map: map, params: *const f64, x: ConefieldTile64, y: ConefieldTileMut64, tape: ConefieldTileMut64; error
-    ) {
-        let kernel = have(map.0.reference(), "kernel in double precision")?;
-        run_forward(map, kernel, None, params, [x.into(), y.into(), tape.into()])?;
-    }
-
-    fn backward_f64(
-        map: map, params: *const f64, x: ConefieldTile64, tape: ConefieldTileMut64, dy: ConefieldTile64,
-        to: ConefieldGrads64, dx: ConefieldTileMut64; error
-    ) {
-        let kernel = have(map.0.reference(), "kernel in double precision")?;
-        run_backward(map, kernel, params, [x.into(), tape.into(), dy.into(), dx.into()], grads64(to))?;
     }
 }

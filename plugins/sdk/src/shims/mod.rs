@@ -16,13 +16,10 @@ pub mod projector;
 pub mod regularizer;
 
 use crate::built::{AnyStage, Built};
-use conefield_core::error::{Error, Result};
-use conefield_core::geometry::VoxelGrid;
+use conefield_core::prelude::*;
 use conefield_core::registry::StageType;
 use conefield_core::scan::ScanHeader;
-use conefield_core::simd::Real;
 use conefield_plugin_abi::*;
-use ndarray::{ArrayView3, ArrayViewMut3};
 use std::ffi::c_void;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::{mem, ptr, slice};

@@ -1,8 +1,8 @@
 //! Projectors.
 
 use super::{guard, hand_over, many, many_mut, shims, table, wgsl};
-use conefield_core::error::Error;
-use conefield_core::stage::{Lengths, Samples, UnitRay};
+use conefield_core::prelude::*;
+use conefield_core::stage::Lengths;
 use conefield_plugin_abi::*;
 use std::cell::RefCell;
 use std::ffi::c_void;

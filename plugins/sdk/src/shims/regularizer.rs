@@ -1,9 +1,8 @@
 //! Regularizers and their penalties on a grid.
 
 use super::{array, grid, guard, hand_over_on, header, many, many_mut, shims, table};
-use conefield_core::error::Error;
-use conefield_core::place::{Host, StatePart};
-use conefield_core::space::Space;
+use conefield_core::place::Host;
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
 use std::sync::Arc;
@@ -58,7 +57,6 @@ shims! {
             StatePart::Host(values) => values,
             StatePart::Placed(array) => array.slice_mut(),
         };
-        let name = ConefieldStr { data: name.as_ptr(), length: name.len() };
-        *out = ConefieldState { name, data: values.as_mut_ptr(), length: values.len() };
+        *out = ConefieldState { name: ConefieldStr::of(name), data: values.as_mut_ptr(), length: values.len() };
     }
 }

@@ -1,17 +1,14 @@
-//! The built-in hash grid as a plugin, to measure the cost of the ABI and to test masks through it; and two
-//! initializers, to test the ABI's functions for them.
+//! The built-in hash grid as a plugin, to measure the cost of the ABI and to test masks through it; two initializers, to
+//! test the ABI's functions for them; and an encoder that panics.
 
+mod panics;
 mod started;
 
 use conefield_encoders::hash_grid::HashGrid;
-use conefield_plugin::error::Result;
-use conefield_plugin::settings::EncoderSpec;
-use conefield_plugin::stage::Encoder;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_plugin::prelude::*;
 
 conefield_plugin::export!();
-conefield_plugin::stage_type!(EncoderSpec, "rehashed", Rehashed, "the built-in hash grid as a plugin");
+stage_type!(EncoderSpec, "rehashed", Rehashed, "the built-in hash grid as a plugin");
 
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]

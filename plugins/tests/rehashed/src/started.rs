@@ -3,15 +3,11 @@
 
 use conefield_fields::initializers::mci::Mci;
 use conefield_fields::initializers::volume::FromVolume;
-use conefield_plugin::arena::Weights;
-use conefield_plugin::error::Result;
-use conefield_plugin::settings::{Initializer, InitializerSpec};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_plugin::prelude::*;
 
 macro_rules! stands_for {
     ($($name:literal $own:ident $other:ident;)*) => {$(
-        conefield_plugin::stage_type!(InitializerSpec, $name, $own, "as the built-in one does it");
+        stage_type!(InitializerSpec, $name, $own, "as the built-in one does it");
 
         #[derive(Serialize, Deserialize, JsonSchema)]
         #[serde(transparent)]

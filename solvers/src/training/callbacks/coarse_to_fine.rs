@@ -47,10 +47,6 @@ impl CallbackSpec for CoarseToFine {
         ensure(self.until > 0.0 && self.until <= 1.0, "spec", "until", self.until, "above 0, at most 1")?;
         Ok(Box::new(Opener(self.clone())))
     }
-
-    fn copy(&self) -> Box<dyn CallbackSpec> {
-        Box::new(self.clone())
-    }
 }
 
 /// The callback that [`CoarseToFine`] builds. It is stateless: the completed share of the run determines the levels.

@@ -47,10 +47,6 @@ impl CallbackSpec for Drift {
         ensure((1..=1 << 16).contains(&self.points), "spec", "points", self.points, "1 to 65536")?;
         Ok(Box::new(Watch { settings: self.clone(), every: 1, points: vec![], looked: None, recorded: None }))
     }
-
-    fn copy(&self) -> Box<dyn CallbackSpec> {
-        Box::new(self.clone())
-    }
 }
 
 /// The callback that [`Drift`] builds.

@@ -112,10 +112,6 @@ impl CallbackSpec for FftMask {
         }
         Ok(Box::new(Masker { settings: self.clone(), done: false }))
     }
-
-    fn copy(&self) -> Box<dyn CallbackSpec> {
-        Box::new(self.clone())
-    }
 }
 
 /// The callback that [`FftMask`] builds.

@@ -42,10 +42,6 @@ impl CallbackSpec for Patience {
         ensure(self.records > 0, "spec", "records", 0, "at least 1")?;
         Ok(Box::new(Waiting { records: self.records, waited: Waited::default(), copy: None }))
     }
-
-    fn copy(&self) -> Box<dyn CallbackSpec> {
-        Box::new(self.clone())
-    }
 }
 
 /// The callback that [`Patience`] builds.

@@ -61,10 +61,6 @@ impl CallbackSpec for Rollback {
         ensure(self.times > 0, "spec", "times", 0, "at least 1; omit rollback to disable it")?;
         Ok(Box::new(Guard { times: self.times, loss: None, measured: 0.0, watched: Watched::default(), copy: None }))
     }
-
-    fn copy(&self) -> Box<dyn CallbackSpec> {
-        Box::new(self.clone())
-    }
 }
 
 /// The state besides the copy.
