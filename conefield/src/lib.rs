@@ -33,7 +33,6 @@ pub mod backend;
 mod devices;
 pub mod explain;
 pub mod files;
-pub mod hounsfield;
 pub mod input;
 pub mod machine;
 pub mod memory;
@@ -56,7 +55,7 @@ pub mod study;
 pub mod tradeoff;
 
 pub use conefield_core::{Error, Result, geometry, scan, spec};
-pub use conefield_evaluation::metrics;
+pub use conefield_evaluation::{hounsfield, metrics};
 pub use conefield_io as io;
 pub use conefield_projectors::simulate;
 pub use conefield_scans::read_scan;

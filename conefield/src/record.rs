@@ -1,16 +1,16 @@
 //! The record of a run.
 
-use crate::hounsfield::Levels;
 use crate::machine::Machine;
 use crate::memory::Memory;
 use crate::plugins::Used;
 use crate::tradeoff::json::to_json;
 use crate::tradeoff::schedule::Schedule;
-use conefield_core::Result;
 use conefield_core::backend::Explain;
 use conefield_core::method::Limits;
 use conefield_core::place::Moved;
 use conefield_core::scan::{Scan, Unit};
+use conefield_core::{Result, checksum};
+use conefield_evaluation::hounsfield::Levels;
 use conefield_evaluation::metrics::Scores;
 use conefield_evaluation::report::text::stem;
 use serde::{Deserialize, Serialize};
@@ -154,8 +154,8 @@ impl ScanRecord {
             views: scan.geometry.views.len(),
             detector: scan.geometry.detector,
             volume: scan.geometry.volume.shape,
-            projections_fnv1a64: checksum(scan.projections.iter().flat_map(|x| x.to_le_bytes())),
-            geometry_fnv1a64: checksum(placed.into_bytes().into_iter()),
+            projections_fnv1a64: checksum::of_numbers(&scan.projections),
+            geometry_fnv1a64: checksum::of_text(&placed),
             unit: Some(scan.unit.clone()),
         })
     }
@@ -170,10 +170,4 @@ impl ScanRecord {
         let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
         format!("{}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
     }
-}
-
-/// FNV-1a hash, to recognize a scan.
-fn checksum(bytes: impl Iterator<Item = u8>) -> String {
-    let hash = bytes.fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
-    format!("{hash:016x}")
 }

@@ -25,6 +25,7 @@ pub mod backend;
 pub mod basis;
 pub mod by_row;
 pub mod checkpoint;
+pub mod checksum;
 pub mod data_term;
 pub mod dense;
 pub mod error;

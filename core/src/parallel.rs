@@ -57,6 +57,11 @@ pub fn change_all(x: &mut Array3<f32>, f: impl Fn(f32) -> f32 + Sync) {
     }
 }
 
+/// Multiplies each number of `x` by `factor`.
+pub fn scale(x: &mut Array3<f32>, factor: f32) {
+    change_all(x, |x| x * factor);
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

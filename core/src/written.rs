@@ -129,6 +129,8 @@ pub(crate) enum Is {
     Bool(bool),
     Number(Number),
     String(String),
+    /// Only in TOML; a type reads it as a text.
+    Date(String),
     Array(Vec<Node>),
     Table(Vec<Entry>),
 }
@@ -263,7 +265,7 @@ impl Node {
             Is::Null => Value::Null,
             Is::Bool(b) => Value::Bool(*b),
             Is::Number(n) => Value::Number(n.clone()),
-            Is::String(s) => Value::String(s.clone()),
+            Is::String(s) | Is::Date(s) => Value::String(s.clone()),
             Is::Array(items) => Value::Array(items.iter().map(Node::to_json).collect()),
             Is::Table(entries) => Value::Object(entries.iter().map(|e| (e.key.clone(), e.value.to_json())).collect()),
         }
@@ -280,6 +282,7 @@ impl Node {
                 format!("a table of {}{more}", keys.join(", "))
             }
             Is::String(s) => format!("the text {s:?}"),
+            Is::Date(s) => format!("the date {s}"),
             _ => self.to_json().to_string(),
         }
     }
@@ -299,14 +302,26 @@ fn toml_table(source: &Arc<Source>, table: &DeTable<'_>, at: At) -> Result<Node>
     let mut entries = Vec::with_capacity(table.len());
     for (key, value) in table {
         let (key, at) = (key.get_ref().to_string(), At::byte(source, key.span().start));
-        let value = toml_value(source, value.get_ref(), At::byte(source, value.span().start), &key)?;
+        let value =
+            toml_value(source, value.get_ref(), At::byte(source, value.span().start)).map_err(|e| below(&key, e))?;
         entries.push(Entry { key, at, value });
     }
     Ok(Node { at, kind: Is::Table(entries) })
 }
 
-fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At, key: &str) -> Result<Node> {
-    let refuse = |found: &dyn fmt::Display, expected: &str| Error::invalid(at.to_string(), key, found, expected);
+/// The error of a value at `step` of a table or list.
+fn below(step: &dyn fmt::Display, error: Error) -> Error {
+    match error {
+        Error::Invalid { place, field, found, expected } => {
+            let field = if field.is_empty() { step.to_string() } else { format!("{step}.{field}") };
+            Error::Invalid { place, field, found, expected }
+        }
+        other => other,
+    }
+}
+
+fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At) -> Result<Node> {
+    let refuse = |found: &dyn fmt::Display, expected: &str| Error::invalid(at.to_string(), "", found, expected);
     let kind = match value {
         DeValue::String(s) => Is::String(s.to_string()),
         DeValue::Boolean(b) => Is::Bool(*b),
@@ -319,11 +334,14 @@ fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At, key: &str) -> R
             let n = f.as_str().parse().ok().and_then(Number::from_f64);
             Is::Number(n.ok_or_else(|| refuse(f, "a finite number"))?)
         }
-        DeValue::Datetime(d) => Is::String(d.to_string()),
+        DeValue::Datetime(d) => Is::Date(d.to_string()),
         DeValue::Array(items) => Is::Array(
             items
                 .iter()
-                .map(|v| toml_value(source, v.get_ref(), At::byte(source, v.span().start), key))
+                .enumerate()
+                .map(|(i, v)| {
+                    toml_value(source, v.get_ref(), At::byte(source, v.span().start)).map_err(|e| below(&i, e))
+                })
                 .collect::<Result<_>>()?,
         ),
         DeValue::Table(t) => return toml_table(source, t, at),
@@ -504,7 +522,7 @@ impl<'de> Deserializer<'de> for &'de Node {
                 (_, Some(n)) => visitor.visit_i64(n),
                 _ => visitor.visit_f64(n.as_f64().unwrap_or(f64::NAN)),
             },
-            Is::String(s) => visitor.visit_str(s),
+            Is::String(s) | Is::Date(s) => visitor.visit_str(s),
             Is::Array(items) => {
                 let mut rest = Items { all: items, next: 0 };
                 visitor.visit_seq(&mut rest).and_then(|v| rest.end().map(|()| v))

@@ -3,6 +3,7 @@
 //! - [`metrics`]: scores of a volume against its reference.
 //! - [`report`]: numbers in words and tables; plots, pictures and pages.
 
+pub mod hounsfield;
 pub mod metrics;
 pub mod pca;
 pub mod report;

@@ -376,7 +376,7 @@ mod tests {
         refused(|t| t.replace("rows = 4", "rows = 4611686018427387904"), &["detector"]);
         refused(|t| t.replace("\"projections.npy\"", "\"none.npy\""), &["projections", "none.npy"]);
         refused(|t| t.replace("dso = 5", "dso = -5"), &["orbit.dso", "-5"]);
-        refused(|t| t.replace("dso = 5", "dso = nan # 5"), &["dso: found nan", "finite"]);
+        refused(|t| t.replace("dso = 5", "dso = nan # 5"), &["orbit.dso: found nan", "finite"]);
         refused(|t| t.replace("offset = [", "count = 9\noffset = ["), &["orbit.angles", "one way"]);
         refused(|t| t.replace("dsd =", "views = []\ndsd ="), &["views"]);
         refused(|t| t.replace("angles = [", "angles = [] # ["), &["views", "at least one"]);

@@ -13,6 +13,7 @@ use conefield_core::geometry;
 use conefield_core::simd::Real;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use conefield_core::{Error, Result};
+use conefield_evaluation::metrics;
 use ndarray::Array3;
 use numpy::{Element, PyArray3, PyReadonlyArray3};
 use pyo3::prelude::*;
@@ -113,7 +114,7 @@ pub fn project_scan<'py>(
         check_memory(projector.as_ref(), &geometry)?;
         let mut views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref())?;
         if residual {
-            projection::residual(scan, &mut views)?;
+            metrics::residual(scan, &mut views)?;
         }
         Ok::<_, Error>(views)
     })?;

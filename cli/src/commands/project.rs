@@ -5,11 +5,12 @@ use crate::{out, signals};
 use clap::Args;
 use conefield::memory::{self, Memory};
 use conefield::parse::HoldOut;
-use conefield::projection::{self, Residual};
+use conefield::projection;
 use conefield::{files, parse};
 use conefield_core::error::ensure;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
+use conefield_evaluation::metrics::{self, Residual};
 use ndarray::Array3;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -94,7 +95,7 @@ impl ProjectArgs {
         };
         let mut predicted = of(views, "predicted");
         conefield_io::write_scan(&self.output, &predicted, None)?;
-        let residual = projection::residual(&scan, &mut predicted.projections)?;
+        let residual = metrics::residual(&scan, &mut predicted.projections)?;
         if let Some(folder) = &self.residual {
             conefield_io::write_scan(folder, &of(predicted.projections, "residual"), None)?;
         }

@@ -18,18 +18,18 @@ pub fn cases() -> Vec<Case> {
     table! {
         "an empty description", changed(r2, META, cut(0)), INFO, ["meta_data.json"];
         "a description cut in the middle", changed(r2, META, |b| b.truncate(b.len() / 2)),
-            INFO, ["meta_data.json: line"];
+            INFO, ["meta_data.json:3"];
         "no UTF-8", then(r2, |d| put(d.join(META), b"{\"scanner\": \"\xff\"}")), INFO, ["UTF-8"];
         "a rotated detector, which is not read", meta("\"mode\"", "\"rotDetector\": [0, 0.1, 0], \"mode\""),
             INFO, ["not read", "scanner.rotDetector"].ends(End::Warned);
         "a missing key", meta("\"DSO\"", "\"DS0\""), INFO, ["DSO", "nothing"];
         "a beam of another kind", meta("\"cone\"", "\"fan\""), INFO, ["mode", "fan", "cone"];
         "a negative distance", meta("\"DSO\": 500.0", "\"DSO\": -500.0"), INFO, ["scanner.DSO", "-500"];
-        "a number past the range", meta("\"DSO\": 500.0", "\"DSO\": 1e999"), INFO, ["meta_data.json: line"];
+        "a number past the range", meta("\"DSO\": 500.0", "\"DSO\": 1e999"), INFO, ["meta_data.json:3"];
         "a detector without rows", meta("\"nDetector\": [\n      4", "\"nDetector\": [\n      0"),
             INFO, ["scanner.nDetector", "at least 1"];
         "a detector of 2^64 rows", meta("\"nDetector\": [\n      4", "\"nDetector\": [\n      18446744073709551616"),
-            INFO, ["meta_data.json: line"];
+            INFO, ["meta_data.json:3"];
         "a detector with a product past 2^64",
             meta("\"nDetector\": [\n      4", "\"nDetector\": [\n      9223372036854775807"),
             INFO, ["18446744073709551615", "no machine"];

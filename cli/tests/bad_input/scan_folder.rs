@@ -33,13 +33,13 @@ pub fn cases() -> Vec<Case> {
         "JSON cut in the middle", changed(scan_json, "scan/scan.json", |b| b.truncate(b.len() / 2)),
             INFO, ["scan.json"];
         "a later version", toml("version = 1", "version = 7"), INFO, ["version", "found 7"];
-        "a misspelt key", toml("dsd =", "dds ="), RECONSTRUCT, ["scan.toml: line", "dds", "`dsd`"];
+        "a misspelt key", toml("dsd =", "dds ="), RECONSTRUCT, ["scan.toml:21:1: orbit.dds", "\"dsd\""];
         "a missing table", toml("[orbit]", "[provenance.orbit]"), INFO, ["orbit", "nothing"];
         "fewer rows than the projections", toml("rows = 4", "rows = 3"),
             INFO, ["projections.npy", "[3, 4, 5]", "[3, 3, 5]"];
         "rows with a product past 2^64", toml("rows = 4", "rows = 9223372036854775807"),
             INFO, ["18446744073709551615", "no machine"];
-        "a volume of NaN", toml("spacing = [0.5", "spacing = [nan"), INFO, ["volume.spacing", "NaN"];
+        "a volume of NaN", toml("spacing = [0.5", "spacing = [nan"), INFO, ["scan.toml:16:12: volume.spacing.0: found nan"];
         "a unit of zero", toml("mm = 1.0", "mm = 0.0"), INFO, ["unit.mm", "found 0"];
         "more views than there are people", |d| {
             scan_toml(d);

@@ -145,6 +145,6 @@ fn angles_and_vectors_come_from_files() {
         let b = b.tilted(angles);
         assert!((0..3).all(|k| (a.u[k] - b.u[k]).abs() < 1e-9 && (a.v[k] - b.v[k]).abs() < 1e-9), "{a:?} {b:?}");
     }
-    refuse(&SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { u = nan }"), &["circle.tilt_deg.u", "NaN"]);
+    refuse(&SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { u = nan }"), &["circle.tilt_deg.u", "nan"]);
     refuse(&SCANNER.replace("dsd = 150.0", "dsd = 150.0\ntilt_deg = { w = 1 }"), &["found a key", "u, v, normal"]);
 }

@@ -194,15 +194,11 @@ fn bad_studies_make_no_folder() {
     let (dir, file) = study(TINY);
     let out = dir.path().join("out");
     for (from, to, want) in [
-        ("seeds", "seed", "line 5: seed: found a key that is not known here, expected `seeds`"),
+        ("seeds", "seed", ":5:1: seed: found a key that is not known here, expected \"seeds\""),
         ("'fdk'", "'fkd'", "fkd: found neither a shipped spec nor a file"),
-        (
-            "encoder.levels=2",
-            "encoder.level=2",
-            "line 4: specs: --set encoder.level=2: encoder.level: found an unknown key",
-        ),
+        ("encoder.levels=2", "encoder.level=2", ": specs: --set encoder.level=2: encoder.level: found an unknown key"),
         ("phantom:head:16", "none.nii", "none.nii"),
-        ("steps = 3", "steps = 0", "line 13: steps"),
+        ("steps = 3", "steps = 0", ":13:9: protocol.steps"),
     ] {
         fs::write(&file, TINY.replacen(from, to, 1)).unwrap();
         let said = refused(1, &["study", &text(&file), "-o", &text(&out)]);

@@ -433,7 +433,7 @@ mod tests {
             ("volumes = ['phantom:head:16']\nspecs = ['fkd']\n", ":2:10: specs: spec: fkd: found neither"),
             ("volumes = ['phantom:hand']\nspecs = ['fdk']\n", ":1:12: volumes: "),
             ("volumes = ['phantom:head:16', 'phantom:head:16']\nspecs = ['fdk']\n", ":1:31: name: found \"head-16\""),
-            ("volumes = ['phantom:head:16']\nspecs = ['fdk', 'fdk']\n", ":2:10: specs: fdk (shipped): name: "),
+            ("volumes = ['phantom:head:16']\nspecs = ['fdk', 'fdk']\n", ":2:17: specs: fdk (shipped): name: "),
             ("volumes = ['phantom:head:16']\nspecs = [{ spec = 'fdk', name = '../fdk' }]\n", "a name for a folder"),
             ("volumes = ['phantom:head:16']\nspecs = [{ spec = 'fast', init = 'none.nii' }]\n", "none.nii"),
         ] {

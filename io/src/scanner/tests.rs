@@ -184,13 +184,13 @@ fn hostile_descriptions_and_files_are_refused_in_words() {
     edit("version = 1", "", &["version", "nothing"]);
     edit("dso = ", "DSO = ", &[":9:1: circle.DSO", "\"dso\" (of beam, dso, dsd"]);
     edit("dso = 500.0", "", &["dso", "nothing"]);
-    edit("dso = 500.0", "dso = nan", &["dso: found nan", "finite"]);
+    edit("dso = 500.0", "dso = nan", &["circle.dso: found nan", "finite"]);
     edit("u = 2.0, v", "v", &["u", "nothing"]);
     edit("dsd = 800.0", "dsd = 300.0", &["circle.dsd", "300", "swapped"]);
     edit("direction = \"counterclockwise\"", "", &["direction", "nothing"]);
     edit("\"counterclockwise\"", "\"left\"", &["direction", "left", "clockwise"]);
     edit("step_deg = 14.4", "", &["circle.step_deg", "no angles", "angles_deg"]);
-    edit("step_deg = 14.4", "step_deg = inf", &["step_deg: found inf"]);
+    edit("step_deg = 14.4", "step_deg = inf", &["circle.step_deg: found inf"]);
     edit("step_deg = 14.4", "step = 14.4", &["circle.step", "\"step_deg\""]);
     edit("[volume]", "[layout]\naxes = [\"view\", \"row\", \"row\"]\n[volume]", &["layout.axes", "once"]);
     edit("[volume]", "[layout]\naxes = [\"view\"]\n[volume]", &["layout.axes", "two of them"]);

@@ -43,7 +43,7 @@ pub fn simulate(volume: &Volume, protocol: &Protocol) -> Result<Scan> {
     let geometry: Geometry = protocol.geometry(&volume.grid)?;
     let mut projections = project(volume, &geometry, protocol.samples_per_voxel)?;
     let units_per_mm = (1.0 / protocol.unit.mm) as f32;
-    parallel::change_all(&mut projections, |a| a * units_per_mm);
+    parallel::scale(&mut projections, units_per_mm);
     let largest = range(&projections)[1].max(0.0);
     protocol.noise.add(&mut projections, protocol.seed);
     let provenance = json!({

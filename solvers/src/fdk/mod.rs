@@ -119,7 +119,7 @@ impl Plan for Fdk {
         let mm = job.scan.unit.mm as f32;
         let psnr = monitor.psnr(&volume, mm);
         observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
-        parallel::change_all(&mut volume, |x| x * mm);
+        parallel::scale(&mut volume, mm);
         let volume = Volume { data: volume, grid: geometry.volume, affine: None };
         let result = Reconstruction::Volume(volume);
         Ok(Solution { result, steps: 1, train_s, samples: 0, sampling_s: 0.0, rollbacks: 0, best: None })

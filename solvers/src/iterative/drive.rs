@@ -269,7 +269,7 @@ impl<'a> Run<'a> {
         };
         let mut data = self.problem.place.take(volume)?;
         let mm = job.scan.unit.mm as f32;
-        parallel::change_all(&mut data, |x| x * mm);
+        parallel::scale(&mut data, mm);
         finite(&data, step)?;
         let volume = Volume { data, grid: job.scan.geometry.volume, affine: None };
         Ok(Solution {

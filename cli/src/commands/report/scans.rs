@@ -12,6 +12,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::voxel::VoxelProjector;
 use conefield_core::{Error, Result};
+use conefield_evaluation::metrics;
 use conefield_evaluation::report::page::{
     MeasuredView, Notice, Page, PageScan, PageVolume, PredictedView, PredictedViews, Scale, geometry_url, picture_url,
     spread,
@@ -258,7 +259,7 @@ impl Shown {
         let mut views = projection::predicted(volume, &geometry, self.scan.unit.mm, options.projector.as_ref())?;
         let pictures =
             views.outer_iter().map(|v| picture_url(v, Scale::Grey(self.window))).collect::<Result<Vec<_>>>()?;
-        let left = projection::residual(&self.scan, &mut views)?;
+        let left = metrics::residual(&self.scan, &mut views)?;
         self.residuals.push(views);
         let images = pictures
             .into_iter()
