@@ -45,7 +45,6 @@ pub mod ranks;
 pub mod reconstruct;
 pub mod record;
 pub mod score;
-pub mod scratch;
 pub mod session;
 pub mod shipped;
 pub mod simulation;
@@ -54,7 +53,7 @@ pub mod specs;
 pub mod study;
 pub mod tradeoff;
 
-pub use conefield_core::{Error, Result, geometry, scan, spec};
+pub use conefield_core::{Error, Result, geometry, scan, scratch, spec};
 pub use conefield_evaluation::{hounsfield, metrics};
 pub use conefield_io as io;
 pub use conefield_projectors::simulate;

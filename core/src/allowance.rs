@@ -46,6 +46,11 @@ pub fn room() -> u64 {
     ROOM.load(Ordering::Relaxed)
 }
 
+/// `bytes` for an error message.
+pub(crate) fn mib(bytes: u64) -> String {
+    format!("{} MiB", bytes.div_ceil(1 << 20))
+}
+
 /// Checks that `bytes` more may be allocated for `field` of the file `place`. This is a check, not a reservation: a
 /// single thread reads.
 pub fn memory(place: &str, field: &str, bytes: u64) -> Result<()> {
@@ -54,7 +59,6 @@ pub fn memory(place: &str, field: &str, bytes: u64) -> Result<()> {
     if held.saturating_add(bytes) <= most {
         return Ok(());
     }
-    let mib = |n: u64| format!("{} MiB", n.div_ceil(1 << 20));
     let found = format!("{} more, with {} already held", mib(bytes), mib(held));
     Err(Error::invalid(place, field, found, format!("at most {} in total, set by --memory or the system", mib(most))))
 }

@@ -53,6 +53,7 @@ pub mod regularizer;
 pub mod runner;
 pub mod scan;
 pub mod scene;
+pub mod scratch;
 pub mod settings;
 pub mod simd;
 pub mod space;

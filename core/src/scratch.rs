@@ -11,7 +11,8 @@
 
 #![allow(unsafe_code)]
 
-use conefield_core::{Error, Result, allowance};
+use crate::allowance;
+use crate::error::{Error, Result};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -198,7 +199,7 @@ mod files {
         let more = bytes.saturating_sub(scratch.reserved);
         let free = free(&scratch.folder).map_err(|e| failed(e.into()))?;
         let short = || {
-            let [free, more] = [free, more].map(conefield_evaluation::report::text::bytes);
+            let [free, more] = [free, more].map(allowance::mib);
             let expected = format!("{more} for arrays that do not fit into memory");
             Error::invalid(folder.display().to_string(), "free space", free, expected)
         };
