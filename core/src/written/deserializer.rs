@@ -1,0 +1,190 @@
+//! Types from values, by `serde`.
+
+use super::node::{At, Entry, Is, Node};
+use super::suggest;
+use crate::error::Error;
+use serde::de::value::{MapAccessDeserializer, StrDeserializer};
+use serde::de::{DeserializeSeed, IntoDeserializer, MapAccess, SeqAccess, Visitor};
+use serde::{Deserializer, de, forward_to_deserialize_any};
+use serde_spanned::de::{SpannedDeserializer, is_spanned};
+use std::fmt;
+
+/// An error of a value, which learns where the value stands.
+#[derive(Debug)]
+pub(crate) struct Misfit {
+    at: Option<At>,
+    /// Keys and numbers that lead to the value, innermost first.
+    path: Vec<String>,
+    message: String,
+}
+
+impl fmt::Display for Misfit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for Misfit {}
+
+impl de::Error for Misfit {
+    #[inline(never)]
+    fn custom<T: fmt::Display>(message: T) -> Self {
+        Self { at: None, path: vec![], message: message.to_string() }
+    }
+}
+
+impl Misfit {
+    fn at(mut self, at: &At) -> Self {
+        self.at.get_or_insert_with(|| at.clone());
+        self
+    }
+
+    fn below(mut self, step: &dyn fmt::Display) -> Self {
+        self.path.push(step.to_string());
+        self
+    }
+
+    /// The error in the text whose value stands at `root`.
+    pub(super) fn located(self, root: &At) -> Error {
+        let Self { at, path, message } = self;
+        let place = at.as_ref().unwrap_or(root).to_string();
+        let field = |key: &str| {
+            let steps = path.iter().rev().map(String::as_str).chain((!key.is_empty()).then_some(key));
+            steps.collect::<Vec<_>>().join(".")
+        };
+        let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
+        match names.split_first() {
+            Some((key, valid)) if message.starts_with("unknown field") => {
+                Error::invalid(place, field(key), "a key that is not known here", suggest(key, valid))
+            }
+            Some((key, _)) if message.starts_with("missing field") => {
+                Error::invalid(place, field(key), "nothing", "a value")
+            }
+            _ => {
+                let (found, expected) = message.split_once(", expected ").unwrap_or((&message, "valid values"));
+                let field = if path.is_empty() { "content".into() } else { field("") };
+                Error::invalid(place, field, found.trim(), expected.trim())
+            }
+        }
+    }
+}
+
+impl<'de> Deserializer<'de> for &'de Node {
+    type Error = Misfit;
+
+    fn deserialize_any<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Misfit> {
+        match &self.kind {
+            Is::Null => visitor.visit_unit(),
+            Is::Bool(b) => visitor.visit_bool(*b),
+            Is::Number(n) => match (n.as_u64(), n.as_i64()) {
+                (Some(n), _) => visitor.visit_u64(n),
+                (_, Some(n)) => visitor.visit_i64(n),
+                _ => visitor.visit_f64(n.as_f64().unwrap_or(f64::NAN)),
+            },
+            Is::String(s) | Is::Date(s) => visitor.visit_str(s),
+            Is::Array(items) => {
+                let mut rest = Items { all: items, next: 0 };
+                visitor.visit_seq(&mut rest).and_then(|v| rest.end().map(|()| v))
+            }
+            Is::Table(entries) => visitor.visit_map(Entries { rest: entries, value: None }),
+        }
+    }
+
+    fn deserialize_option<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Misfit> {
+        match self.kind {
+            Is::Null => visitor.visit_none(),
+            _ => visitor.visit_some(self),
+        }
+    }
+
+    fn deserialize_newtype_struct<V: Visitor<'de>>(self, _: &'static str, visitor: V) -> Result<V::Value, Misfit> {
+        visitor.visit_newtype_struct(self)
+    }
+
+    fn deserialize_struct<V: Visitor<'de>>(
+        self,
+        name: &'static str,
+        _: &'static [&'static str],
+        visitor: V,
+    ) -> Result<V::Value, Misfit> {
+        if is_spanned(name) {
+            let offset = self.at.offset().unwrap_or(0);
+            return visitor.visit_map(SpannedDeserializer::new(self, offset..offset));
+        }
+        self.deserialize_any(visitor)
+    }
+
+    fn deserialize_enum<V: Visitor<'de>>(
+        self,
+        _: &'static str,
+        _: &'static [&'static str],
+        visitor: V,
+    ) -> Result<V::Value, Misfit> {
+        match &self.kind {
+            Is::String(name) => visitor.visit_enum(StrDeserializer::new(name)),
+            Is::Table(entries) => {
+                visitor.visit_enum(MapAccessDeserializer::new(Entries { rest: entries, value: None }))
+            }
+            _ => Err(de::Error::custom(format_args!("{}, expected a text or a table", self.shown()))),
+        }
+    }
+
+    forward_to_deserialize_any! {
+        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char str string bytes byte_buf unit unit_struct seq tuple
+        tuple_struct map identifier ignored_any
+    }
+}
+
+impl<'de> IntoDeserializer<'de, Misfit> for &'de Node {
+    type Deserializer = Self;
+    fn into_deserializer(self) -> Self {
+        self
+    }
+}
+
+/// The items of a list.
+struct Items<'a> {
+    all: &'a [Node],
+    next: usize,
+}
+
+impl Items<'_> {
+    /// Refuses a list with items that nobody read.
+    fn end(&self) -> Result<(), Misfit> {
+        let Self { all, next } = *self;
+        let long = || de::Error::custom(format_args!("a list of {}, expected {next}", all.len()));
+        if next < all.len() { Err(long()) } else { Ok(()) }
+    }
+}
+
+impl<'de> SeqAccess<'de> for Items<'de> {
+    type Error = Misfit;
+    fn next_element_seed<T: DeserializeSeed<'de>>(&mut self, seed: T) -> Result<Option<T::Value>, Misfit> {
+        let Some(node) = self.all.get(self.next) else { return Ok(None) };
+        self.next += 1;
+        seed.deserialize(node).map(Some).map_err(|e: Misfit| e.at(&node.at).below(&(self.next - 1)))
+    }
+    fn size_hint(&self) -> Option<usize> {
+        Some(self.all.len() - self.next)
+    }
+}
+
+/// The entries of a table.
+struct Entries<'a> {
+    rest: &'a [Entry],
+    /// The entry whose key was read.
+    value: Option<&'a Entry>,
+}
+
+impl<'de> MapAccess<'de> for Entries<'de> {
+    type Error = Misfit;
+    fn next_key_seed<K: DeserializeSeed<'de>>(&mut self, seed: K) -> Result<Option<K::Value>, Misfit> {
+        let Some((entry, rest)) = self.rest.split_first() else { return Ok(None) };
+        (self.rest, self.value) = (rest, Some(entry));
+        seed.deserialize(StrDeserializer::new(&entry.key)).map(Some).map_err(|e: Misfit| e.at(&entry.at))
+    }
+    fn next_value_seed<V: DeserializeSeed<'de>>(&mut self, seed: V) -> Result<V::Value, Misfit> {
+        let Some(entry) = self.value.take() else { return Err(de::Error::custom("a value without a key")) };
+        seed.deserialize(&entry.value).map_err(|e: Misfit| e.at(&entry.value.at).below(&entry.key))
+    }
+}
