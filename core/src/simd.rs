@@ -37,8 +37,6 @@ pub trait Real:
     type Four<S: Simd>: SimdFloat<S, Element = Self, Array = [Self; 4]>;
     /// 0.
     const ZERO: Self;
-    /// Whether kernels are compiled for each number of operands. Not for `f64`, which only checks gradients.
-    const UNROLLED: bool;
     /// 1.
     const ONE: Self;
     /// The nearest number to `x`.
@@ -87,7 +85,6 @@ const POWER_OF_TWO: [f32; 6] =
 impl Real for f32 {
     type Four<S: Simd> = fearless_simd::f32x4<S>;
     const ZERO: Self = 0.0;
-    const UNROLLED: bool = true;
     const ONE: Self = 1.0;
     #[inline(always)]
     fn of(x: f64) -> Self {
@@ -263,7 +260,6 @@ impl Real for f32 {
 impl Real for f64 {
     type Four<S: Simd> = fearless_simd::f64x4<S>;
     const ZERO: Self = 0.0;
-    const UNROLLED: bool = false;
     const ONE: Self = 1.0;
     #[inline(always)]
     fn of(x: f64) -> Self {

@@ -516,21 +516,17 @@ impl<R: Real> Op for Adjoint<'_, R> {
                     }
                     let plane = &mut self.gathered[p * lines * stride..(p + 1) * lines * stride];
                     let from = [pixels, &q];
-                    // One tap more than needed adds a weight of 0.
-                    let taps = if R::UNROLLED { hit.taps } else { hit.taps.max(TAPS) };
-                    match (taps, c.is_upright()) {
+                    match (hit.taps, c.is_upright()) {
+                        (0..=2, true) => hit.gather_upright::<S, R, 2>(s, pixels, plane, stride, &mut windows),
+                        (3, true) => hit.gather_upright::<S, R, 3>(s, pixels, plane, stride, &mut windows),
+                        (4, true) => hit.gather_upright::<S, R, 4>(s, pixels, plane, stride, &mut windows),
+                        (5..=6, true) => hit.gather_upright::<S, R, 6>(s, pixels, plane, stride, &mut windows),
                         (7..=TAPS, true) => hit.gather_upright::<S, R, TAPS>(s, pixels, plane, stride, &mut windows),
+                        (0..=2, _) => hit.gather::<S, R, 2>(s, from, plane, stride, &mut windows),
+                        (3, _) => hit.gather::<S, R, 3>(s, from, plane, stride, &mut windows),
+                        (4, _) => hit.gather::<S, R, 4>(s, from, plane, stride, &mut windows),
+                        (5..=6, _) => hit.gather::<S, R, 6>(s, from, plane, stride, &mut windows),
                         (7..=TAPS, _) => hit.gather::<S, R, TAPS>(s, from, plane, stride, &mut windows),
-                        (0..=6, upright) if R::UNROLLED => match (taps, upright) {
-                            (0..=2, true) => hit.gather_upright::<S, R, 2>(s, pixels, plane, stride, &mut windows),
-                            (3, true) => hit.gather_upright::<S, R, 3>(s, pixels, plane, stride, &mut windows),
-                            (4, true) => hit.gather_upright::<S, R, 4>(s, pixels, plane, stride, &mut windows),
-                            (_, true) => hit.gather_upright::<S, R, 6>(s, pixels, plane, stride, &mut windows),
-                            (0..=2, _) => hit.gather::<S, R, 2>(s, from, plane, stride, &mut windows),
-                            (3, _) => hit.gather::<S, R, 3>(s, from, plane, stride, &mut windows),
-                            (4, _) => hit.gather::<S, R, 4>(s, from, plane, stride, &mut windows),
-                            _ => hit.gather::<S, R, 6>(s, from, plane, stride, &mut windows),
-                        },
                         _ => {
                             q.resize(pixels.len(), R::ZERO);
                             c.places(s, -(PAD as f64), &mut q);
