@@ -1,11 +1,12 @@
 //! Backends compile a pipeline and run it: training steps, evaluation at points, rendering of rays.
 
+use crate::device::Device;
 use crate::error::Result;
 use crate::loss::Loss;
 use crate::pipeline::{Model, Pipeline};
 use crate::place::{Host, Moved, Place};
 use crate::prior::Prior;
-use crate::stage::UnitRay;
+use crate::stage::{UnitGrid, UnitRay};
 use serde::Serialize;
 use std::sync::Arc;
 
@@ -113,6 +114,10 @@ pub trait Backend: Send + Sync {
     fn place(&self) -> Arc<dyn Place> {
         Arc::new(Host)
     }
+    /// Its device, for a field with its own line integrals; `None` if there is none.
+    fn device(&self) -> Option<Box<dyn Device>> {
+        None
+    }
     /// Bytes moved between the host and this backend's device so far.
     fn moved(&self) -> Moved {
         Moved::default()
@@ -147,6 +152,13 @@ pub trait Executable: Send {
     fn evaluate(&mut self, model: &Model, points: &[[f32; 3]], out: &mut [f32]) -> Result<()>;
     /// The encoder's features at `points`, channel-major.
     fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>>;
+    /// The field at the points of `grid` (`[x, y, z]`, z fastest), for a field that evaluates whole grids.
+    fn values(&mut self, model: &Model, grid: &UnitGrid, out: &mut [f32]) -> Result<()> {
+        if let Some(field) = model.pipeline.field.on_grid() {
+            field.values(&model.arena.params, grid, out);
+        }
+        Ok(())
+    }
     /// Line integrals of `rays`.
     fn render(&mut self, model: &Model, rays: &[UnitRay], out: &mut [f32]) -> Result<()>;
     /// Brings the model's arena up to date with the calls so far.

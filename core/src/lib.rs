@@ -5,7 +5,7 @@
 //! - [`by_row`]: stages written for one row at a time; [`prelude`]: imports for their authors.
 //! - [`support`]: where the object can be; [`scene`]: the mapping between the world and the stages.
 //! - [`loss`], [`prior`]: what training minimizes.
-//! - [`wgsl`]: stages, losses and priors on a GPU.
+//! - [`wgsl`]: stages, losses and priors on a GPU; [`device`]: kernels and buffers on one.
 //! - [`arena`]: parameters, gradients and optimizer state by name.
 //! - [`files`]: opening of user-named files; [`allowance`]: limits of memory and work for reading them; [`finite`]: the
 //!   search for values that are not allowed.
@@ -28,6 +28,7 @@ pub mod checkpoint;
 pub mod checksum;
 pub mod data_term;
 pub mod dense;
+pub mod device;
 pub mod error;
 pub mod files;
 pub mod finite;

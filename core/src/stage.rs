@@ -2,6 +2,7 @@
 //!
 //! A tile is channel-major: channel `c` of row `i` is at index `c·rows + i`. Rows are samples, in ray-major order.
 
+use crate::device::Device;
 use crate::error::{Error, Result};
 use crate::simd::Real;
 use crate::wgsl::Fragment;
@@ -359,6 +360,24 @@ pub trait Lines: Send + Sync {
     /// Overwrites `out` with the line integrals of `rays`, in cube sides; 0 for a ray that misses the box
     /// ([`UnitRay::inside`]).
     fn project(&self, params: &[f32], rays: &[UnitRay], out: &mut [f32]);
+
+    /// The field on a device: its values and line integrals. Refuses a device by default.
+    fn on_device(&self, device: Box<dyn Device>) -> Result<Box<dyn OnDevice>> {
+        let why = "the field has no kernels for a GPU; use --backend cpu";
+        Err(Error::unsupported(format!("a field with its own line integrals on {}", device.name()), why))
+    }
+}
+
+/// A field with its own line integrals on a device.
+pub trait OnDevice: Send {
+    /// Takes these parameters from now on.
+    fn load(&mut self, params: &[f32]) -> Result<()>;
+    /// Overwrites `out` with the values at `points` of the unit cube.
+    fn evaluate(&mut self, points: &[[f32; 3]], out: &mut [f32]) -> Result<()>;
+    /// Overwrites `out` with the values at the points of `grid`, as [`OnGrid::values`].
+    fn values(&mut self, grid: &UnitGrid, out: &mut [f32]) -> Result<()>;
+    /// Overwrites `out` with the line integrals of `rays`, as [`Lines::project`].
+    fn project(&mut self, rays: &[UnitRay], out: &mut [f32]) -> Result<()>;
 }
 
 /// A ray in the unit cube: `origin + t·direction`, where `t` counts cube sides.

@@ -9,7 +9,7 @@ use crate::parts::{Part, Voxels};
 use crate::pipeline::{Model, Pipeline};
 use crate::scan::Affine;
 use crate::scene::{Scene, SceneSettings};
-use crate::stage::{OnGrid, UnitGrid};
+use crate::stage::UnitGrid;
 use crate::support::Support;
 use ndarray::{ArrayViewMut3, s};
 use serde::{Deserialize, Serialize};
@@ -161,8 +161,8 @@ impl<'a> Sampler<'a> {
         [xs, ys, zs]: &Part,
         mut out: ArrayViewMut3<'_, f32>,
     ) -> Result<()> {
-        if let Some(field) = model.pipeline.field.on_grid() {
-            return self.fill_grid(field, &model.arena.params, [xs, ys, zs], out);
+        if model.pipeline.field.on_grid().is_some() {
+            return self.fill_grid(model, exe, [xs, ys, zs], out);
         }
         let Self { scene, grid, scale, points, places, values } = self;
         // In the iteration order of `out`.
@@ -195,8 +195,8 @@ impl<'a> Sampler<'a> {
     /// [`Sampler::fill`] for a field with whole grids, a few planes at a time.
     fn fill_grid(
         &mut self,
-        field: &dyn OnGrid,
-        params: &[f32],
+        model: &Model,
+        exe: &mut dyn Executable,
         [xs, ys, zs]: [&Range<usize>; 3],
         mut out: ArrayViewMut3<'_, f32>,
     ) -> Result<()> {
@@ -208,7 +208,7 @@ impl<'a> Sampler<'a> {
             let shape = [end - start, ys.len(), zs.len()];
             let spacing = grid.spacing.map(|s| s / scene.side);
             values.resize(shape.iter().product(), 0.0);
-            field.values(params, &UnitGrid { first, spacing, shape }, values);
+            exe.values(model, &UnitGrid { first, spacing, shape }, values)?;
             let places = (start..end).flat_map(|x| ys.clone().flat_map(move |y| zs.clone().map(move |z| [x, y, z])));
             let mut part = out.slice_mut(s![start - xs.start..end - xs.start, .., ..]);
             for ((out, value), voxel) in part.iter_mut().zip(values.iter()).zip(places) {

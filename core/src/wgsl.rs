@@ -109,6 +109,8 @@ pub const FOREIGN: &str = "// from a plugin\n";
 pub const RAY: &str = include_str!("wgsl/ray.wgsl");
 /// `random_mix` and `random_unit`: equivalents of [`mix`](crate::random::mix) and [`unit`](crate::random::unit).
 pub const RANDOM: &str = include_str!("wgsl/random.wgsl");
+/// `total`: the sum of a number over the 64 lanes of a group, in a fixed order.
+pub const TOTAL: &str = include_str!("wgsl/total.wgsl");
 /// `stage_trilinear_locate`, `…_index`, `…_weight` and `…_slopes`: equivalents of [`crate::trilinear`].
 pub const TRILINEAR: &str = include_str!("wgsl/trilinear.wgsl");
 

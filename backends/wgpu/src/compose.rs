@@ -8,13 +8,13 @@
 //! skipped.
 
 use crate::device::Atomics;
-use crate::source::{Access, Source};
+use conefield_core::device::{Access, Source, fragment_of};
 use conefield_core::error::{Error, Result};
 use conefield_core::loss::Loss;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::prior::Prior;
 use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage, titled};
-use conefield_core::wgsl::{self, Fragment, RANDOM, RAY, Sum};
+use conefield_core::wgsl::{self, Fragment, RANDOM, RAY, Sum, TOTAL};
 use std::fmt::Write;
 use std::ops::Range;
 
@@ -96,18 +96,6 @@ pub struct Chain {
     /// Parameters of the arena.
     params: usize,
     target: Target,
-}
-
-/// The WGSL of the stage called `name`. Refuses a stage without WGSL, and names that could collide with another stage's.
-pub(crate) fn fragment_of(name: &str, fragment: Option<Fragment>) -> Result<Fragment> {
-    let refused = |why: &str| Error::unsupported(format!("{name} on the wgpu backend"), why);
-    let fragment = fragment.ok_or_else(|| refused("the stage offers no WGSL; it runs with --backend cpu"))?;
-    match fragment.stray() {
-        Some(stray) => {
-            Err(refused(&format!("its WGSL declares {stray}, expected names that begin with {}", wgsl::PREFIX)))
-        }
-        None => Ok(fragment),
-    }
 }
 
 impl Chain {
@@ -836,7 +824,7 @@ fn derivatives() -> Source {
     source.bind("mu", Access::Read, "array<f32>");
     source.bind("dmu", Access::Write, "array<f32>");
     source.bind("losses", Access::Write, "array<f32>");
-    source.add("total", include_str!("kernels/total.wgsl"));
+    source.add("total", TOTAL);
     source
 }
 

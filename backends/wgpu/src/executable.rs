@@ -5,10 +5,11 @@ use crate::compose::{self, Chain, GROUP};
 use crate::kernel::{Buffers, Kernel, fits};
 use crate::pace::Pace;
 use crate::profile::Profile;
-use crate::source::Source;
+use crate::source::validate;
 use crate::wave::{self, GpuRay, MOST_GROUPS, Wave};
 use crate::{Gpu, Shared};
 use conefield_core::backend::{Adam, BlockWork, Executable, StepStats, Work};
+use conefield_core::device::Source;
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;
 use conefield_core::parallel;
@@ -103,7 +104,7 @@ impl Kernels {
 
     /// Adds a kernel, or replaces the one with this label.
     fn add(&mut self, shared: &Shared, label: &str, source: Source) -> Result<()> {
-        source.validate()?;
+        validate(&source)?;
         fits(&shared.gpu, label, &source)?;
         self.sources.insert(label.into(), source);
         Ok(())

@@ -1,7 +1,8 @@
 //! A cache of compiled kernels, and their launch on named buffers.
 
 use crate::device::Gpu;
-use crate::source::{Access, Source};
+use crate::source::validate;
+use conefield_core::device::{Access, Source};
 use conefield_core::error::{Error, Result};
 use conefield_core::wgsl::FOREIGN;
 use std::collections::HashMap;
@@ -58,7 +59,7 @@ fn checks(source: &Source) -> wgpu::ShaderRuntimeChecks {
 
 fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
     fits(gpu, label, source)?;
-    source.validate()?;
+    validate(source)?;
     let started = Instant::now();
     let entry = |(i, access): (usize, Access)| wgpu::BindGroupLayoutEntry {
         binding: i as u32,

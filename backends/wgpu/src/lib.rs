@@ -8,6 +8,7 @@
 //! - [`executable`]: steps, updates, evaluation.
 //! - [`measure`]: measured limits of a device.
 //! - [`profile`]: time on the device.
+//! - `programs`: programs of fields with their own line integrals.
 //! - [`single`]: one stage alone, to compare it with the CPU.
 //! - `place`: volumes and views on the device, and the kernels that combine them.
 //!
@@ -22,6 +23,7 @@ pub mod measure;
 mod pace;
 mod place;
 pub mod profile;
+mod programs;
 pub mod single;
 pub mod source;
 mod staging;
@@ -29,7 +31,8 @@ pub mod wave;
 
 use compose::{Chain, Target};
 use conefield_core::backend::{Backend, Executable, Explain};
-use conefield_core::error::{Error, Result};
+use conefield_core::device::Device;
+use conefield_core::error::Result;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::place::{Moved, Place};
 use conefield_core::stage::{GradKind, titled};
@@ -37,6 +40,7 @@ pub use device::{Adapter, Atomics, Gpu, Limits, adapters};
 use executable::{Kernels, Wgpu as Running};
 use kernel::Cache;
 pub use place::DevicePlace;
+use programs::{Alone, Programs};
 use std::sync::Arc;
 
 /// An open device with the kernels compiled so far.
@@ -99,12 +103,13 @@ impl Backend for Wgpu {
     }
 
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
-        if pipeline.field.lines().is_some() {
-            let what = titled("field", &pipeline.field.describe());
-            let why = "it brings line integrals of its own, which only the CPU computes; use --backend cpu";
-            return Err(Error::unsupported(format!("{what} on the wgpu backend"), why));
-        }
         let shared = &self.shared;
+        if let Some(lines) = pipeline.field.lines() {
+            let field = lines.on_device(Box::new(Programs::new(shared.clone())))?;
+            let notes = vec![format!("{}: kernels of its own", titled("field", &pipeline.field.describe()))];
+            let explain = Explain { backend: format!("wgpu, {}", shared.gpu.adapter), notes, scratch_bytes: 0 };
+            return Ok((Box::new(Alone { field, loaded: false }), explain));
+        }
         let chain = Chain::new(pipeline, shared.target())?;
         let kernels = Kernels::new(shared, &chain, pipeline.projector.as_ref())?;
         let adapter = &shared.gpu.adapter;
@@ -152,6 +157,10 @@ impl Backend for Wgpu {
 
     fn place(&self) -> Arc<dyn Place> {
         self.place.clone()
+    }
+
+    fn device(&self) -> Option<Box<dyn Device>> {
+        Some(Box::new(Programs::new(self.shared.clone())))
     }
 
     fn moved(&self) -> Moved {

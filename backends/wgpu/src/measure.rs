@@ -3,7 +3,7 @@
 use crate::Shared;
 use crate::device::{Atomics, Gpu};
 use crate::kernel::{Buffers, Kernel};
-use crate::source::{Access, Source};
+use conefield_core::device::{Access, Source};
 use conefield_core::error::Result;
 use serde::Serialize;
 use std::time::Instant;

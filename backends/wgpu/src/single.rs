@@ -5,9 +5,9 @@ use crate::arena;
 use crate::compose::{self, Chain, GROUP};
 use crate::executable::Step;
 use crate::kernel::Buffers;
-use crate::source::Source;
 use crate::wave::{GpuRay, MOST_GROUPS};
 use conefield_core::arena::Arena;
+use conefield_core::device::Source;
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;
 use conefield_core::prior::Prior;
@@ -40,7 +40,7 @@ impl Runner for Shared {
             buffers.get(name).inspect(|b| gpu.write(b, 0, bytemuck::cast_slice(data)));
         }
         buffers.reserve(gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
-        let run = |label: &str, source: &crate::source::Source, step: Step, groups: usize| -> Result<()> {
+        let run = |label: &str, source: &Source, step: Step, groups: usize| -> Result<()> {
             buffers.get("step").inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(&step)));
             let kernel = self.kernels.get(gpu, label, source)?;
             let bound = kernel.bind(gpu, &buffers)?;

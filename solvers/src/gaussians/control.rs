@@ -6,9 +6,8 @@
 //! pruned. Slots are limited: if they run out, the Gaussians with the largest gradients are doubled.
 
 use super::shape::{CENTRE, DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, before_softplus};
-use crate::training::{Callback, Kept, Run, State, Update};
+use crate::training::{Callback, Kept, Run, State};
 use conefield_core::arena::Layout;
-use conefield_core::backend::{StepStats, Work};
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::stream;
 use rand::RngExt;
@@ -16,6 +15,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::f32::consts::TAU;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 /// Its name in checkpoints.
 const NAME: &str = "density-control";
@@ -72,26 +72,61 @@ pub struct DensityControl {
     settings: Control,
     /// Converts a derivative with respect to the centre to a pull.
     scale: f32,
-    /// Sums of pulls, and numbers of steps, per slot.
-    sums: Vec<f32>,
-    counts: Vec<f32>,
+    pulls: Arc<Mutex<Pulls>>,
     shape: [usize; 1],
+    /// The pulls in the checkpoint that is being written.
+    kept: OnceLock<Pulls>,
+}
+
+/// Pulls of Gaussians on their centres since the last act: sums, and numbers of steps, per slot. Training adds to them.
+#[derive(Debug, Default, Clone)]
+pub struct Pulls {
+    /// Lengths of the derivatives with respect to the centre.
+    pub sums: Vec<f32>,
+    /// Steps with such a derivative.
+    pub counts: Vec<f32>,
+}
+
+/// The pulls, which a panic in training cannot leave half written: they are numbers.
+pub fn lock(pulls: &Mutex<Pulls>) -> MutexGuard<'_, Pulls> {
+    pulls.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Pulls {
+    /// For `most` slots.
+    pub fn new(most: usize) -> Self {
+        Self { sums: vec![0.0; most], counts: vec![0.0; most] }
+    }
+
+    /// Adds those of a step.
+    pub fn add(&mut self, grads: &[f32]) {
+        for ((g, sum), count) in grads.chunks(NUMBERS).zip(&mut self.sums).zip(&mut self.counts) {
+            let size = (g[0] * g[0] + g[1] * g[1] + g[2] * g[2]).sqrt();
+            if size > 0.0 {
+                *sum += size;
+                *count += 1.0;
+            }
+        }
+    }
 }
 
 impl DensityControl {
-    /// For `most` slots; `scale` converts a derivative with respect to the centre to a pull.
-    pub fn new(settings: Control, most: usize, scale: f64) -> Self {
-        Self { settings, scale: scale as f32, sums: vec![0.0; most], counts: vec![0.0; most], shape: [most] }
+    /// Acts on `pulls`; `scale` converts a derivative with respect to the centre to a pull.
+    pub fn new(settings: Control, pulls: Arc<Mutex<Pulls>>, scale: f64) -> Self {
+        let shape = [lock(&pulls).sums.len()];
+        Self { settings, scale: scale as f32, pulls, shape, kept: OnceLock::new() }
     }
 
     /// Bytes for `most` slots.
     pub fn bytes(most: usize) -> u64 {
-        8 * most as u64
+        // Pulls, and their copy in a checkpoint.
+        16 * most as u64
     }
 
     /// Prunes, clones and splits; reports the numbers.
     fn act(&mut self, run: &mut Run<'_>) -> Result<()> {
         run.exe.fetch(&mut run.model)?;
+        let mut pulls = lock(&self.pulls);
         let arena = &mut run.model.arena;
         let set = self.settings;
         let (mut free, mut wanted, mut pruned) = (vec![], vec![], 0);
@@ -104,7 +139,7 @@ impl DensityControl {
                 free.push(i);
                 continue;
             }
-            let pull = self.scale * self.sums[i] / self.counts[i].max(1.0);
+            let pull = self.scale * pulls.sums[i] / pulls.counts[i].max(1.0);
             if pull >= set.pull as f32 {
                 wanted.push((pull, i));
             }
@@ -149,9 +184,9 @@ impl DensityControl {
             arena.second[own].fill(0.0);
         }
         run.exe.renew();
-        self.sums.fill(0.0);
-        self.counts.fill(0.0);
-        let there = self.sums.len() + cloned + split - free.len();
+        pulls.sums.fill(0.0);
+        pulls.counts.fill(0.0);
+        let there = pulls.sums.len() + cloned + split - free.len();
         run.tally.window.events.push(format!("{cloned} cloned, {split} split, {pruned} pruned: {there} Gaussians"));
         Ok(())
     }
@@ -163,33 +198,23 @@ impl Callback for DensityControl {
     }
 
     fn before_step(&mut self, run: &mut Run<'_>) -> Result<()> {
+        self.kept = OnceLock::new();
         let share = run.clock.share(run.step);
         let due = run.step > 0 && run.step.is_multiple_of(self.settings.every);
         if due && (self.settings.from..=self.settings.until).contains(&share) { self.act(run) } else { Ok(()) }
     }
 
-    fn after_gradients(&mut self, _: &Work<'_>, _: &StepStats, run: &mut Run<'_>) -> Result<Update> {
-        let grads = run.model.arena.grads.chunks(NUMBERS);
-        for ((g, sum), count) in grads.zip(&mut self.sums).zip(&mut self.counts) {
-            let size = (g[0] * g[0] + g[1] * g[1] + g[2] * g[2]).sqrt();
-            if size > 0.0 {
-                *sum += size;
-                *count += 1.0;
-            }
-        }
-        Ok(Update::Take)
-    }
-
     fn state<'a>(&'a self, _: &'a Layout) -> Result<State<'a>> {
+        let pulls = self.kept.get_or_init(|| lock(&self.pulls).clone());
         let tensor = |name: &str, values: &'a [f32]| (format!("{NAME}.{name}"), &self.shape[..], values);
-        let tensors = vec![tensor("sums", &self.sums), tensor("counts", &self.counts)];
+        let tensors = vec![tensor("sums", &pulls.sums), tensor("counts", &pulls.counts)];
         State::new(NAME, &Value::Null, tensors)
     }
 
     fn restore(&mut self, kept: &Kept<'_>, _: &Run<'_>) -> Result<()> {
         kept.value::<()>()?;
-        self.sums = kept.tensor(&format!("{NAME}.sums"), &self.shape)?;
-        self.counts = kept.tensor(&format!("{NAME}.counts"), &self.shape)?;
+        let tensor = |name: &str| kept.tensor(&format!("{NAME}.{name}"), &self.shape);
+        *lock(&self.pulls) = Pulls { sums: tensor("sums")?, counts: tensor("counts")? };
         Ok(())
     }
 }

@@ -4,10 +4,11 @@
 //! - [`view`]: line integrals for a view, in closed form and exact for cone beams. [`grid`], [`cells`]: values at
 //!   points of a grid, and at scattered points. [`lists`]: which Gaussian reaches what.
 //! - [`start`]: initial Gaussians. [`control`]: density control. [`ssim`]: structural similarity of views.
-//! - [`views`]: a training step. The training loop is the same as for every field.
+//! - [`views`]: a training step. The training loop is the same as for every field. [`device`]: all of it on a GPU.
 
 pub mod cells;
 pub mod control;
+pub mod device;
 pub mod grid;
 pub mod lists;
 pub mod shape;
@@ -32,7 +33,7 @@ use crate::solid;
 use crate::surround::{self, Corrected, Quiet};
 use crate::training::callbacks::{FieldMonitor, LiveSlices};
 use crate::training::{CallbackSpec, Callbacks, Draw, Run, Task, checkpoint, train};
-use conefield_core::backend::Adam;
+use conefield_core::backend::{Adam, Executable};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::loss::Loss;
 use conefield_core::method::{
@@ -45,13 +46,14 @@ use conefield_core::scene::{Scene, SceneSettings};
 use conefield_core::settings::{LossSpec, PriorSpec};
 use conefield_core::spec::stage as stages;
 use conefield_core::trained::{FieldVoxels, Placement, TrainedField};
-use control::{Control, DensityControl};
+use control::{Control, DensityControl, Pulls};
+use device::training::DeviceTraining;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::Mixture;
 use start::Start;
-use std::sync::Arc;
-use views::{Rule, ViewTraining};
+use std::sync::{Arc, Mutex};
+use views::{Rule, ViewTraining, Views};
 
 /// Most slots for Gaussians: 11 GiB with gradients and moments.
 const MOST: usize = 1 << 26;
@@ -196,6 +198,15 @@ impl Method for Gaussians {
         // Fails on a backend that does not support fields with their own line integrals.
         let (exe, compiled) = context.backend.compile(&pipeline)?;
         exe.admits(loss.as_ref(), &priors)?;
+        let device = context.backend.device();
+        if let Some(device) = &device {
+            DeviceTraining::check(device.as_ref(), loss.as_ref(), &priors, self.ssim)?;
+        }
+        let memory = match &device {
+            None => Memory::Host,
+            Some(device) if device.is_software() => Memory::Software,
+            Some(_) => Memory::Device,
+        };
         let stages = vec![StageLine::new("field", "gaussians", pipeline.field.as_ref())];
         let mut beside = vec![Line::new("loss", self.loss.type_name(), &loss.describe())];
         for (i, (p, spec)) in priors.iter().zip(&self.priors).enumerate() {
@@ -227,6 +238,7 @@ impl Method for Gaussians {
             pipeline,
             kept,
             held_out,
+            memory,
             outline: Outline { method, stages, beside, compiled: Some(compiled), links: vec![] },
         }))
     }
@@ -251,7 +263,17 @@ struct GaussianPlan {
     kept: u64,
     /// The key of the callback that uses held-out views.
     held_out: Option<String>,
+    memory: Memory,
     outline: Outline,
+}
+
+/// Whose memory training takes.
+#[derive(Clone, Copy)]
+enum Memory {
+    Host,
+    /// A device's that is the host's.
+    Software,
+    Device,
 }
 
 impl Plan for GaussianPlan {
@@ -264,7 +286,14 @@ impl Plan for GaussianPlan {
         let seen = scan.binned(self.bin);
         let bins = if self.bin > 1 { 4 * seen.pixels() } else { 0 };
         let begun = first().needs(scan).working + self.start.bytes(scan.voxels());
-        let training = ViewTraining::bytes(&seen, self.most as u64);
+        let slots = self.most as u64;
+        // On their way to a device, the views are here.
+        let views = 4 * seen.pixels();
+        let training = match self.memory {
+            Memory::Host => ViewTraining::bytes(&seen, slots),
+            Memory::Software => 2 * views + DeviceTraining::bytes(&seen, slots),
+            Memory::Device => views,
+        };
         let [surround, corrected] = surround::bytes(self.scene.surround, scan);
         let backend = self.outline.backend().scratch_bytes as u64;
         Needs {
@@ -314,15 +343,31 @@ impl Plan for GaussianPlan {
             }
         }
         let rule = Rule { views: self.training.views, ssim: self.ssim, rates: self.rates, widths };
-        let exe = match self.bin {
-            1 => ViewTraining::new(rule, job.scan, &scene),
-            bin => ViewTraining::new(rule, &job.scan.binned(bin), &scene),
+        let pulls = Arc::new(Mutex::new(Pulls::new(self.control.map_or(0, |_| self.most))));
+        let device = job.backend.device();
+        let padding = device.as_ref().map_or(ViewTraining::PADDING, |_| 0);
+        let views = match self.bin {
+            1 => Views::new(job.scan, &scene, padding),
+            bin => Views::new(&job.scan.binned(bin), &scene, padding),
+        };
+        let scale = views.half_detector() / views.top;
+        let exe: Box<dyn Executable> = match device {
+            Some(device) => {
+                let header = job.scan.header().binned(self.bin);
+                let bytes = DeviceTraining::bytes(&header, self.most as u64) + size_of_val(&*views.measured) as u64;
+                let parts = (self.loss.as_ref(), &self.priors[..]);
+                let resident = job.backend.place().holds(bytes);
+                if !resident {
+                    observer.note("the views do not fit on the device beside the Gaussians: each step loads its own");
+                }
+                Box::new(DeviceTraining::new(device, self.most, rule, (views, resident), parts, pulls.clone())?)
+            }
+            None => Box::new(ViewTraining::new(rule, views, pulls.clone())),
         };
         let mut callbacks = build_callbacks(&self.callbacks)?;
         callbacks.insert(0, Box::new(FieldMonitor::new(job, &scene, &model.pipeline)));
         if let Some(control) = self.control {
-            let scale = exe.half_detector() / exe.top();
-            callbacks.push(Box::new(DensityControl::new(control, self.most, scale)));
+            callbacks.push(Box::new(DensityControl::new(control, pulls, scale)));
         }
         callbacks.push(Box::new(LiveSlices));
         let mut callbacks = Callbacks(callbacks);
@@ -335,7 +380,7 @@ impl Plan for GaussianPlan {
             loss: self.loss.clone(),
             steps_an_epoch: views.div_ceil(self.training.views) as u64,
             report_every: self.training.report_every,
-            ..Run::new(job, &scene, observer, model, Box::new(exe))
+            ..Run::new(job, &scene, observer, model, exe)
         };
         if let Some(resume) = job.resume {
             checkpoint::restore(&mut run, &mut callbacks, resume)?;

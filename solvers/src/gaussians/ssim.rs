@@ -80,7 +80,7 @@ impl Ssim {
 }
 
 /// The window along one axis.
-fn window() -> [f32; TAPS] {
+pub(super) fn window() -> [f32; TAPS] {
     let raw: [f64; TAPS] = std::array::from_fn(|i| (-0.5 * ((i as f64 - REACH as f64) / 1.5).powi(2)).exp());
     let sum: f64 = raw.iter().sum();
     raw.map(|x| (x / sum) as f32)

@@ -3,13 +3,17 @@
 //! Training uses whole views and whole grids, which is faster ([`view`], [`grid`]); this module implements the same
 //! formula for everything else.
 
+use super::device::DeviceMixture;
 use super::grid::{self, Grid};
 use super::shape::{DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, Slope, V3, apply, cross, dot};
 use super::view;
+use conefield_core::device::Device;
+use conefield_core::error::Result;
 use conefield_core::parallel;
 use conefield_core::simd::Real;
 use conefield_core::stage::{
-    Field, GradKind, Grads, Info, Kernel, Lines, OnGrid, Parameter, Scope, Stage, Tile, TileMut, UnitGrid, UnitRay,
+    Field, GradKind, Grads, Info, Kernel, Lines, OnDevice, OnGrid, Parameter, Scope, Stage, Tile, TileMut, UnitGrid,
+    UnitRay,
 };
 use std::f64::consts::TAU;
 use std::ops::Range;
@@ -162,14 +166,14 @@ impl<R: Real> Kernel<R> for Mixture {
 
 /// Rays in similar directions: a Gaussian further from the first ray than `spread` plus its own reach meets none of
 /// them.
-struct Bundle {
+pub(super) struct Bundle {
     origin: V3,
     direction: V3,
-    spread: f64,
+    pub(super) spread: f64,
 }
 
 impl Bundle {
-    fn of(rays: &[UnitRay]) -> Option<Self> {
+    pub(super) fn of(rays: &[UnitRay]) -> Option<Self> {
         let of = |r: &UnitRay| (r.origin.map(f64::from), r.direction.map(f64::from));
         let (origin, direction) = of(rays.first()?);
         // No Gaussian has its centre beyond the cube's far side.
@@ -223,6 +227,10 @@ impl Mixture {
 impl Lines for Mixture {
     fn project(&self, params: &[f32], rays: &[UnitRay], out: &mut [f32]) {
         self.line_integrals(params, rays, out);
+    }
+
+    fn on_device(&self, device: Box<dyn Device>) -> Result<Box<dyn OnDevice>> {
+        Ok(Box::new(DeviceMixture::new(device, self.most)?))
     }
 }
 

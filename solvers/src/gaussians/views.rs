@@ -1,6 +1,7 @@
 //! Training on whole views: implements the executable that a backend provides for other fields.
 
 use super::cells::Cells;
+use super::control::{Pulls, lock};
 use super::grid::Grid;
 use super::shape::{CENTRE, DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, Slope, V3};
 use super::ssim::Ssim;
@@ -18,6 +19,7 @@ use conefield_core::scene::Scene;
 use conefield_core::simd::{self, Op, Select, Simd, SimdBase, SimdFloat, V, WIDEST, load, store};
 use conefield_core::stage::{UnitGrid, UnitRay};
 use rand::seq::SliceRandom;
+use std::sync::{Arc, Mutex};
 
 /// Rays that a worker renders at once.
 const TOGETHER: usize = 64;
@@ -39,14 +41,55 @@ pub struct Rule {
     pub widths: [f64; 2],
 }
 
-/// The views of a scan, with the working memory of a step.
+/// The views of a scan as training sees them.
+pub struct Views {
+    /// Their rays.
+    pub beams: Vec<Beam>,
+    /// Rows and columns.
+    pub detector: [usize; 2],
+    /// Measured line integrals in the scale that stages see, view after view, in padded rows.
+    pub measured: Vec<f32>,
+    /// The largest of them: what counts as a view's range.
+    pub top: f64,
+}
+
+impl Views {
+    /// The views of `scan`, with this many zeros after each row.
+    pub fn new(scan: &Scan, scene: &Scene, padding: usize) -> Self {
+        let g = &scan.geometry;
+        let beams: Vec<Beam> = (0..g.views.len()).map(|view| beam(g, view, scene)).collect();
+        let stride = g.detector[1] + padding;
+        let mut measured = vec![0.0; g.views.len() * g.detector[0] * stride];
+        let rows = scan.projections.rows().into_iter();
+        for (out, row) in measured.chunks_mut(stride).zip(rows) {
+            out.iter_mut().zip(row).for_each(|(out, a)| *out = scene.line_to_unit(*a));
+        }
+        let top = measured.iter().fold(1e-12, |top: f64, x| top.max(f64::from(*x)));
+        Self { beams, detector: g.detector, measured, top }
+    }
+
+    /// The measured line integrals of a view.
+    pub fn image(&self, view: usize) -> &[f32] {
+        let size = self.measured.len() / self.beams.len();
+        &self.measured[view * size..(view + 1) * size]
+    }
+
+    /// The shift of a centre in the cube that moves its projection by half the detector.
+    pub fn half_detector(&self) -> f64 {
+        let beam = &self.beams[0];
+        let [rows, columns] = beam.detector.map(|n| n as f64);
+        let norm = |v: V3| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+        let middle: V3 = std::array::from_fn(|k| beam.first[k] + 0.5 * (columns * beam.u[k] + rows * beam.v[k]));
+        let to_cube = norm(std::array::from_fn(|k| 0.5 - beam.source[k]));
+        0.5 * (columns * norm(beam.u)).max(rows * norm(beam.v)) * to_cube / norm(middle)
+    }
+}
+
+/// Training on the CPU: the views of a scan, with the working memory of a step.
 pub struct ViewTraining {
     rule: Rule,
-    beams: Vec<Beam>,
-    /// Measured line integrals in the scale that stages see, view after view, in padded rows.
-    measured: Vec<f32>,
-    /// The line integral that counts as a view's range.
-    top: f64,
+    views: Views,
+    pulls: Arc<Mutex<Pulls>>,
     rates: [f32; PATTERN],
     shapes: Vec<Shape>,
     sight: Sight<f32>,
@@ -71,17 +114,11 @@ pub fn beam(geometry: &Geometry, view: usize, scene: &Scene) -> Beam {
 }
 
 impl ViewTraining {
-    /// Training on the views of `scan`.
-    pub fn new(rule: Rule, scan: &Scan, scene: &Scene) -> Self {
-        let g = &scan.geometry;
-        let beams: Vec<Beam> = (0..g.views.len()).map(|view| beam(g, view, scene)).collect();
-        let stride = g.detector[1] + WIDEST;
-        let mut measured = vec![0.0; g.views.len() * g.detector[0] * stride];
-        let rows = scan.projections.rows().into_iter();
-        for (out, row) in measured.chunks_mut(stride).zip(rows) {
-            out.iter_mut().zip(row).for_each(|(out, a)| *out = scene.line_to_unit(*a));
-        }
-        let top = measured.iter().fold(1e-12, |top: f64, x| top.max(f64::from(*x)));
+    /// Zeros after each row of the views: vectors reach past the last pixel.
+    pub const PADDING: usize = WIDEST;
+
+    /// Training on `views`, which are padded by [`Self::PADDING`]; the pulls on centres are added to `pulls`.
+    pub fn new(rule: Rule, views: Views, pulls: Arc<Mutex<Pulls>>) -> Self {
         let mut rates = [1.0; PATTERN];
         for (i, rate) in rates.iter_mut().enumerate() {
             *rate = match i % NUMBERS {
@@ -91,12 +128,12 @@ impl ViewTraining {
                 _ => 1.0,
             };
         }
-        let images = || vec![0.0; g.detector[0] * stride];
+        let [rows, columns] = views.detector;
+        let images = || vec![0.0; rows * (columns + WIDEST)];
         Self {
             rule,
-            beams,
-            measured,
-            top,
+            views,
+            pulls,
             rates,
             shapes: vec![],
             sight: Sight::default(),
@@ -115,29 +152,14 @@ impl ViewTraining {
         4 * image * (header.views as u64 + 2) + Ssim::bytes(image) + each as u64 * places
     }
 
-    /// The largest measured line integral, in the scale that stages see.
-    pub fn top(&self) -> f64 {
-        self.top
-    }
-
-    /// The shift of a centre in the cube that moves its projection by half the detector.
-    pub fn half_detector(&self) -> f64 {
-        let beam = &self.beams[0];
-        let [rows, columns] = beam.detector.map(|n| n as f64);
-        let norm = |v: V3| v.iter().map(|x| x * x).sum::<f64>().sqrt();
-        let middle: V3 = std::array::from_fn(|k| beam.first[k] + 0.5 * (columns * beam.u[k] + rows * beam.v[k]));
-        let to_cube = norm(std::array::from_fn(|k| 0.5 - beam.source[k]));
-        0.5 * (columns * norm(beam.u)).max(rows * norm(beam.v)) * to_cube / norm(middle)
-    }
-
     /// The mean loss of a view's pixels and the weighted dissimilarity; `slopes` gets the derivatives with respect to
     /// the shapes of the view's share of the step.
     fn view(&mut self, view: usize, loss: &dyn Loss) -> [f64; 2] {
-        let Self { rule, beams, measured, shapes, sight, slopes, found, gradient, ssim, top, .. } = self;
-        let beam = &beams[view];
+        let Self { rule, views, shapes, sight, slopes, found, gradient, ssim, .. } = self;
+        let beam = &views.beams[view];
         let [rows, columns] = beam.detector;
         let stride = columns + WIDEST;
-        let wanted = &measured[view * rows * stride..(view + 1) * rows * stride];
+        let wanted = views.image(view);
         sight.project(beam, shapes, found);
         let share = 1.0 / rule.views as f64;
         let scale = share / (rows * columns) as f64;
@@ -157,7 +179,7 @@ impl ViewTraining {
         let mut unlike = 0.0;
         if rule.ssim > 0.0 {
             let weight = -rule.ssim * share;
-            unlike = rule.ssim * (1.0 - ssim.add([found, wanted], [columns, stride], *top, weight, gradient));
+            unlike = rule.ssim * (1.0 - ssim.add([found, wanted], [columns, stride], views.top, weight, gradient));
         }
         sight.backproject(beam, shapes, gradient, slopes);
         [sums.iter().sum::<f64>() * scale, unlike * share]
@@ -193,7 +215,7 @@ impl ViewTraining {
 }
 
 /// The views of step `step` (from 0): every view once before any repeats, in a new order each time.
-fn drawn(seed: u64, step: u64, views: usize, count: usize) -> impl Iterator<Item = usize> {
+pub(super) fn drawn(seed: u64, step: u64, views: usize, count: usize) -> impl Iterator<Item = usize> {
     (0..views as u64).map(move |i| {
         let turn = step * views as u64 + i;
         let mut order: Vec<usize> = (0..count).collect();
@@ -209,11 +231,11 @@ impl Executable for ViewTraining {
         self.slopes.resize(self.shapes.len(), Slope::default());
         arena.grads.fill(0.0);
         let mut stats = StepStats::default();
-        for view in drawn(work.seed, work.step, self.rule.views, self.beams.len()) {
+        for view in drawn(work.seed, work.step, self.rule.views, self.views.beams.len()) {
             let [loss, unlike] = self.view(view, work.loss);
             stats.loss += loss;
             stats.prior += unlike;
-            stats.samples += self.beams[view].detector.iter().product::<usize>() as u64;
+            stats.samples += self.views.detector.iter().product::<usize>() as u64;
             let (slopes, shapes) = (&self.slopes, &self.shapes);
             let parts = arena.grads.chunks_mut(PART * NUMBERS).zip(arena.params.chunks(PART * NUMBERS));
             parallel::over(parts, |n, (grads, params)| {
@@ -234,6 +256,7 @@ impl Executable for ViewTraining {
     }
 
     fn update(&mut self, model: &mut Model, adam: &Adam) -> Result<()> {
+        lock(&self.pulls).add(&model.arena.grads);
         let bias = [adam.beta1, adam.beta2].map(|b| 1.0 - b.powf(adam.step as f64));
         let rule = AdamRule {
             rate: (adam.lr / bias[0]) as f32,

@@ -12,6 +12,7 @@ mod core_modules;
 mod crates;
 mod drift;
 mod gaussians;
+mod gaussians_on_device;
 mod guard;
 mod live;
 mod masks;

@@ -3,7 +3,7 @@
 use super::launch::{Room, Task, each, summing};
 use super::{Array, Mask, flag, parts, plane};
 use crate::Shared;
-use crate::source::{Access, Source};
+use conefield_core::device::{Access, Source};
 use conefield_core::error::Result;
 use conefield_core::place::{Map, Reduction};
 use ndarray::ArrayView3;

@@ -6,7 +6,7 @@
 use super::launch::{Room, Task, each};
 use super::{Array, parts, plane};
 use crate::Shared;
-use crate::source::{Access, Source};
+use conefield_core::device::{Access, Source};
 use conefield_core::error::Result;
 use conefield_core::parallel;
 use conefield_core::place::FilteredViews;

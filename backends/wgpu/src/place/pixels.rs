@@ -2,8 +2,7 @@
 
 use super::launch::{Room, Task, each, summing};
 use super::{Array, Chunk, DevicePlace, flag, parts, plane};
-use crate::compose::fragment_of;
-use crate::source::{Access, Source};
+use conefield_core::device::{Access, Source, fragment_of};
 use conefield_core::error::Result;
 use conefield_core::place::{Place, Weighing};
 use conefield_core::wgsl::Fragment;

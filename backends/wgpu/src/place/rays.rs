@@ -3,9 +3,9 @@
 use super::launch::{Room, Task, each};
 use super::{Array, parts, plane};
 use crate::Shared;
-use crate::compose::fragment_of;
 use crate::device::Atomics;
-use crate::source::{Access, Source};
+use crate::source::validate;
+use conefield_core::device::{Access, Source, fragment_of};
 use conefield_core::error::Result;
 use conefield_core::geometry::{Geometry, norm, sub};
 use conefield_core::voxel::VoxelProjector;
@@ -88,7 +88,7 @@ impl<'a> Walks<'a> {
 
     /// Refuses invalid WGSL.
     pub(super) fn validate(&self) -> Result<()> {
-        [true, false].into_iter().try_for_each(|forward| self.kernel(forward).validate())
+        [true, false].into_iter().try_for_each(|forward| validate(&self.kernel(forward)))
     }
 
     pub(super) fn forward(

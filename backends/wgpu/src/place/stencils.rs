@@ -7,9 +7,8 @@
 use super::launch::{ARRAY, Room, Task, each, summing};
 use super::{Array, Chunk, flag, parts, plane};
 use crate::Shared;
-use crate::compose::fragment_of;
-use crate::source::{Access, Source};
 use Access::{Read, Write};
+use conefield_core::device::{Access, Source, fragment_of};
 use conefield_core::error::Result;
 use conefield_core::place::{ProximalStep, Slab, VariationSlope};
 use conefield_core::regularizer::{Bounds, Dual, Guide, Kernels};

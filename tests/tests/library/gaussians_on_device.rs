@@ -1,0 +1,309 @@
+//! Gaussians on a device agree with the CPU's: gradients, updates, values, line integrals, whole runs.
+
+use crate::common::psnr;
+use crate::device::backends;
+use conefield_backend_cpu::Cpu;
+use conefield_backend_wgpu::{Limits, Wgpu};
+use conefield_core::backend::{Adam, Backend, BlockWork, Executable, Work};
+use conefield_core::device::{Device, Launch, Program};
+use conefield_core::error::Result;
+use conefield_core::loss::Loss;
+use conefield_core::pipeline::{Model, Pipeline};
+use conefield_core::prior::Prior;
+use conefield_core::scan::Scan;
+use conefield_core::scene::{Scene, SceneSettings};
+use conefield_core::settings::{LossSpec, PriorSpec};
+use conefield_core::stage::UnitGrid;
+use conefield_projectors::simulate::{Protocol, simulate};
+use conefield_solvers::gaussians::control::Pulls;
+use conefield_solvers::gaussians::device::training::DeviceTraining;
+use conefield_solvers::gaussians::shape::{FREE, NUMBERS};
+use conefield_solvers::gaussians::stage::Mixture;
+use conefield_solvers::gaussians::views::{Rule, ViewTraining, Views};
+use conefield_solvers::losses::L1;
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use serde_json::json;
+use std::sync::{Arc, Mutex};
+
+const MOST: usize = 150;
+
+/// Five views of 37 × 45 pixels; from a cone, or from a source so far away that its rays are parallel.
+fn views(source: f64) -> Scan {
+    let protocol: Protocol = serde_json::from_value(json!({
+        "dso": source, "dsd": source + 250.0, "detector": [37, 45], "extent": {"side": [200.0, 240.0]},
+        "angles": {"even": {"views": 5}},
+    }))
+    .unwrap();
+    simulate(&crate::common::truth(), &protocol).unwrap()
+}
+
+/// Gaussians of all shapes, with widths from this one to 12 times it; every seventh slot is free.
+fn mixture(least: f32) -> Model {
+    let mut model = Model::random(Pipeline::alone(Box::new(Mixture { most: MOST })).unwrap(), 0);
+    let mut rng = StdRng::seed_from_u64(3);
+    for (i, p) in model.arena.params.chunks_mut(NUMBERS).enumerate() {
+        for (k, x) in p.iter_mut().enumerate() {
+            let r: f32 = rng.random();
+            *x = match k {
+                0..3 => 0.1 + 0.8 * r,
+                3..6 => least.ln() + r * 2.5,
+                6..10 => 2.0 * r - 1.0,
+                _ => -4.0 + 4.0 * r,
+            };
+        }
+        if i % 7 == 3 {
+            p[10] = FREE;
+        }
+    }
+    model
+}
+
+/// Devices whose buffers are large enough.
+fn on_devices() -> Vec<(&'static str, Wgpu)> {
+    backends("Gaussians").into_iter().filter(|(limits, _)| *limits != "small buffers").collect()
+}
+
+struct Both {
+    scan: Scan,
+    scene: Scene,
+    rule: Rule,
+    loss: Box<dyn Loss>,
+    priors: Vec<Box<dyn Prior>>,
+}
+
+impl Both {
+    fn new(source: f64, ssim: f64, prior: bool) -> Self {
+        let scan = views(source);
+        let scene = Scene::with_attenuation(scan.geometry.volume, &SceneSettings::default(), 0.02).unwrap();
+        let rule = Rule { views: 2, ssim, rates: [0.02, 2.0, 0.2], widths: [0.005, 0.25] };
+        let tv = json!({"type": "total-variation", "weight": 0.3, "blocks": 2, "edge": 9});
+        let tv: Box<dyn PriorSpec> = serde_json::from_value(tv).unwrap();
+        let priors = if prior { vec![tv.build().unwrap()] } else { vec![] };
+        Self { scan, scene, rule, loss: LossSpec::build(&L1 {}).unwrap(), priors }
+    }
+
+    fn on(&self, backend: &dyn Backend, resident: bool, pulls: &Arc<Mutex<Pulls>>) -> Box<dyn Executable> {
+        match backend.device() {
+            None => {
+                let views = Views::new(&self.scan, &self.scene, ViewTraining::PADDING);
+                Box::new(ViewTraining::new(self.rule, views, pulls.clone()))
+            }
+            Some(device) => {
+                let views = (Views::new(&self.scan, &self.scene, 0), resident);
+                let parts = (self.loss.as_ref(), &self.priors[..]);
+                Box::new(DeviceTraining::new(device, MOST, self.rule, views, parts, pulls.clone()).unwrap())
+            }
+        }
+    }
+
+    fn blocks<'a>(&'a self, corners: &'a [[f32; 3]]) -> Vec<BlockWork<'a>> {
+        let spacing = [0.03, 0.035, 0.04];
+        self.priors.iter().map(|p| BlockWork { prior: p.as_ref(), corners, spacing }).collect()
+    }
+
+    fn work<'a>(&'a self, step: u64, priors: &'a [BlockWork<'a>]) -> Work<'a> {
+        Work { step, seed: 5, loss: self.loss.as_ref(), rays: &[], points: &[], priors }
+    }
+}
+
+/// Asserts that two arrays agree within `share` of the largest number of each of 11 kinds.
+fn close(found: &[f32], wanted: &[f32], share: f32, what: &str) {
+    for kind in 0..NUMBERS {
+        let of = |x: &[f32]| x.iter().skip(kind).step_by(NUMBERS).copied().collect::<Vec<f32>>();
+        let (found, wanted) = (of(found), of(wanted));
+        let largest = wanted.iter().fold(0.0f32, |m, x| m.max(x.abs()));
+        for (i, (a, b)) in found.iter().zip(&wanted).enumerate() {
+            assert!(
+                (a - b).abs() <= share * largest,
+                "{what}, number {kind} of Gaussian {i}: {a} for {b} of {largest}"
+            );
+        }
+    }
+}
+
+#[test]
+fn gradients_and_updates_are_those_of_the_cpu() {
+    for (limits, backend) in on_devices() {
+        for (source, ssim, prior, resident) in
+            [(500.0, 0.0, false, true), (500.0, 0.5, false, false), (500.0, 0.5, true, true), (1e8, 0.5, true, true)]
+        {
+            let what = format!("{limits}, source at {source}, ssim {ssim}, prior {prior}");
+            let both = Both::new(source, ssim, prior);
+            let corners = [[0.2, 0.3, 0.25], [0.45, 0.1, 0.5]];
+            let priors = both.blocks(&corners);
+            let backends: [&dyn Backend; 2] = [&Cpu::new(), &backend];
+            let [host, device] = backends.map(|backend| {
+                let pulls = Arc::new(Mutex::new(Pulls::new(MOST)));
+                let (mut model, mut exe) = (mixture(0.01), both.on(backend, resident, &pulls));
+                let mut stats = vec![];
+                for step in 0..2 {
+                    stats.push(exe.step(&mut model, &both.work(step, &priors)).unwrap());
+                    if step == 0 {
+                        let adam = Adam { lr: 1e-4, beta1: 0.9, beta2: 0.999, eps: 1e-8, step: 1 };
+                        exe.update(&mut model, &adam).unwrap();
+                    }
+                }
+                exe.fetch(&mut model).unwrap();
+                let pulls = pulls.lock().unwrap().clone();
+                (model, stats, pulls)
+            });
+            for (a, b) in host.1.iter().zip(&device.1) {
+                let near = |a: f64, b: f64| (a - b).abs() <= 2e-5 * a.abs();
+                assert!(near(a.loss, b.loss) && near(a.prior, b.prior), "{what}: {a:?} {b:?}");
+                assert!(a.samples == b.samples && a.loss > 0.0, "{what}: {a:?} {b:?}");
+            }
+            let (a, b) = (&host.0.arena, &device.0.arena);
+            close(&b.grads, &a.grads, 2e-3, &format!("{what}: gradients"));
+            close(&b.first, &a.first, 2e-3, &format!("{what}: first moments"));
+            close(&b.params, &a.params, 1e-4, &format!("{what}: parameters"));
+            let pulls = |p: &Pulls| p.sums.iter().sum::<f32>();
+            assert!((pulls(&host.2) - pulls(&device.2)).abs() < 1e-3 * pulls(&host.2), "{what}");
+            assert_eq!(host.2.counts, device.2.counts, "{what}");
+            assert!(a.grads.iter().any(|g| *g != 0.0));
+        }
+    }
+}
+
+#[test]
+fn values_and_line_integrals_are_those_of_the_cpu() {
+    let (model, scan) = (mixture(0.04), views(500.0));
+    let scene = Scene::with_attenuation(scan.geometry.volume, &SceneSettings::default(), 0.02).unwrap();
+    let grid = UnitGrid { first: [0.1, 0.2, 0.05], spacing: [0.021, 0.03, 0.017], shape: [19, 21, 23] };
+    let mut rng = StdRng::seed_from_u64(4);
+    let points: Vec<[f32; 3]> = (0..333).map(|_| std::array::from_fn(|_| rng.random())).collect();
+    let rays: Vec<_> = (0..37 * 45).map(|i| scene.pixel_ray(&scan.geometry, i % 5, i / 45, i % 45)).collect();
+    let all = |backend: &dyn Backend| {
+        let mut exe = backend.compile(&model.pipeline).unwrap().0;
+        let mut found = [vec![0.0; 19 * 21 * 23], vec![0.0; points.len()], vec![0.0; rays.len()]];
+        exe.values(&model, &grid, &mut found[0]).unwrap();
+        exe.evaluate(&model, &points, &mut found[1]).unwrap();
+        exe.render(&model, &rays, &mut found[2]).unwrap();
+        found
+    };
+    let wanted = all(&Cpu::new());
+    // Lists larger than a buffer: a grid in pieces, fewer cells.
+    let little = Limits { binding_bytes: Some(40_000), ..Limits::default() };
+    let mut backends = on_devices();
+    if !backends.is_empty() {
+        backends.push(("small lists", Wgpu::with_limits(None, little).unwrap()));
+    }
+    for (limits, backend) in backends {
+        for (name, (found, wanted)) in ["grid", "points", "rays"].iter().zip(all(&backend).iter().zip(&wanted)) {
+            let largest = wanted.iter().fold(0.0f32, |m, x| m.max(x.abs()));
+            assert!(largest > 0.0);
+            for (i, (a, b)) in found.iter().zip(wanted).enumerate() {
+                assert!((a - b).abs() < 1e-3 * largest, "{limits}, {name} {i}: {a} for {b} of {largest}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_run_ends_where_the_cpu_does() {
+    let settings = json!({
+        "type": "gaussians", "most": 1500, "start": {"count": 800, "threshold": 0.1, "sites": "cells"}, "ssim": 0.1,
+        "training": {"steps": 150, "report_every": 50}, "optimizer": {"lr": 0.01},
+        "priors": [{"type": "total-variation", "weight": 0.01, "blocks": 1, "edge": 6}],
+        "density_control": {"every": 10, "pull": 1e-4},
+    });
+    let (wanted, _) = psnr(&settings, &Cpu::new());
+    for (limits, backend) in on_devices() {
+        let (found, records) = psnr(&settings, &backend);
+        println!("{limits}: {found:.3} dB, the CPU {wanted:.3} dB");
+        assert!((found - wanted).abs() < 0.3, "{found} {wanted}");
+        assert!(records.iter().any(|r| r.events.iter().any(|e| e.contains("cloned"))), "no density control");
+    }
+}
+
+/// A device that counts launches and submissions.
+struct Counting {
+    inner: Box<dyn Device>,
+    counts: Arc<Mutex<[usize; 2]>>,
+}
+
+impl Device for Counting {
+    fn name(&self) -> String {
+        self.inner.name()
+    }
+    fn is_software(&self) -> bool {
+        self.inner.is_software()
+    }
+    fn most_bytes(&self) -> u64 {
+        self.inner.most_bytes()
+    }
+    fn admits(&self, program: &Program) -> Result<()> {
+        self.inner.admits(program)
+    }
+    fn reserve(&mut self, name: &str, bytes: u64) -> Result<()> {
+        self.inner.reserve(name, bytes)
+    }
+    fn write(&mut self, name: &str, data: &[u8]) -> Result<()> {
+        self.inner.write(name, data)
+    }
+    fn read(&mut self, name: &str, at: u64, out: &mut [u8]) -> Result<()> {
+        self.inner.read(name, at, out)
+    }
+    fn copy(&mut self, from: &str, at: u64, to: &str, bytes: u64) -> Result<()> {
+        self.inner.copy(from, at, to, bytes)
+    }
+    fn run(&mut self, launches: &[Launch<'_>]) -> Result<()> {
+        let mut counts = self.counts.lock().unwrap();
+        *counts = [counts[0] + launches.len(), counts[1] + 1];
+        self.inner.run(launches)
+    }
+}
+
+/// A step moves numbers: views stay on the device, and so do Gaussians with their gradients and moments.
+#[test]
+fn a_step_moves_numbers_and_launches_few_kernels() {
+    for (limits, backend) in on_devices() {
+        // Bytes of a view that is not resident: 37 × 45 pixels, of which two are taken.
+        for (resident, ssim, prior, bytes, launches) in [
+            (true, 0.5, false, 0, 26),
+            (false, 0.5, false, 2 * 4 * 37 * 45, 26),
+            (true, 0.0, false, 0, 18),
+            (true, 0.5, true, 160, 44),
+        ] {
+            let both = Both::new(500.0, ssim, prior);
+            let corners = [[0.2, 0.3, 0.25], [0.45, 0.1, 0.5]];
+            let priors = both.blocks(&corners);
+            let counts = Arc::new(Mutex::new([0; 2]));
+            let device = Box::new(Counting { inner: backend.device().unwrap(), counts: counts.clone() });
+            let views = (Views::new(&both.scan, &both.scene, 0), resident);
+            let parts = (both.loss.as_ref(), &both.priors[..]);
+            let pulls = Arc::new(Mutex::new(Pulls::new(MOST)));
+            let (mut model, adam) = (mixture(0.01), Adam { lr: 1e-4, beta1: 0.9, beta2: 0.999, eps: 1e-8, step: 1 });
+            let mut exe = DeviceTraining::new(device, MOST, both.rule, views, parts, pulls).unwrap();
+            let mut step = |step| {
+                exe.step(&mut model, &both.work(step, &priors)).unwrap();
+                exe.update(&mut model, &adam).unwrap();
+            };
+            // The first one loads the Gaussians, and makes the buffers.
+            step(0);
+            let (before, first) = (backend.moved(), *counts.lock().unwrap());
+            step(1);
+            let (after, second) = (backend.moved(), *counts.lock().unwrap());
+            let what = format!("{limits}, resident {resident}, ssim {ssim}, prior {prior}");
+            // Bins and view of two views, the rule; bins and grid of each block.
+            assert_eq!(after.to_device - before.to_device, 2 * (32 + 128) + 48 + bytes, "{what}");
+            assert_eq!(after.from_device - before.from_device, 16, "{what}");
+            assert_eq!(second[0] - first[0], launches, "{what}");
+        }
+    }
+}
+
+/// What a device cannot hold is an error that says so.
+#[test]
+fn too_small_buffers_are_refused() {
+    for (limits, backend) in backends("Gaussians") {
+        let Err(e) =
+            backend.compile(&mixture(0.01).pipeline).unwrap().0.evaluate(&mixture(0.01), &[[0.5; 3]], &mut [0.0])
+        else {
+            assert_ne!(limits, "small buffers");
+            continue;
+        };
+        assert_eq!(limits, "small buffers", "{e}");
+        assert!(e.to_string().contains("2048 that a kernel may read"), "{e}");
+    }
+}
