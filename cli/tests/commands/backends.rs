@@ -23,9 +23,9 @@ fn scan(dir: &Path, voxels: usize, views: usize) -> PathBuf {
     path
 }
 
-fn reconstruct(scan: &Path, run: &Path, more: &[&str]) -> Value {
+fn reconstruct(scan: &Path, run: &Path, spec: &str, more: &[&str]) -> Value {
     let (scan, run) = (text(scan), text(run));
-    let all = ["reconstruct", &scan, "--spec", "ni-naf", "-o", &run, "--reference", "truth", "--json"];
+    let all = ["reconstruct", &scan, "--spec", spec, "-o", &run, "--reference", "truth", "--json"];
     serde_json::from_str(&done(&[&all[..], more].concat())).unwrap()
 }
 
@@ -76,7 +76,7 @@ fn ni_naf_ends_where_the_cpu_ends() {
     let run = |backend: &str| {
         let settings = ["--steps=320", "--set=training.rays=64", "--set=projector.samples=48"];
         let tables = ["--set=encoder.log2_table_size=14", "--backend", backend];
-        let record = reconstruct(&scan, &dir.path().join(backend), &[&settings[..], &tables].concat());
+        let record = reconstruct(&scan, &dir.path().join(backend), "ni-naf", &[&settings[..], &tables].concat());
         assert!(record["backend"]["backend"].as_str().unwrap().starts_with(backend));
         let psnr = record["scores"]["psnr"].as_f64().unwrap();
         println!("{backend}: {psnr:.3} dB, {} parameters", record["parameters"]);
@@ -86,6 +86,28 @@ fn ni_naf_ends_where_the_cpu_ends() {
     assert!((cpu - gpu).abs() < 0.1, "CPU {cpu} dB, GPU {gpu} dB");
     assert_eq!(parameters, on_gpu, "the mask keeps the same channels");
     assert!(cpu > 15.0, "{cpu} dB is no reconstruction");
+}
+
+/// Both specs of Gaussians, the published one with its prior and its density control, end at the same PSNR.
+#[test]
+fn gaussians_end_where_the_cpu_ends() {
+    if !adapter("runs of Gaussians") {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let scan = scan(dir.path(), 32, 20);
+    let control = ["--set=density_control.every=20", "--set=density_control.from=0"];
+    for (spec, more) in [("gaussians", &[][..]), ("gaussians-published", &control)] {
+        let psnr = ["cpu", "wgpu"].map(|backend| {
+            let fixed = ["--set=start.count=800", "--set=most=1200", "--steps=50", "--backend", backend];
+            let record = reconstruct(&scan, &dir.path().join(spec).join(backend), spec, &[&fixed, more].concat());
+            assert!(record["backend"]["backend"].as_str().unwrap().starts_with(backend));
+            record["scores"]["psnr"].as_f64().unwrap()
+        });
+        println!("{spec}: {psnr:?} dB");
+        assert!((psnr[0] - psnr[1]).abs() < 0.01, "{spec}: {psnr:?} dB");
+        assert!(psnr[0] > 15.0, "{psnr:?} dB is no reconstruction");
+    }
 }
 
 const TINY: [&str; 5] = [
@@ -125,23 +147,27 @@ fn an_interrupted_run_goes_on_on_the_other_backend() {
     }
     let dir = tempfile::tempdir().unwrap();
     let scan = scan(dir.path(), 16, 8);
-    for (first, second) in [("wgpu", "cpu"), ("cpu", "wgpu")] {
-        let run = dir.path().join(first);
-        let command = [&["--steps=400", "--checkpoint-every=0.01s"][..], &TINY].concat();
-        let fixed = ["reconstruct", &text(&scan), "--spec", "ni-naf", "-o", &text(&run), "--reference", "truth"];
-        killed_at_a_checkpoint(&run, &[&fixed[..], &["--backend", first], &command].concat());
-        let record = reconstruct(&scan, &run, &[&command[..], &["--backend", second, "--resume"]].concat());
-        assert_eq!(record["steps"], 400);
-        assert!(record["backend"]["backend"].as_str().unwrap().starts_with(second));
+    let few = ["--set=start.count=300", "--set=most=400", "--set=density_control.every=50"];
+    for (spec, steps, settings) in [("ni-naf", 400, &TINY[..]), ("gaussians", 120, &few)] {
+        let of = |name: &str| dir.path().join(spec).join(name);
+        for (first, second) in [("wgpu", "cpu"), ("cpu", "wgpu")] {
+            let (run, end) = (of(first), format!("--steps={steps}"));
+            let command = [&[&*end, "--checkpoint-every=0.01s"][..], settings].concat();
+            let fixed = ["reconstruct", &text(&scan), "--spec", spec, "-o", &text(&run), "--reference", "truth"];
+            killed_at_a_checkpoint(&run, &[&fixed[..], &["--backend", first], &command].concat());
+            let record = reconstruct(&scan, &run, spec, &[&command[..], &["--backend", second, "--resume"]].concat());
+            assert_eq!(record["steps"], steps);
+            assert!(record["backend"]["backend"].as_str().unwrap().starts_with(second));
+        }
+        let volumes = ["cpu", "wgpu"].map(|backend| {
+            let path = text(&of(backend).with_extension("npy"));
+            done(&["export", &text(&of("wgpu")), "-o", &path, "--backend", backend]);
+            path
+        });
+        let scores: Value = serde_json::from_str(&done(&["evaluate", &volumes[0], &volumes[1], "--json"])).unwrap();
+        // Relative to the volume's largest value: single precision.
+        assert!(scores["psnr"].as_f64().unwrap() > 80.0, "{spec}: {scores}");
     }
-    let volumes = ["cpu", "wgpu"].map(|backend| {
-        let path = text(&dir.path().join(format!("{backend}.npy")));
-        done(&["export", &text(&dir.path().join("wgpu")), "-o", &path, "--backend", backend]);
-        path
-    });
-    let scores: Value = serde_json::from_str(&done(&["evaluate", &volumes[0], &volumes[1], "--json"])).unwrap();
-    // Relative to the volume's largest value: single precision, over 400 steps.
-    assert!(scores["psnr"].as_f64().unwrap() > 80.0, "{scores}");
 }
 
 /// Several adapters share a volume, of which one checkpoint is whole; here it is the same adapter twice.
@@ -176,7 +202,9 @@ fn several_adapters_share_a_volume() {
     assert!(e.contains("wgpu:0,0") && e.contains("one adapter"), "{e}");
     let e = refused(&["reconstruct", &scan, "--budget", "9s", "-o", &at("timed")]);
     assert!(e.contains("one adapter within a budget"), "{e}");
-    let e = refused(&["reconstruct", &scan, "--spec", "fast", "-o", &at("field")]);
-    assert!(e.contains("a field is trained by one"), "{e}");
+    for spec in ["fast", "gaussians"] {
+        let e = refused(&["reconstruct", &scan, "--spec", spec, "-o", &at("field")]);
+        assert!(e.contains("a field is trained by one"), "{e}");
+    }
     assert!(!dir.path().join("field").join("spec.toml").exists(), "nothing was begun");
 }

@@ -207,7 +207,8 @@ impl Method for Gaussians {
             Some(device) if device.is_software() => Memory::Software,
             Some(_) => Memory::Device,
         };
-        let stages = vec![StageLine::new("field", "gaussians", pipeline.field.as_ref())];
+        // The field has kernels of its own in place of a fragment.
+        let stages = vec![StageLine { wgsl: true, ..StageLine::new("field", "gaussians", pipeline.field.as_ref()) }];
         let mut beside = vec![Line::new("loss", self.loss.type_name(), &loss.describe())];
         for (i, (p, spec)) in priors.iter().zip(&self.priors).enumerate() {
             beside.push(Line::new(&format!("priors.{i}"), spec.type_name(), &p.describe()));
