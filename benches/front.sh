@@ -9,7 +9,7 @@ cd "$(dirname "$0")/.."
 source benches/common.sh
 data=$1
 out=$2
-front=${3:-specs/tradeoff/front.toml}
+front=${3:-conefield/specs/tradeoff/front.toml}
 cargo build --release --quiet --bin conefield
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 mkdir -p "$out"

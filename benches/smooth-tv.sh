@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # What each part of smooth-tv is worth, and what similar patches and Gaussians add to it:
-#   bash benches/smooth-tv.sh DATA_FOLDER OUT_FOLDER [VARIANTS [SEEDS [VOLUMES [VIEWS]]]]
+#   bash benches/smooth-tv.sh DATA_FOLDER OUT_FOLDER [VARIANTS [SEEDS [VOLUMES [VIEWS [BACKEND]]]]]
 # VARIANTS: total-variation along-edges merged shipped three-from-144 three-from-128 (the default: all of these), smooth-patches,
 # gaussians, smooth-gaussians. Each runs on VIEWS (50) noisy views of each of VOLUMES; each of SEEDS ("0") is another noise. Prints mean and
 # half the range of PSNR, the mean of ssim_2d and the longest time. Passes and steps are counted, not timed: other work on the
-# machine changes nothing but the seconds. An interrupted run continues.
+# machine changes nothing but the seconds. BACKEND "wgpu" runs on a GPU. An interrupted run continues.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
@@ -14,6 +14,7 @@ variants=${3:-total-variation along-edges merged shipped three-from-144 three-fr
 seeds=${4:-0}
 volumes=${5:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
 views=${6:-50}
+backend=${7:-auto}
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 [[ -x $bin ]] || cargo build --release --quiet --bin conefield
 mkdir -p "$out"
@@ -56,7 +57,7 @@ for volume in $volumes; do
                 smooth-patches | gaussians | smooth-gaussians) sets=() && spec=$variant ;;
                 *) echo "$variant: no such variant" >&2 && exit 2 ;;
             esac
-            "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --spec "$spec" "${sets[@]/#/--set=}" >/dev/null
+            "$bin" -q reconstruct "$scan" -o "$out/run" --force --reference truth --backend "$backend" --spec "$spec" "${sets[@]/#/--set=}" >/dev/null
             cp "$out/run/record.json" "$record"
         done
     done
