@@ -46,7 +46,7 @@ const fn program(name: &'static str, limit_s: u64, program: &'static str, argume
 }
 
 /// The most informative stages come first, because the machine may be available for a few minutes only.
-const STAGES: [Stage; 10] = [
+const STAGES: [Stage; 11] = [
     own("adapter", 20, device::adapter),
     own("limits", 60, device::limits),
     own("compile", 60, speed::compile),
@@ -54,9 +54,10 @@ const STAGES: [Stage; 10] = [
     own("kernels", 120, speed::kernels),
     own("voxels", 60, speed::voxels),
     own("classical", 120, speed::classical),
+    own("gaussians", 60, speed::gaussians),
     own("training", 100, speed::training),
     program("parity-of-stages", 120, "parity-stages", &["--test-threads", "1"]),
-    program("parity-of-runs", 120, "parity-library", &["--test-threads", "1", "wgpu"]),
+    program("parity-of-runs", 120, "parity-library", &["--test-threads", "1", "wgpu", "gaussians_on_device"]),
 ];
 
 /// What was asked for on the command line.

@@ -230,35 +230,37 @@ fn run_folder() -> PathBuf {
     std::env::temp_dir().join(format!("conefield-contact-{}", std::process::id()))
 }
 
-/// `smooth-tv` on the kit's scan, as a user runs it, on the device and on the CPU: seconds of the whole command and PSNR. A software
-/// device makes one pass per level.
+/// `smooth-tv` on the device and on the CPU. A software device makes one pass per level.
 pub fn classical(asked: &Asked) -> Result<()> {
+    let few: Vec<String> = (0..3).map(|level| format!("methods.{level}.stop.passes=1")).collect();
+    let few = if asked.software { &few[..] } else { &[] };
+    reconstruct("smooth-tv", &format!("wgpu:{}", asked.adapter), few)?;
+    reconstruct("smooth-tv", "cpu", few)
+}
+
+/// `gaussians` on the device. A software device trains few of them for a few steps.
+pub fn gaussians(asked: &Asked) -> Result<()> {
+    let few = ["training.steps=40", "start.count=2000", "most=4000"].map(str::to_owned);
+    reconstruct("gaussians", &format!("wgpu:{}", asked.adapter), if asked.software { &few } else { &[] })
+}
+
+/// A spec on the kit's scan, as a user runs it: seconds of the whole command and of the method alone, and PSNR.
+fn reconstruct(spec: &str, backend: &str, settings: &[String]) -> Result<()> {
     let run = run_folder();
-    let program = file("conefield")?;
-    for backend in [format!("wgpu:{}", asked.adapter), "cpu".into()] {
-        let mut command = Command::new(&program);
-        command.arg("reconstruct").arg(file("scan")?).args(["--spec", "smooth-tv", "--force", "-q", "-o"]).arg(&run);
-        command.args(["--backend", &backend]);
-        if asked.software {
-            command.args((0..3).flat_map(|level| ["--set".into(), format!("methods.{level}.stop.passes=1")]));
-        }
-        let started = Instant::now();
-        let done = command.output()?;
-        let seconds = started.elapsed().as_secs_f64();
-        let truth = file("scan")?.join("truth.nii.gz");
-        let scores = Command::new(&program)
-            .args(["evaluate", "-q", "--json"])
-            .args([run.join("volume.nii.gz"), truth])
-            .output()?;
-        let _ = std::fs::remove_dir_all(&run);
-        for done in [&done, &scores] {
-            if !done.status.success() {
-                return Err(String::from_utf8_lossy(&done.stderr).into());
-            }
-        }
-        let scores: Value = serde_json::from_slice(&scores.stdout)?;
-        say(&json!({ "spec": "smooth-tv", "backend": backend, "seconds": seconds, "psnr": scores["psnr"] }));
+    let mut command = Command::new(file("conefield")?);
+    command.arg("reconstruct").arg(file("scan")?).args(["--spec", spec, "--force", "-q", "--json", "-o"]).arg(&run);
+    command.args(["--backend", backend, "--reference", "truth"]);
+    command.args(settings.iter().flat_map(|set| ["--set", set]));
+    let started = Instant::now();
+    let done = command.output()?;
+    let seconds = started.elapsed().as_secs_f64();
+    let _ = std::fs::remove_dir_all(&run);
+    if !done.status.success() {
+        return Err(String::from_utf8_lossy(&done.stderr).into());
     }
+    let record: Value = serde_json::from_slice(&done.stdout)?;
+    let (train_s, psnr) = (&record["train_s"], &record["scores"]["psnr"]);
+    say(&json!({ "spec": spec, "backend": backend, "seconds": seconds, "train_s": train_s, "psnr": psnr }));
     Ok(())
 }
 
