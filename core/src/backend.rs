@@ -1,7 +1,7 @@
 //! Backends compile a pipeline and run it: training steps, evaluation at points, rendering of rays.
 
 use crate::device::Device;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::loss::Loss;
 use crate::pipeline::{Model, Pipeline};
 use crate::place::{Host, Moved, Place};
@@ -154,9 +154,9 @@ pub trait Executable: Send {
     fn encode(&mut self, model: &Model, points: &[[f32; 3]]) -> Result<Vec<f32>>;
     /// The field at the points of `grid` (`[x, y, z]`, z fastest), for a field that evaluates whole grids.
     fn values(&mut self, model: &Model, grid: &UnitGrid, out: &mut [f32]) -> Result<()> {
-        if let Some(field) = model.pipeline.field.on_grid() {
-            field.values(&model.arena.params, grid, out);
-        }
+        let field = &model.pipeline.field;
+        let no = || Error::unsupported(field.describe(), "it does not evaluate whole grids");
+        field.on_grid().ok_or_else(no)?.values(&model.arena.params, grid, out);
         Ok(())
     }
     /// Line integrals of `rays`.

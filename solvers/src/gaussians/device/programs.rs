@@ -70,18 +70,26 @@ pub struct Evaluation {
 impl Evaluation {
     pub fn new() -> Self {
         let constants = constants();
-        let lists = |label, read: &[&str], write: &[&str], atomic: &str, piece| {
-            let mut program = with_atomic(program(label, &["bins"], read, write, &[]), atomic);
+        let visiting = |label, write: &[&str], atomic: &str, visit: &str| {
+            let mut program = with_atomic(program(label, &["bins"], &["boxes"], write, &[]), atomic);
             program.source.add("bins", piece!("bins").1);
-            program.source.add(label, piece);
+            program.source.add(label, &piece!("visit").1.replace("VISIT", visit));
             program
         };
         let shape = piece!("shape");
         Self {
             decode: program("decode", &[], &["params"], &["shapes"], &[shape, piece!("quaternion"), piece!("decode")]),
-            count: lists("count", &["boxes"], &["counts"], "counts", piece!("count").1),
+            // The counts are zero before, and again after the scan.
+            count: visiting("count", &["counts"], "counts", "atomicAdd(&counts[bin], 1u);"),
             scan: program("scan", &["bins"], &[], &["counts", "starts", "next"], &[piece!("bins"), piece!("scan")]),
-            fill: lists("fill", &["boxes"], &["next", "entries"], "next", piece!("fill").1),
+            // Lists in any order. Where there is no room, the host sees it and repeats the work.
+            fill: visiting(
+                "fill",
+                &["next", "entries"],
+                "next",
+                "let at = atomicAdd(&next[bin], 1u);
+                    if at < bins.room { entries[at] = i; }",
+            ),
             reach: program("reach", &["grid"], &["shapes"], &["boxes"], &[shape, piece!("grid"), piece!("reach")]),
             paint: program(
                 "paint",
@@ -141,7 +149,7 @@ impl Training {
         let constants = constants();
         let (shape, quaternion, view) = (piece!("shape"), piece!("quaternion"), piece!("view"));
         let (bins, grid, constants) = (piece!("bins"), piece!("grid"), ("constants", &*constants));
-        let (footprint, ray) = (piece!("footprint"), piece!("ray_length"));
+        let (footprint, moments, ray) = (piece!("footprint"), piece!("moments"), piece!("ray_length"));
         let total = ("total", TOTAL);
         let name = titled("loss", &loss.describe());
         let loss = fragment_of(&name, loss.wgsl())?.named("loss_");
@@ -181,7 +189,7 @@ impl Training {
                 &["view"],
                 &["boxes", "seen", "gradient"],
                 &["moments"],
-                &[view, shape, footprint, piece!("gather")],
+                &[view, shape, footprint, moments, piece!("gather")],
             ),
             learn_view: program(
                 "learn view",
@@ -206,7 +214,7 @@ impl Training {
                 &["grid"],
                 &["boxes", "shapes", "by"],
                 &["moments"],
-                &[shape, grid, piece!("collect")],
+                &[shape, grid, moments, piece!("collect")],
             ),
             learn_block: program(
                 "learn block",

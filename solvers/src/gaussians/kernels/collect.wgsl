@@ -1,7 +1,5 @@
 // Moments of a block's derivatives over the points of each Gaussian, a group for each: of w = dμ·exp(-½|Md|²), times 1, d, and
 // the upper half of d·dᵀ.
-var<workgroup> sums: array<array<vec4<f32>, 3>, 64>;
-
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -32,19 +30,6 @@ fn main(
                 a2 += w * vec4<f32>(d.y * d.z, d.z * d.z, 0.0, 0.0);
             }
         }
-        sums[lane] = array<vec4<f32>, 3>(a0, a1, a2);
-        workgroupBarrier();
-        for (var half = 32u; half > 0u; half >>= 1u) {
-            if lane < half {
-                for (var k = 0u; k < 3u; k++) {
-                    sums[lane][k] += sums[lane + half][k];
-                }
-            }
-            workgroupBarrier();
-        }
-        if lane < 3u {
-            moments[3u * i + lane] = sums[0][lane];
-        }
-        workgroupBarrier();
+        keep_moments(i, lane, array<vec4<f32>, 3>(a0, a1, a2));
     }
 }

@@ -1,7 +1,5 @@
 // Moments of a view's derivatives over the pixels of each Gaussian, a group for each: of w = dA·a^(-3/2)·exp(-N/2a) and of
 // w·(1 - N/a), times 1, du, dv, du², du·dv, dv².
-var<workgroup> sums: array<array<vec4<f32>, 3>, 64>;
-
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -34,19 +32,6 @@ fn main(
                 a2 += l * vec4<f32>(dv, du * du, du * dv, dv * dv);
             }
         }
-        sums[lane] = array<vec4<f32>, 3>(a0, a1, a2);
-        workgroupBarrier();
-        for (var half = 32u; half > 0u; half >>= 1u) {
-            if lane < half {
-                for (var k = 0u; k < 3u; k++) {
-                    sums[lane][k] += sums[lane + half][k];
-                }
-            }
-            workgroupBarrier();
-        }
-        if lane < 3u {
-            moments[3u * i + lane] = sums[0][lane];
-        }
-        workgroupBarrier();
+        keep_moments(i, lane, array<vec4<f32>, 3>(a0, a1, a2));
     }
 }

@@ -1,4 +1,4 @@
-// Puts each Gaussian into the lists of its bins, in any order. Where there is no room, the host sees it and repeats the work.
+// Visits the bins of each box.
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     for (var i = id.x; i < arrayLength(&boxes); i += groups.x * 64u) {
@@ -7,10 +7,8 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
         for (var x = begin.x; x < end.x; x++) {
             for (var y = begin.y; y < end.y; y++) {
                 for (var z = begin.z; z < end.z; z++) {
-                    let at = atomicAdd(&next[(x * bins.shape.y + y) * bins.shape.z + z], 1u);
-                    if at < bins.room {
-                        entries[at] = i;
-                    }
+                    let bin = (x * bins.shape.y + y) * bins.shape.z + z;
+                    VISIT
                 }
             }
         }
