@@ -5,7 +5,7 @@ use crate::device::backends;
 use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::{Limits, Wgpu};
 use conefield_core::backend::{Adam, Backend, BlockWork, Executable, Work};
-use conefield_core::device::{Device, Launch, Program};
+use conefield_core::device::{Device, Launch, Program, Source};
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;
 use conefield_core::pipeline::{Model, Pipeline};
@@ -107,19 +107,25 @@ impl Both {
     }
 }
 
-/// Asserts that two arrays agree within `share` of the largest number of each of 11 kinds.
-fn close(found: &[f32], wanted: &[f32], share: f32, what: &str) {
+/// The first number of an array that differs from another's by more than `share` of the largest of its kind, of 11.
+fn stray(found: &[f32], wanted: &[f32], share: f32) -> Option<String> {
     for kind in 0..NUMBERS {
         let of = |x: &[f32]| x.iter().skip(kind).step_by(NUMBERS).copied().collect::<Vec<f32>>();
         let (found, wanted) = (of(found), of(wanted));
         let largest = wanted.iter().fold(0.0f32, |m, x| m.max(x.abs()));
-        for (i, (a, b)) in found.iter().zip(&wanted).enumerate() {
-            assert!(
-                (a - b).abs() <= share * largest,
-                "{what}, number {kind} of Gaussian {i}: {a} for {b} of {largest}"
-            );
+        let away = |(i, (a, b)): (usize, (&f32, &f32))| {
+            let far = (a - b).abs() > share * largest || a.is_nan();
+            far.then(|| format!("number {kind} of Gaussian {i}: {a} for {b} of {largest}"))
+        };
+        if let Some(away) = found.iter().zip(&wanted).enumerate().find_map(away) {
+            return Some(away);
         }
     }
+    None
+}
+
+fn close(found: &[f32], wanted: &[f32], share: f32, what: &str) {
+    assert_eq!(stray(found, wanted, share), None, "{what}");
 }
 
 #[test]
@@ -216,13 +222,29 @@ fn a_run_ends_where_the_cpu_does() {
     }
 }
 
-/// A device that counts launches and submissions.
-struct Counting {
-    inner: Box<dyn Device>,
-    counts: Arc<Mutex<[usize; 2]>>,
+/// A program with `to` in place of `from`.
+fn edited(program: &Program, from: &str, to: &str) -> Program {
+    let (bound, rest): (Vec<&str>, Vec<&str>) =
+        program.source.text().lines().partition(|line| line.starts_with("@group(0) @binding"));
+    let mut source = Source::default();
+    for (binding, line) in program.source.bindings().iter().zip(bound) {
+        let kind = line.split_once(": ").unwrap().1.trim_end_matches(';');
+        source.bind(&binding.name, binding.access, kind);
+    }
+    let rest = rest.join("\n");
+    assert!(rest.contains(from), "{}: {from}", program.label);
+    source.add("edited", &rest.replace(from, to));
+    Program { label: program.label.clone(), source }
 }
 
-impl Device for Counting {
+/// A device that counts launches and submissions, and may run a program with one piece of its text replaced.
+struct Watched {
+    inner: Box<dyn Device>,
+    counts: Arc<Mutex<[usize; 2]>>,
+    fault: Option<[&'static str; 3]>,
+}
+
+impl Device for Watched {
     fn name(&self) -> String {
         self.inner.name()
     }
@@ -250,7 +272,10 @@ impl Device for Counting {
     fn run(&mut self, launches: &[Launch<'_>]) -> Result<()> {
         let mut counts = self.counts.lock().unwrap();
         *counts = [counts[0] + launches.len(), counts[1] + 1];
-        self.inner.run(launches)
+        let Some([label, from, to]) = self.fault else { return self.inner.run(launches) };
+        let program = |p: &Program| if p.label == label { edited(p, from, to) } else { p.clone() };
+        let edited: Vec<(Program, usize)> = launches.iter().map(|(p, groups)| (program(p), *groups)).collect();
+        self.inner.run(&edited.iter().map(|(program, groups)| (program, *groups)).collect::<Vec<_>>())
     }
 }
 
@@ -269,7 +294,7 @@ fn a_step_moves_numbers_and_launches_few_kernels() {
             let corners = [[0.2, 0.3, 0.25], [0.45, 0.1, 0.5]];
             let priors = both.blocks(&corners);
             let counts = Arc::new(Mutex::new([0; 2]));
-            let device = Box::new(Counting { inner: backend.device().unwrap(), counts: counts.clone() });
+            let device = Box::new(Watched { inner: backend.device().unwrap(), counts: counts.clone(), fault: None });
             let views = (Views::new(&both.scan, &both.scene, 0), resident);
             let parts = (both.loss.as_ref(), &both.priors[..]);
             let pulls = Arc::new(Mutex::new(Pulls::new(MOST)));
@@ -305,5 +330,53 @@ fn too_small_buffers_are_refused() {
         };
         assert_eq!(limits, "small buffers", "{e}");
         assert!(e.to_string().contains("2048 that a kernel may read"), "{e}");
+    }
+}
+
+/// The comparison with the CPU finds a small fault in each kernel of a step.
+#[test]
+fn a_faulty_kernel_is_found() {
+    let faults = [
+        ["gaussians: decode", "log(1.0 + e)", "log(1.02 + e)"],
+        ["gaussians: look", "1.0 - m1 * m1 - m2 * m2", "1.1 - m1 * m1 - m2 * m2"],
+        ["gaussians: fill", "if at < bins.room", "if at < bins.room && i % 50u != 1u"],
+        ["gaussians: project", "exp(-0.5 * x)", "exp(-0.51 * x)"],
+        ["gaussians: blur", "column + k >= 5u", "column + k > 5u"],
+        ["gaussians: similarity", "view.c2", "1.01 * view.c2"],
+        ["gaussians: blur slopes", "sums[m] += tap", "sums[m] += 1.01 * tap"],
+        ["gaussians: dissimilar", "2.0 * found[i]", "2.02 * found[i]"],
+        ["gaussians: gather", "w * (1.0 - x)", "w * (1.01 - x)"],
+        ["gaussians: learn view", "let across = p[3]", "let across = 1.02 * p[3]"],
+        ["gaussians: reach", "sqrt(CUT", "sqrt(0.5 * CUT"],
+        ["gaussians: paint", "exp(-0.5 * e)", "exp(-0.52 * e)"],
+        ["gaussians: penalty 0", "grid.scale * v.y", "1.01 * grid.scale * v.y"],
+        ["gaussians: collect", "d.y * d.z, d.z * d.z", "d.y * d.z, 1.05 * d.z * d.z"],
+        ["gaussians: learn block", "let d = -s.density", "let d = -1.02 * s.density"],
+    ];
+    let Some((_, backend)) = on_devices().into_iter().next() else { return };
+    let both = Both::new(500.0, 0.5, true);
+    let corners = [[0.2, 0.3, 0.25], [0.45, 0.1, 0.5]];
+    let gradients = |device: Option<Box<dyn Device>>| {
+        let (mut model, pulls) = (mixture(0.01), Arc::new(Mutex::new(Pulls::new(MOST))));
+        let mut exe: Box<dyn Executable> = match device {
+            None => both.on(&Cpu::new(), true, &pulls),
+            Some(device) => {
+                let views = (Views::new(&both.scan, &both.scene, 0), true);
+                let parts = (both.loss.as_ref(), &both.priors[..]);
+                Box::new(DeviceTraining::new(device, MOST, both.rule, views, parts, pulls).unwrap())
+            }
+        };
+        exe.step(&mut model, &both.work(0, &both.blocks(&corners))).unwrap();
+        exe.fetch(&mut model).unwrap();
+        model.arena.grads
+    };
+    let wanted = gradients(None);
+    let on = |fault| {
+        let watched = Watched { inner: backend.device().unwrap(), counts: Arc::default(), fault };
+        stray(&gradients(Some(Box::new(watched))), &wanted, 2e-3)
+    };
+    assert_eq!(on(None), None);
+    for fault in faults {
+        assert!(on(Some(fault)).is_some(), "{fault:?} was not found");
     }
 }
