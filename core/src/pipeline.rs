@@ -169,7 +169,7 @@ impl Pipeline {
     /// The lengths that settings may count in, for a unit cube with a side of `side` mm.
     fn lengths(&self, voxel_mm: f64, side: f64) -> Lengths {
         let finest = self.encoder.resolutions().map(|all| all.into_iter().fold(1.0, f64::max));
-        Lengths { voxel_mm, cell_mm: finest.filter(|n| *n > 1.0).map(|n| side / n) }
+        Lengths { voxel_mm, cell_mm: finest.filter(|n| *n > 0.0).map(|n| side / n) }
     }
 
     /// Number of open channels of the encoder: the first ones. The others are 0.

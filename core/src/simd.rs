@@ -70,6 +70,12 @@ pub trait Real:
     /// Distribution function and density of the standard normal, `(Φ(x), φ(x))`, of every lane. `f32`: |error| < 3e-7,
     /// by Abramowitz & Stegun 7.1.26, which shares its exponential with φ. Several vectors at once hide the latency.
     fn normal_lanes<S: Simd, const K: usize>(s: S, x: [V<S, Self>; K]) -> [[V<S, Self>; K]; 2];
+    /// Exponential.
+    fn exp(self) -> Self;
+    /// Natural logarithm.
+    fn ln(self) -> Self;
+    /// Square root.
+    fn sqrt(self) -> Self;
     /// Sine and cosine.
     fn sin_cos(self) -> (Self, Self);
     /// Natural logarithm of `1 + exp(x)` without overflow.
@@ -238,6 +244,18 @@ impl Real for f32 {
         [cdf, pdf]
     }
     #[inline(always)]
+    fn exp(self) -> Self {
+        f32::exp(self)
+    }
+    #[inline(always)]
+    fn ln(self) -> Self {
+        f32::ln(self)
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        f32::sqrt(self)
+    }
+    #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {
         f32::sin_cos(self)
     }
@@ -324,6 +342,18 @@ impl Real for f64 {
             }
         }
         [cdf, pdf]
+    }
+    #[inline(always)]
+    fn exp(self) -> Self {
+        f64::exp(self)
+    }
+    #[inline(always)]
+    fn ln(self) -> Self {
+        f64::ln(self)
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        f64::sqrt(self)
     }
     #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {

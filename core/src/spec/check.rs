@@ -243,17 +243,26 @@ fn wanted(schema: &Value, cx: &Context<'_>) -> String {
 }
 
 fn list(schema: &Value, cx: &Context<'_>) -> String {
-    let n = schema["minItems"].as_u64().filter(|n| schema["maxItems"].as_u64() == Some(*n));
     let item = if schema["items"].is_object() { format!(", each {}", wanted(&schema["items"], cx)) } else { "".into() };
-    n.map_or(format!("a list{item}"), |n| format!("a list of {n}{item}"))
+    match (schema["minItems"].as_u64(), schema["maxItems"].as_u64()) {
+        (Some(a), Some(b)) if a == b => format!("a list of {a}{item}"),
+        (Some(a), Some(b)) => format!("a list of {a} to {b}{item}"),
+        (Some(a), None) => format!("a list of at least {a}{item}"),
+        (None, Some(b)) => format!("a list of at most {b}{item}"),
+        (None, None) => format!("a list{item}"),
+    }
 }
 
 fn limits(schema: &Value) -> String {
-    match (schema["minimum"].as_f64(), schema["maximum"].as_f64()) {
-        (Some(a), Some(b)) => format!(" from {a} to {b}"),
-        (Some(a), None) => format!(" of at least {a}"),
-        (None, Some(b)) => format!(" of at most {b}"),
-        (None, None) => String::new(),
+    let of = |key: &str| schema[key].as_f64();
+    match [of("minimum"), of("maximum"), of("exclusiveMinimum"), of("exclusiveMaximum")] {
+        [Some(a), Some(b), None, None] => format!(" from {a} to {b}"),
+        [None, None, None, None] => String::new(),
+        [least, most, above, below] => {
+            let words = [("of at least", least), ("above", above), ("of at most", most), ("below", below)];
+            let words = words.into_iter().filter_map(|(word, x)| Some(format!("{word} {}", x?)));
+            format!(" {}", words.collect::<Vec<_>>().join(" and "))
+        }
     }
 }
 

@@ -29,18 +29,38 @@ static inline void say(struct ConefieldText *out, const char *format, ...) {
     memcpy(out->data, line, out->length < out->capacity ? out->length : out->capacity);
 }
 
-/* The number under `key` of the settings: one flat JSON object, checked against the schema by the host, with defaults
- * filled in. NaN if the key is missing. Settings that are texts, lists or tables need a JSON parser. */
-static inline double number(struct ConefieldStr settings, const char *key) {
+/* The number or the list of numbers under `key` of the settings: one flat JSON object, checked against the schema by the
+ * host, with defaults filled in. Writes at most `most` of them to `out`; returns how many there are, 0 if the key is
+ * missing. Settings that are texts or tables need a JSON parser. */
+static inline size_t numbers(struct ConefieldStr settings, const char *key, double *out, size_t most) {
     char quoted[64];
+    size_t count = 0;
     char *text = (char *)malloc(settings.length + 1);
-    if (text == NULL) return NAN;
+    if (text == NULL) return 0;
     memcpy(text, settings.data, settings.length);
     text[settings.length] = 0;
     snprintf(quoted, sizeof quoted, "\"%s\":", key);
     const char *at = strstr(text, quoted);
-    double value = at == NULL ? NAN : strtod(at + strlen(quoted), NULL);
+    at = at == NULL ? NULL : at + strlen(quoted);
+    while (at != NULL) {
+        char *end = NULL;
+        at += strspn(at, " [,");
+        double value = strtod(at, &end);
+        if (end == at) break;
+        if (count < most) out[count] = value;
+        count++;
+        at = end + strspn(end, " ");
+        /* Another key follows a number that is in no list. */
+        if (*at != ',' || strspn(at, " ,\"") > strspn(at, " ,")) break;
+    }
     free(text);
+    return count;
+}
+
+/* The number under `key` of the settings; NaN if the key is missing. */
+static inline double number(struct ConefieldStr settings, const char *key) {
+    double value = NAN;
+    numbers(settings, key, &value, 1);
     return value;
 }
 

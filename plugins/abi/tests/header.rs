@@ -146,3 +146,17 @@ fn the_layout_is_pinned() {
     assert_eq!(offsets!(ConefieldGrid: shape spacing center), [0, 24, 48]);
     assert_eq!(offsets!(ConefieldExpansion: coefficients scratch samples double_precision), [0, 72, 80, 84]);
 }
+
+/// Numbers and lists of numbers, as `conefield_helpers.h` reads them.
+#[test]
+#[cfg(unix)]
+fn settings_are_read_in_c() {
+    use std::process::Command;
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("settings");
+    let mut compile = Command::new(std::env::var_os("CC").unwrap_or("cc".into()));
+    compile.args(["-Wall", "-Wextra", "-Werror", "-I"]).arg(folder.join("include"));
+    compile.arg(folder.join("tests/settings.c")).arg("-o").arg(&program).arg("-lm");
+    assert!(compile.status().unwrap().success());
+    assert!(Command::new(&program).status().unwrap().success());
+}

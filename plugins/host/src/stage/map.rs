@@ -114,7 +114,10 @@ fn sound(i: &ConefieldInfo) -> Result<Info, String> {
         other => return Err(format!("its kind of gradients {other} is unknown")),
     };
     if (params == 0) != (grads == GradKind::None) {
-        return Err(format!("{params} parameters with gradients {grads:?}"));
+        let grads = format!("CONEFIELD_GRADS_{}", format!("{grads:?}").to_uppercase());
+        let expected =
+            if params == 0 { "CONEFIELD_GRADS_NONE" } else { "CONEFIELD_GRADS_DENSE or CONEFIELD_GRADS_SCATTER" };
+        return Err(format!("{params} parameters with {grads}, expected {expected}"));
     }
     Ok(Info { input, output, params, tape, scope, grads, macs, identity: i.identity != 0 })
 }

@@ -154,20 +154,6 @@ impl Training {
         let name = titled("loss", &loss.describe());
         let loss = fragment_of(&name, loss.wgsl())?.named("loss_");
         let with_ssim = ("constants", &*format!("const SSIM = {ssim};"));
-        let finish = |label, uniforms: &[&str], pieces: &[(&str, &str)], body: &str| {
-            let text = piece!("finish").1.replace("FINISH", body);
-            let mut program = program(label, uniforms, &["partial", "starts"], &["stats"], pieces);
-            program.source.add("finish", &text);
-            program
-        };
-        let mut penalties = vec![];
-        for (i, prior) in priors.iter().enumerate() {
-            let name = titled("prior", &prior.describe());
-            let edge = format!("const prior_edge = {}u;", prior.blocks().edge);
-            let text = fragment_of(&name, prior.wgsl())?.named("prior_");
-            let pieces = [grid, total, ("blocks", &*edge), (&*name, &*text), piece!("penalty")];
-            penalties.push(program(&format!("penalty {i}"), &["grid"], &["values"], &["by", "partial"], &pieces));
-        }
         Ok(Self {
             look: program(
                 "look",
@@ -208,7 +194,7 @@ impl Training {
         stats[2] = before.z;
         stats[3] = max(before.w, starts[bins.count]);",
             ),
-            penalties,
+            penalties: penalties(priors)?,
             collect: program(
                 "collect",
                 &["grid"],
@@ -247,6 +233,25 @@ impl Training {
         let fixed = [look, project, gather, learn_view, finish_view, collect, learn_block, finish_block, adam];
         fixed.into_iter().chain(&self.ssim).chain(&self.penalties)
     }
+}
+
+/// Adds up the partial sums of a view or block: `body` adds `all[0]` to the statistics of a step.
+fn finish(label: &str, uniforms: &[&str], pieces: &[(&str, &str)], body: &str) -> Program {
+    let mut program = program(label, uniforms, &["partial", "starts"], &["stats"], pieces);
+    program.source.add("finish", &piece!("finish").1.replace("FINISH", body));
+    program
+}
+
+/// The penalties of the priors. Refuses one without WGSL.
+fn penalties(priors: &[Box<dyn Prior>]) -> Result<Vec<Program>> {
+    let all = priors.iter().enumerate().map(|(i, prior)| {
+        let name = titled("prior", &prior.describe());
+        let edge = format!("const prior_edge = {}u;", prior.blocks().edge);
+        let text = fragment_of(&name, prior.wgsl())?.named("prior_");
+        let pieces = [piece!("grid"), ("total", TOTAL), ("blocks", &*edge), (&*name, &*text), piece!("penalty")];
+        Ok(program(&format!("penalty {i}"), &["grid"], &["values"], &["by", "partial"], &pieces))
+    });
+    all.collect()
 }
 
 /// The programs of structural similarity.
