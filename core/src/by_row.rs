@@ -108,7 +108,8 @@ impl<T: RowMap> ByRow<T> {
 
     /// All parameters: a reduced stage keeps them.
     fn params(&self) -> Vec<Range<usize>> {
-        vec![0..self.info().params]
+        let all = 0..self.info().params;
+        if all.is_empty() { vec![] } else { vec![all] }
     }
 
     /// The stage that computes only the outputs `keep`.

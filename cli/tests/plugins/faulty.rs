@@ -164,13 +164,13 @@ const ENCODER_FAULTS: &[Fault] = faults! {
         ["", "finite differences: inputs", ""];
     fault "keeps all channels where some are to go", instead MAP, REDUCE, ["", "keep outputs", ""];
     untried "too few resolutions", instead "c < count; c++) cells", "c + 1 < count; c++) cells",
-        "resolutions failed: channel 17 of 18 is left unwritten";
+        "resolutions: channel 17 of 18 is left unwritten";
     untried "more resolutions than channels", instead "c < count; c++) cells", "c <= count; c++) cells",
-        "resolutions failed: it writes past the 18 channels that there are";
+        "resolutions: it writes past the 18 channels that there are";
     untried "a resolution that is NaN", instead "cells[c] =", "cells[c] = c == 1 ? NAN :",
-        "resolutions failed: channel 1 of 18 resolves NaN cells";
+        "resolutions: channel 1 of 18 resolves NaN cells";
     untried "a negative resolution", instead "cells[c] =", "cells[c] = c == 1 ? -8.0 :",
-        "resolutions failed: channel 1 of 18 resolves -8 cells";
+        "resolutions: channel 1 of 18 resolves -8 cells";
     fault "results that depend on earlier calls",
         instead "to[i] = params[c]", "to[i] = 1e-6f * (float)(calls++ % 1000) + params[c]",
         ["", "tile sizes: outputs", ""];
@@ -312,7 +312,7 @@ const BASIS_FAULTS: &[Fault] = faults! {
     fault "a sound basis", instead "", "", ["", "", ""];
     untried "no coefficients",
         instead ".double_precision = 1};", ".double_precision = 1}; info->coefficients.shape[0] = 0;",
-        "info failed: coefficients: volume.shape: found [0, 2, 3]";
+        "info: coefficients: volume.shape: found [0, 2, 3]";
     untried "a basis that writes past its voxels", before "voxels[i] = coeff", "voxels[i + 1] = ",
         "it writes outside its voxels: 1 past 120 numbers";
     untried "a voxel that is left unwritten",

@@ -78,7 +78,7 @@ impl<F: FunctionsOf> Foreign<F> {
 
     /// The error for a wrong result of `call`.
     fn wrong(&self, call: &str, what: &str) -> Error {
-        self.ty().failed(call, CONEFIELD_FAILED, what)
+        Error::unsupported(self.ty().words(), format!("{call}: {what}"))
     }
 
     /// Calls `f` with the stage and a buffer for the reason. Errors name `call`.

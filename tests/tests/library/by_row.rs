@@ -101,3 +101,41 @@ fn many_parameters_are_scattered() {
     let want = [7.0 + 2.0f32.sin() * 3.0, 7.0 + 3.0f32.sin() * 1.0];
     assert_eq!(grads, want);
 }
+
+/// `y = exp(x)`, `√x`, `ln(x)` of the first channel, without parameters.
+struct Curves;
+
+impl RowMap for Curves {
+    fn widths(&self) -> [usize; 2] {
+        [3, 3]
+    }
+
+    fn parameters(&self) -> Vec<(String, Vec<usize>)> {
+        vec![]
+    }
+
+    fn init(&self, _: u64, _: &mut [f32]) {}
+
+    fn forward<R: Real>(&self, _: &[R], x: &[R], y: &mut [R]) {
+        let x = x[0] + R::ONE;
+        y.copy_from_slice(&[x.exp(), x.sqrt(), x.ln()]);
+    }
+
+    fn backward<R: Real>(&self, _: &[R], x: &[R], dy: &[R], _: &mut Sums<'_, R>, dx: &mut [R]) {
+        let x = x[0] + R::ONE;
+        dx[0] += dy[0] * x.exp() + dy[1] * R::of(0.5) / x.sqrt() + dy[2] / x;
+    }
+
+    fn describe(&self) -> String {
+        "curves: of the first channel".into()
+    }
+}
+
+#[test]
+fn a_map_without_parameters_leaves_channels_out() {
+    let all = ByRow::new(Curves);
+    let small = Encoder::keep_outputs(&all, &[0, 2]).unwrap();
+    assert_eq!((small.stage.info().output, small.params.len()), (2, 0));
+    let report = check_encoder(&all, &Options::encoder());
+    assert!(report.passed(), "{report}");
+}
