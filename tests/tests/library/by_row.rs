@@ -102,7 +102,7 @@ fn many_parameters_are_scattered() {
     assert_eq!(grads, want);
 }
 
-/// `y = exp(x)`, `√x`, `ln(x)` of the first channel, without parameters.
+/// `exp(s)`, `√(s + 2)` and `ln(s + 2)` of `s = sin(x)` of the first channel, without parameters.
 struct Curves;
 
 impl RowMap for Curves {
@@ -117,13 +117,15 @@ impl RowMap for Curves {
     fn init(&self, _: u64, _: &mut [f32]) {}
 
     fn forward<R: Real>(&self, _: &[R], x: &[R], y: &mut [R]) {
-        let x = x[0] + R::ONE;
-        y.copy_from_slice(&[x.exp(), x.sqrt(), x.ln()]);
+        let s = x[0].sin_cos().0;
+        let two = s + R::of(2.0);
+        y.copy_from_slice(&[s.exp(), two.sqrt(), two.ln()]);
     }
 
     fn backward<R: Real>(&self, _: &[R], x: &[R], dy: &[R], _: &mut Sums<'_, R>, dx: &mut [R]) {
-        let x = x[0] + R::ONE;
-        dx[0] += dy[0] * x.exp() + dy[1] * R::of(0.5) / x.sqrt() + dy[2] / x;
+        let (s, cos) = x[0].sin_cos();
+        let two = s + R::of(2.0);
+        dx[0] += cos * (dy[0] * s.exp() + dy[1] * R::of(0.5) / two.sqrt() + dy[2] / two);
     }
 
     fn describe(&self) -> String {
