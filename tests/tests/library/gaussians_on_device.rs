@@ -26,7 +26,8 @@ use rand::{RngExt, SeedableRng};
 use serde_json::json;
 use std::sync::{Arc, Mutex};
 
-const MOST: usize = 150;
+/// An odd number of slots: buffers are rounded up to whole vectors.
+const MOST: usize = 151;
 
 /// Five views of 37 × 45 pixels; from a cone, or from a source so far away that its rays are parallel.
 fn views(source: f64) -> Scan {

@@ -13,7 +13,7 @@ struct Rule {
 
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    for (var i = id.x; i < arrayLength(&pulls); i += groups.x * 64u) {
+    for (var i = id.x; i < arrayLength(&params) / 11u; i += groups.x * 64u) {
         let p = i * 11u;
         if params[p + 10u] <= FREE {
             continue;
