@@ -6,14 +6,13 @@ use crate::device::Gpu;
 use crate::kernel::Buffers;
 use conefield_core::arena::Arena;
 use conefield_core::error::Result;
-use conefield_core::pages::copy;
 use std::ops::Range;
 
 /// The arena's parts, by their names in kernels.
 pub const PARTS: [&str; 4] = ["params", "grads", "first", "second"];
 
 /// Bytes that are copied to or from the device at once.
-const PIECE: u64 = 16 << 20;
+pub(crate) const PIECE: u64 = 16 << 20;
 
 /// The range of the arena in buffer `s`.
 pub fn segment(chain: &Chain, s: usize, params: usize, size: usize) -> Range<usize> {
@@ -81,13 +80,7 @@ pub fn download(gpu: &Gpu, buffers: &mut Buffers, chain: &Chain, arena: &mut Are
         for s in 0..chain.segments() {
             let Some(buffer) = buffers.get(&format!("{part}_{s}")) else { continue };
             let range = segment(chain, s, data.len(), size);
-            for (i, piece) in data[range].chunks_mut(PIECE as usize / 4).enumerate() {
-                let bytes = 4 * piece.len() as u64;
-                let mut encoder = gpu.device.create_command_encoder(&Default::default());
-                encoder.copy_buffer_to_buffer(buffer, i as u64 * PIECE, &staging, 0, bytes);
-                gpu.queue.submit([encoder.finish()]);
-                gpu.read(&staging, bytes, |found| copy(bytemuck::cast_slice_mut(piece), found))?;
-            }
+            gpu.download(buffer, 0, &staging, bytemuck::cast_slice_mut(&mut data[range]))?;
         }
     }
     Ok(())

@@ -2,6 +2,7 @@
 
 use crate::staging::Staging;
 use conefield_core::error::{Error, Result};
+use conefield_core::pages::copy;
 use conefield_core::place::Moved;
 use serde::Serialize;
 use std::fmt;
@@ -351,6 +352,19 @@ impl Gpu {
                 Ok(mapped) => return mapped.map_err(|e| self.error(e.to_string())),
             }
         }
+    }
+
+    /// Overwrites `out` with the bytes of `from` from byte `at` on, piece by piece through `staging`.
+    pub(crate) fn download(&self, from: &wgpu::Buffer, at: u64, staging: &wgpu::Buffer, out: &mut [u8]) -> Result<()> {
+        let most = staging.size();
+        for (i, piece) in out.chunks_mut(most as usize).enumerate() {
+            let bytes = piece.len() as u64;
+            let mut encoder = self.device.create_command_encoder(&Default::default());
+            encoder.copy_buffer_to_buffer(from, at + i as u64 * most, staging, 0, bytes);
+            self.submit(encoder);
+            self.read(staging, bytes, |found| copy(piece, found))?;
+        }
+        Ok(())
     }
 
     /// Calls `read` with the first `bytes` of `from` when the device has written them.

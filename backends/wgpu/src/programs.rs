@@ -1,22 +1,19 @@
 //! Programs of others on the device: [`conefield_core::device::Device`].
 
 use crate::Shared;
+use crate::arena::PIECE;
 use crate::kernel::{Buffers, Kernel, fits};
 use crate::source::validate;
 use crate::wave::MOST_GROUPS;
 use conefield_core::backend::{Adam, Executable, StepStats, Work};
 use conefield_core::device::{Device, Launch, Program};
 use conefield_core::error::{Error, Result};
-use conefield_core::pages::copy;
 use conefield_core::parallel;
 use conefield_core::pipeline::Model;
 use conefield_core::stage::{OnDevice, UnitGrid, UnitRay};
 use std::collections::HashMap;
 use std::sync::Arc;
 use wgpu::BufferUsages as U;
-
-/// Bytes that are read at once.
-const PIECE: usize = 16 << 20;
 
 /// Named buffers, and the programs that ran on them.
 pub struct Programs {
@@ -95,16 +92,8 @@ impl Device for Programs {
 
     fn read(&mut self, name: &str, at: u64, out: &mut [u8]) -> Result<()> {
         let gpu = &self.shared.gpu;
-        let staging = self.buffers.staging(gpu, PIECE.min(out.len()) as u64)?;
-        let from = self.buffer(name)?.clone();
-        for (i, piece) in out.chunks_mut(PIECE).enumerate() {
-            let bytes = piece.len() as u64;
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            encoder.copy_buffer_to_buffer(&from, at + (i * PIECE) as u64, &staging, 0, bytes);
-            gpu.submit(encoder);
-            gpu.read(&staging, bytes, |found| copy(piece, found))?;
-        }
-        Ok(())
+        let staging = self.buffers.staging(gpu, PIECE.min(out.len() as u64))?;
+        gpu.download(self.buffer(name)?, at, &staging, out)
     }
 
     fn copy(&mut self, from: &str, at: u64, to: &str, bytes: u64) -> Result<()> {

@@ -87,7 +87,7 @@ pub struct Pulls {
     pub counts: Vec<f32>,
 }
 
-/// The pulls, which a panic in training cannot leave half written: they are numbers.
+/// Locks the pulls, also after a panic: they are plain numbers.
 pub fn lock(pulls: &Mutex<Pulls>) -> MutexGuard<'_, Pulls> {
     pulls.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -16,7 +16,7 @@ macro_rules! piece {
     };
 }
 
-/// The type of a buffer in WGSL; those of the lists are `bins` (`count`, `fill`) by themselves.
+/// The type of a buffer in WGSL.
 fn kind(buffer: &str) -> &'static str {
     match buffer {
         "view" => "View",

@@ -218,7 +218,7 @@ impl DeviceTraining {
             let (p, q, tiles) = (&self.programs, &self.mixture.programs, bins.count as usize);
             let (each, slots) = (DeviceMixture::groups(self.mixture.most), self.mixture.most);
             let mut launches: Vec<Launch<'_>> = vec![(&q.reach, each)];
-            launches.extend(self.mixture.programs.lists(each));
+            launches.extend(q.lists(each));
             launches.extend([(&q.paint, tiles), (&p.penalties[which], tiles), (&p.collect, slots)]);
             launches.extend([(&p.learn_block, each), (&p.finish_block, 1)]);
             self.mixture.device.run(&launches)?;
@@ -232,11 +232,9 @@ impl Executable for DeviceTraining {
         self.load(model)?;
         self.mixture.decode()?;
         loop {
-            let mut samples = 0;
             let views = drawn(work.seed, work.step, self.rule.views, self.views.beams.len());
             for (n, view) in views.enumerate() {
                 self.view(view, n == 0)?;
-                samples += self.views.detector.iter().product::<usize>() as u64;
             }
             for (which, prior) in work.priors.iter().enumerate() {
                 self.prior(which, prior)?;
@@ -250,6 +248,7 @@ impl Executable for DeviceTraining {
                 continue;
             }
             let [loss, alike, penalty] = [loss, alike, penalty].map(|bits| f64::from(f32::from_bits(bits)));
+            let samples = (self.rule.views * self.views.detector.iter().product::<usize>()) as u64;
             let unlike = self.rule.ssim * (1.0 - alike / self.rule.views as f64);
             return Ok(StepStats { loss, prior: unlike + penalty, samples, ..StepStats::default() });
         }

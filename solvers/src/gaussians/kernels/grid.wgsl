@@ -1,7 +1,7 @@
 // A grid of points: x slowest, z fastest.
 struct Grid {
     first: vec3<f32>,
-    // Points that a box may be too large by.
+    // Points by which a box reaches further down: a whole one if the points are cells, else for rounding.
     slack: f32,
     spacing: vec3<f32>,
     // Factor of a block's penalty and of its derivatives.

@@ -20,7 +20,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
             continue;
         }
         let g = seen_by(view, s);
-        // Behind the detector's source, or around it.
+        // Behind the source, or around it.
         if !(g.t > 1e-9 && g.zz > 1.0001 * CUT) {
             continue;
         }

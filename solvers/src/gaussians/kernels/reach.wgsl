@@ -1,7 +1,7 @@
 // The boxes of points that the Gaussians reach.
 fn range(low: f32, high: f32, count: u32) -> u32 {
     let first = clamp(ceil(low - grid.slack), 0.0, f32(count));
-    let end = clamp(floor(high + fract(grid.slack)) + 1.0, first, f32(count));
+    let end = clamp(floor(high + 0.01) + 1.0, first, f32(count));
     return u32(first) | u32(end) << 16u;
 }
 
