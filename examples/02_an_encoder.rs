@@ -32,13 +32,6 @@ impl EncoderSpec for Waves {
     }
 }
 
-impl Waves {
-    /// The angle of wave `c`, whose parameters are its direction and its phase.
-    fn angle<R: Real>(params: &[R], x: &[R], c: usize) -> R {
-        (0..3).fold(params[4 * c + 3], |sum, k| sum + params[4 * c + k] * x[k])
-    }
-}
-
 impl RowMap for Waves {
     fn widths(&self) -> [usize; 2] {
         [3, self.waves]
@@ -54,20 +47,24 @@ impl RowMap for Waves {
         }
     }
 
-    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]) {
-        for (c, y) in y.iter_mut().enumerate() {
-            *y = Self::angle(params, x, c).sin_cos().0;
+    #[inline(always)]
+    fn forward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, y: &mut ChannelsMut<N>) {
+        for (c, w) in params.chunks(4).enumerate() {
+            let angle = x.at(0) * w[0] + x.at(1) * w[1] + x.at(2) * w[2] + w[3];
+            y.set(c, angle.sin_cos().0);
         }
     }
 
-    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
-        for (c, &dy) in dy.iter().enumerate() {
-            let slope = dy * Self::angle(params, x, c).sin_cos().1;
+    #[inline(always)]
+    fn backward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, dy: Channels<N>, grads: &mut Gradients<N>) {
+        for (c, w) in params.chunks(4).enumerate() {
+            let angle = x.at(0) * w[0] + x.at(1) * w[1] + x.at(2) * w[2] + w[3];
+            let slope = dy.at(c) * angle.sin_cos().1;
             for k in 0..3 {
-                grads.add(4 * c + k, slope * x[k]);
-                dx[k] += slope * params[4 * c + k];
+                grads.param(4 * c + k, slope * x.at(k));
+                grads.input(k, slope * w[k]);
             }
-            grads.add(4 * c + 3, slope);
+            grads.param(4 * c + 3, slope);
         }
     }
 

@@ -1,11 +1,12 @@
-//! Stages written for one row at a time: the simple way to an encoder, normalizer or field.
+//! Stages written for one row at a time: the simple way to an encoder, normalizer or field, and a fast one.
 //!
 //! A [`RowMap`] defines the channels of one row and their gradients. [`ByRow`] makes a complete [`Stage`] of it, with
-//! tiles, double-precision checks and masked channels. Stages that need maximum speed implement [`Stage`] and
-//! [`Kernel`] directly.
+//! tiles, vectors of rows, double-precision checks and masked channels. A stage that works on more than a row, or keeps
+//! numbers from forward to backward, implements [`Stage`] and [`Kernel`] directly.
 
-use crate::error::{Error, Result};
-use crate::simd::Real;
+use crate::error::{Error, Result, ensure};
+use crate::lanes::{Lanes, Vectors};
+use crate::simd::{Op, Real, Simd, run};
 use crate::stage::{
     Encoder, Field, GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
 };
@@ -16,11 +17,12 @@ use std::sync::Arc;
 /// Up to this many parameters, each worker sums gradients in its own copy. Above it, one worker sums all.
 const FEW: usize = 1 << 20;
 
-/// Rows whose outputs are written together. Those of one row are all in different cache lines, and with many rows these
-/// displace each other before the next row is written.
-const BLOCK: usize = 16;
+/// Vectors of rows at once. The last rows of a tile are computed one vector at a time.
+const AT_ONCE: usize = 4;
 
-/// A map of the channels of one row. One source serves `f32` and `f64`.
+/// A map of the channels of one row. A number is an `N: Lanes`, one of each of several rows, so that one source serves
+/// single and double precision and the vectors of every processor. `forward` and `backward` should be
+/// `#[inline(always)]`, and so should the functions that they call with `N`.
 pub trait RowMap: Send + Sync + 'static {
     /// Input and output channels. An encoder has 3 inputs, a field 1 output.
     fn widths(&self) -> [usize; 2];
@@ -35,11 +37,11 @@ pub trait RowMap: Send + Sync + 'static {
         let _ = (seed, params);
     }
 
-    /// Computes the output channels `y` from the input channels `x`. `y` is 0 on entry.
-    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]);
+    /// Writes all output channels `y`, from the input channels `x`.
+    fn forward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, y: &mut ChannelsMut<N>);
 
-    /// Given `dy = ∂L/∂y`, adds `∂L/∂params` to `grads` and `∂L/∂x` to `dx`, which is 0 on entry.
-    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]);
+    /// Given `dy = ∂L/∂y`, adds `∂L/∂params` and `∂L/∂x` to `grads`.
+    fn backward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, dy: Channels<N>, grads: &mut Gradients<N>);
 
     /// A line for `explain` that begins with the type name.
     fn describe(&self) -> String;
@@ -65,8 +67,9 @@ pub trait RowMap: Send + Sync + 'static {
         None
     }
 
-    /// For a normalizer of independent channels: the map of the channels `keep` alone, and the parameters that it
-    /// keeps. See [`Normalizer::keep_inputs`].
+    /// The map of the channels `keep` alone, outputs of an encoder or inputs of a normalizer or field, and the parameters
+    /// that it keeps. Without it, an encoder computes all outputs and drops some, a field gets 0 for a missing input, and
+    /// a normalizer refuses. See [`Encoder::keep_outputs`], [`Normalizer::keep_inputs`] and [`Field::keep_inputs`].
     fn keep(&self, keep: &[usize]) -> Option<(Self, Vec<Range<usize>>)>
     where
         Self: Sized,
@@ -76,16 +79,79 @@ pub trait RowMap: Send + Sync + 'static {
     }
 }
 
-/// Accumulator of parameter gradients.
-pub struct Sums<'a, R>(Grads<'a, R>);
+/// Channels of some rows, to read.
+#[derive(Clone, Copy)]
+pub struct Channels<'a, N: Lanes> {
+    tile: Tile<'a, N::Real>,
+    /// The channel of the tile for each of the map.
+    places: &'a [Option<usize>],
+    /// The first row.
+    row: usize,
+    zero: N,
+}
 
-impl<R: Real> Sums<'_, R> {
-    /// Adds `value` to the gradient of parameter `index`.
+impl<N: Lanes> Channels<'_, N> {
+    /// Channel `c`; 0 if it is masked.
     #[inline(always)]
-    pub fn add(&mut self, index: usize, value: R) {
+    pub fn at(&self, c: usize) -> N {
+        match self.places[c] {
+            Some(place) => self.zero.load(self.tile.channel(place), self.row),
+            None => self.zero,
+        }
+    }
+
+    /// The number `value` in every row.
+    #[inline(always)]
+    pub fn same(&self, value: f64) -> N {
+        self.zero.same(value)
+    }
+}
+
+/// Channels of some rows, to write.
+pub struct ChannelsMut<'a, N: Lanes> {
+    tile: TileMut<'a, N::Real>,
+    /// The channel of the tile for each of the map; what has none is not needed.
+    places: &'a [Option<usize>],
+    /// The first row.
+    row: usize,
+    zero: N,
+}
+
+impl<N: Lanes> ChannelsMut<'_, N> {
+    /// Writes channel `c`.
+    #[inline(always)]
+    pub fn set(&mut self, c: usize, value: N) {
+        if let Some(place) = self.places[c] {
+            value.store(self.tile.channel(place), self.row);
+        }
+    }
+}
+
+/// Gradients of parameters and inputs, to add to.
+pub struct Gradients<'a, N: Lanes> {
+    params: Grads<'a, N::Real>,
+    /// Rows of the present numbers.
+    rows: usize,
+    inputs: ChannelsMut<'a, N>,
+}
+
+impl<N: Lanes> Gradients<'_, N> {
+    /// Adds to the gradient of parameter `index`.
+    #[inline(always)]
+    pub fn param(&mut self, index: usize, value: N) {
         // Another worker sums the others.
-        if self.0.range.contains(&index) {
-            self.0.values[index - self.0.range.start] += value;
+        if self.params.range.contains(&index) {
+            self.params.values[index - self.params.range.start] += value.sum(self.rows);
+        }
+    }
+
+    /// Adds to the gradient of input channel `c`.
+    #[inline(always)]
+    pub fn input(&mut self, c: usize, value: N) {
+        let ChannelsMut { tile, places, row, zero } = &mut self.inputs;
+        if let Some(place) = places[c] {
+            let channel = tile.channel(place);
+            (zero.load(channel, *row) + value).store(channel, *row);
         }
     }
 }
@@ -93,17 +159,17 @@ impl<R: Real> Sums<'_, R> {
 /// The stage of a [`RowMap`].
 pub struct ByRow<T> {
     map: Arc<T>,
-    /// Input channels of the map that are used; the others are 0.
-    inputs: Vec<usize>,
-    /// Output channels of the map that are used.
-    outputs: Vec<usize>,
+    /// The channel of the stage for each input of the map; a masked one has none.
+    inputs: Vec<Option<usize>>,
+    /// The same for its outputs.
+    outputs: Vec<Option<usize>>,
 }
 
 impl<T: RowMap> ByRow<T> {
     /// The stage of `map`.
     pub fn new(map: T) -> Self {
-        let [input, output] = map.widths();
-        Self { map: Arc::new(map), inputs: (0..input).collect(), outputs: (0..output).collect() }
+        let [inputs, outputs] = map.widths().map(|n| (0..n).map(Some).collect());
+        Self { map: Arc::new(map), inputs, outputs }
     }
 
     /// All parameters: a reduced stage keeps them.
@@ -112,38 +178,116 @@ impl<T: RowMap> ByRow<T> {
         if all.is_empty() { vec![] } else { vec![all] }
     }
 
-    /// The stage that computes only the outputs `keep`.
-    fn without_outputs(&self, keep: &[usize]) -> (Self, Vec<Range<usize>>, Vec<usize>) {
-        let outputs = keep.iter().map(|&c| self.outputs[c]).collect();
-        let stage = Self { map: self.map.clone(), inputs: self.inputs.clone(), outputs };
-        (stage, self.params(), (0..self.inputs.len()).collect())
+    /// Whether it has all channels of the map.
+    fn whole(&self) -> bool {
+        self.inputs.iter().chain(&self.outputs).all(Option::is_some)
     }
 
-    /// Copies row `i` of `from` to channels `places` of `to`.
-    #[inline(always)]
-    fn take<R: Real>(from: Tile<'_, R>, i: usize, places: &[usize], to: &mut [R]) {
-        for (c, &place) in places.iter().enumerate() {
-            to[place] = from.data[c * from.rows + i];
+    /// The stage without some channels, and the parameters that it keeps: of the map that its author wrote for that, or
+    /// of the same map with these channels.
+    fn kept(
+        &self,
+        keep: &[usize],
+        inputs: Vec<Option<usize>>,
+        outputs: Vec<Option<usize>>,
+    ) -> (Self, Vec<Range<usize>>) {
+        match self.map.keep(keep).filter(|_| self.whole()) {
+            Some((map, params)) => (Self::new(map), params),
+            None => (Self { map: self.map.clone(), inputs, outputs }, self.params()),
         }
     }
 }
 
-impl<T: RowMap, R: Real> Kernel<R> for ByRow<T> {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, mut y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        let [input, output] = self.map.widths();
-        let (mut row, mut out) = (vec![R::ZERO; input], vec![R::ZERO; output * BLOCK.min(x.rows)]);
-        for at in (0..x.rows).step_by(BLOCK) {
-            let rows = at..x.rows.min(at + BLOCK);
-            out.fill(R::ZERO);
-            for i in rows.clone() {
-                Self::take(x, i, &self.inputs, &mut row);
-                self.map.forward(params, &row, &mut out[(i - at) * output..][..output]);
-            }
-            for (c, &place) in self.outputs.iter().enumerate() {
-                let from = out.iter().skip(place).step_by(output);
-                y.channel(c)[rows.clone()].iter_mut().zip(from).for_each(|(to, from)| *to = *from);
-            }
+/// These channels without all but `keep`.
+fn only(channels: &[Option<usize>], keep: &[usize]) -> Vec<Option<usize>> {
+    channels.iter().map(|c| keep.iter().position(|k| Some(*k) == *c)).collect()
+}
+
+/// The number of channels that are used.
+fn used(channels: &[Option<usize>]) -> usize {
+    channels.iter().flatten().count()
+}
+
+struct Forward<'a, T, R> {
+    stage: &'a ByRow<T>,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    y: TileMut<'a, R>,
+}
+
+impl<T: RowMap, R: Real> Forward<'_, T, R> {
+    /// Rows `from` to `to`, so many at once that the last may be past the end.
+    #[inline(always)]
+    fn rows<S: Simd, const K: usize>(&mut self, s: S, from: usize, to: usize) {
+        let (zero, ByRow { map, inputs, outputs }) = (Vectors::<S, R, K>::splat(s, R::ZERO), self.stage);
+        for row in (from..to).step_by(Vectors::<S, R, K>::ROWS) {
+            let x = Channels { tile: self.x, places: inputs, row, zero };
+            let tile = TileMut::new(self.y.data, self.y.rows);
+            map.forward(self.params, x, &mut ChannelsMut { tile, places: outputs, row, zero });
         }
+    }
+}
+
+impl<T: RowMap, R: Real> Op for Forward<'_, T, R> {
+    type Number = R;
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(mut self, s: S) {
+        let (rows, most) = (self.x.rows, Vectors::<S, R, AT_ONCE>::ROWS);
+        let whole = rows - rows % most;
+        self.rows::<S, AT_ONCE>(s, 0, whole);
+        self.rows::<S, 1>(s, whole, rows);
+    }
+}
+
+struct Backward<'a, T, R> {
+    stage: &'a ByRow<T>,
+    params: &'a [R],
+    x: Tile<'a, R>,
+    dy: Tile<'a, R>,
+    grads: Grads<'a, R>,
+    dx: Option<TileMut<'a, R>>,
+}
+
+impl<T: RowMap, R: Real> Backward<'_, T, R> {
+    /// As [`Forward::rows`]; `nowhere` is for the gradients of inputs that nobody asks for.
+    #[inline(always)]
+    fn rows<S: Simd, const K: usize>(&mut self, s: S, from: usize, to: usize, nowhere: &[Option<usize>]) {
+        let (zero, ByRow { map, inputs, outputs }) = (Vectors::<S, R, K>::splat(s, R::ZERO), self.stage);
+        for row in (from..to).step_by(Vectors::<S, R, K>::ROWS) {
+            let x = Channels { tile: self.x, places: inputs, row, zero };
+            let dy = Channels { tile: self.dy, places: outputs, row, zero };
+            let (tile, places) = match &mut self.dx {
+                Some(dx) => (TileMut::new(dx.data, dx.rows), &inputs[..]),
+                None => (TileMut::new(&mut [], 0), nowhere),
+            };
+            let params = Grads { values: self.grads.values, range: self.grads.range.clone() };
+            let inputs = ChannelsMut { tile, places, row, zero };
+            let rows = Vectors::<S, R, K>::ROWS.min(to - row);
+            map.backward(self.params, x, dy, &mut Gradients { params, rows, inputs });
+        }
+    }
+}
+
+impl<T: RowMap, R: Real> Op for Backward<'_, T, R> {
+    type Number = R;
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(mut self, s: S) {
+        let nowhere = vec![None; self.stage.inputs.len()];
+        if let Some(dx) = &mut self.dx {
+            dx.data.fill(R::ZERO);
+        }
+        let (rows, most) = (self.x.rows, Vectors::<S, R, AT_ONCE>::ROWS);
+        let whole = rows - rows % most;
+        self.rows::<S, AT_ONCE>(s, 0, whole, &nowhere);
+        self.rows::<S, 1>(s, whole, rows, &nowhere);
+    }
+}
+
+impl<T: RowMap, R: Real> Kernel<R> for ByRow<T> {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
+        run(Forward { stage: self, params, x, y });
     }
 
     fn backward(
@@ -153,21 +297,9 @@ impl<T: RowMap, R: Real> Kernel<R> for ByRow<T> {
         _: TileMut<'_, R>,
         dy: Tile<'_, R>,
         grads: Grads<'_, R>,
-        mut dx: Option<TileMut<'_, R>>,
+        dx: Option<TileMut<'_, R>>,
     ) {
-        let [mut row, mut d] = self.map.widths().map(|n| vec![R::ZERO; n]);
-        let (mut slope, mut grads) = (row.clone(), Sums(grads));
-        for i in 0..x.rows {
-            Self::take(x, i, &self.inputs, &mut row);
-            Self::take(dy, i, &self.outputs, &mut d);
-            slope.fill(R::ZERO);
-            self.map.backward(params, &row, &d, &mut grads, &mut slope);
-            if let Some(dx) = &mut dx {
-                for (c, &place) in self.inputs.iter().enumerate() {
-                    dx.data[c * dx.rows + i] = slope[place];
-                }
-            }
-        }
+        run(Backward { stage: self, params, x, dy, grads, dx });
     }
 }
 
@@ -179,7 +311,7 @@ impl<T: RowMap> Stage for ByRow<T> {
             1..=FEW => GradKind::Dense,
             _ => GradKind::Scatter,
         };
-        let (input, output, macs) = (self.inputs.len(), self.outputs.len(), self.map.macs());
+        let (input, output, macs) = (used(&self.inputs), used(&self.outputs), self.map.macs());
         Info { input, output, params, tape: 0, scope: Scope::Row, grads, macs, identity: false }
     }
 
@@ -205,24 +337,23 @@ impl<T: RowMap> Stage for ByRow<T> {
         Some(self)
     }
 
-    /// Only for the whole map: a reduced stage runs on the CPU.
+    /// Only for a whole map: with masked channels the stage runs on the CPU.
     fn wgsl(&self) -> Option<Fragment> {
-        let [input, output] = self.map.widths();
-        let whole = [self.inputs.len(), self.outputs.len()] == [input, output];
-        self.map.wgsl().filter(|_| whole)
+        self.map.wgsl().filter(|_| self.whole())
     }
 
     fn describe(&self) -> String {
         let [_, all] = self.map.widths();
-        let (what, kept) = (self.map.describe(), self.outputs.len());
+        let (what, kept) = (self.map.describe(), used(&self.outputs));
         if kept == all { what } else { format!("{what}, {kept} of {all} channels") }
     }
 }
 
 impl<T: RowMap> Encoder for ByRow<T> {
     fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
-        let (stage, params, channels) = self.without_outputs(keep);
-        Ok(Reduced { stage: Box::new(stage), params, channels })
+        ensure(!keep.is_empty(), &self.describe(), "channels", "none kept", "at least one")?;
+        let (stage, params) = self.kept(keep, self.inputs.clone(), only(&self.outputs, keep));
+        Ok(Reduced { stage: Box::new(stage), params, channels: (0..self.inputs.len()).collect() })
     }
 
     fn coarse_to_fine(&self) -> bool {
@@ -231,7 +362,7 @@ impl<T: RowMap> Encoder for ByRow<T> {
 
     fn resolutions(&self) -> Option<Vec<f64>> {
         let all = self.map.resolutions()?;
-        Some(self.outputs.iter().map(|&c| all[c]).collect())
+        Some(self.outputs.iter().zip(all).filter(|(c, _)| c.is_some()).map(|(_, cells)| cells).collect())
     }
 }
 
@@ -245,8 +376,7 @@ impl<T: RowMap> Normalizer for ByRow<T> {
 
 impl<T: RowMap> Field for ByRow<T> {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
-        let inputs = keep.iter().map(|&c| self.inputs[c]).collect();
-        let stage = Self { map: self.map.clone(), inputs, outputs: self.outputs.clone() };
-        Ok(Reduced { stage: Box::new(stage), params: self.params(), channels: (0..self.outputs.len()).collect() })
+        let (stage, params) = self.kept(keep, only(&self.inputs, keep), self.outputs.clone());
+        Ok(Reduced { stage: Box::new(stage), params, channels: (0..self.outputs.len()).collect() })
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! - [`geometry`], [`orbit`], [`scan`], [`outside`], [`parts`]: measurements in millimetres, and the resulting volumes.
 //! - [`simd`], [`dense`], [`activation`], [`trilinear`], [`stage`]: the arithmetic of stages.
-//! - [`by_row`]: stages written for one row at a time; [`prelude`]: imports for their authors.
+//! - [`by_row`]: stages written for one row at a time, over [`lanes`]; [`prelude`]: imports for their authors.
 //! - [`support`]: where the object can be; [`scene`]: the mapping between the world and the stages.
 //! - [`loss`], [`prior`]: what training minimizes.
 //! - [`wgsl`]: stages, losses and priors on a GPU; [`device`]: kernels and buffers on one.
@@ -35,6 +35,7 @@ pub mod finite;
 pub mod geometry;
 pub mod host;
 pub mod input_file;
+pub mod lanes;
 pub mod loss;
 pub mod matrix;
 pub mod method;

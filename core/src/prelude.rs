@@ -2,10 +2,11 @@
 
 pub use crate::arena::{Arena, InitReport, Layout, Weights};
 pub use crate::basis::{Basis, BasisOperator, BasisSpec, Expansion};
-pub use crate::by_row::{ByRow, RowMap, Sums};
+pub use crate::by_row::{ByRow, Channels, ChannelsMut, Gradients, RowMap};
 pub use crate::data_term::{DataTerm, DataTermSpec, Misfit};
 pub use crate::error::{Error, Result, ensure};
 pub use crate::geometry::VoxelGrid;
+pub use crate::lanes::Lanes;
 pub use crate::loss::{Loss, NoiseModel};
 pub use crate::place::StatePart;
 pub use crate::prior::{Blocks, Prior};

@@ -4,7 +4,7 @@
 //! `S`; [`run`] selects the best instruction set of the machine at run time.
 
 use fearless_simd::Bytes;
-pub use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdFloatElement, SimdMask};
+pub use fearless_simd::{ExtractToken, Level, Select, Simd, SimdBase, SimdFloat, SimdFloatElement, SimdMask};
 use std::fmt::{Debug, Display};
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Sub, SubAssign};
@@ -74,8 +74,6 @@ pub trait Real:
     fn exp(self) -> Self;
     /// Natural logarithm.
     fn ln(self) -> Self;
-    /// Square root.
-    fn sqrt(self) -> Self;
     /// Sine and cosine.
     fn sin_cos(self) -> (Self, Self);
     /// Natural logarithm of `1 + exp(x)` without overflow.
@@ -252,10 +250,6 @@ impl Real for f32 {
         f32::ln(self)
     }
     #[inline(always)]
-    fn sqrt(self) -> Self {
-        f32::sqrt(self)
-    }
-    #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {
         f32::sin_cos(self)
     }
@@ -350,10 +344,6 @@ impl Real for f64 {
     #[inline(always)]
     fn ln(self) -> Self {
         f64::ln(self)
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        f64::sqrt(self)
     }
     #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {

@@ -5,15 +5,11 @@
 //! `sin(2ᵏ·π·p)` on `p = 2x − 1` has `f_k = 2ᵏ`, up to a phase. Channels are ordered from low to high frequency: the
 //! coordinates, then for each band `sin x, sin y, sin z, cos x, cos y, cos z`.
 
-use conefield_core::error::{Result, ensure};
-use conefield_core::settings::EncoderSpec;
-use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{Encoder, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
-use conefield_core::wgsl::{Fragment, functions};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::wgsl::functions;
 use std::f64::consts::TAU;
 use std::fmt::Write;
+use std::ops::Range;
 
 /// Spacing of the frequencies between 1 and the highest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -54,12 +50,12 @@ conefield_core::stage_type!(
 
 impl EncoderSpec for Frequency {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        Ok(Box::new(FrequencyStage::new(self)?))
+        Ok(Box::new(ByRow::new(Waves::new(self)?)))
     }
 }
 
 /// One frequency of one coordinate, and the channels of its sine and cosine, if used.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Clone)]
 struct Wave {
     axis: usize,
     frequency: f64,
@@ -67,9 +63,8 @@ struct Wave {
     cos: Option<usize>,
 }
 
-/// The stage that [`Frequency`] builds.
-#[derive(Debug, Clone, PartialEq)]
-pub struct FrequencyStage {
+/// The map of [`Frequency`].
+struct Waves {
     settings: Frequency,
     /// Coordinates that are passed through, with their channels.
     inputs: Vec<(usize, usize)>,
@@ -77,9 +72,9 @@ pub struct FrequencyStage {
     outputs: usize,
 }
 
-impl FrequencyStage {
-    /// Builds the stage, or names the setting that is out of range.
-    pub fn new(settings: &Frequency) -> Result<Self> {
+impl Waves {
+    /// All waves, or the setting that is out of range.
+    fn new(settings: &Frequency) -> Result<Self> {
         let s = settings;
         ensure((1..=64).contains(&s.bands), "spec", "bands", s.bands, "1 to 64")?;
         let max = s.max_frequency;
@@ -107,141 +102,68 @@ impl FrequencyStage {
     }
 }
 
-/// `sin(2π·t)` and `cos(2π·t)`. `t` is in turns, so that whole turns cancel exactly before any rounding. The rest is at
-/// most an eighth of a turn, where the truncation error of the Taylor series is below half a unit in the last place.
-#[inline(always)]
-fn sin_cos_turns<S: Simd, R: Real>(s: S, t: V<S, R>) -> (V<S, R>, V<S, R>) {
-    let number = |v: f64| V::<S, R>::splat(s, R::of(v));
-    let (single, zero) = (size_of::<R>() == 4, number(0.0));
-    // From here on every float is an integer. NaN compares false and stays.
-    let whole = t.abs().simd_ge(number(if single { 16_777_216.0 } else { 9_007_199_254_740_992.0 }));
-    let t = whole.select(zero, t);
-    let quarter = (t * number(4.0)).round_ties_even();
-    let a = quarter.mul_add(number(-0.25), t) * number(TAU);
-    let q = quarter - (quarter * number(0.25)).floor() * number(4.0);
-    let square = a * a;
-    let series = |last: usize| {
-        // 1 − a²/((last − 1)·last)·(…), evaluated from the last term inwards.
-        let mut sum = number(1.0);
-        let mut k = last;
-        while k >= 2 {
-            sum = (square * sum).mul_add(number(-1.0 / (k * (k - 1)) as f64), number(1.0));
-            k -= 2;
-        }
-        sum
-    };
-    let sin = a * series(if single { 9 } else { 17 });
-    let cos = series(if single { 10 } else { 18 });
-    let odd = q.simd_eq(number(1.0)) | q.simd_eq(number(3.0));
-    let (sin, cos) = (odd.select(cos, sin), odd.select(sin, cos));
-    let sin = q.simd_ge(number(2.0)).select(zero - sin, sin);
-    let minus = q.simd_eq(number(1.0)) | q.simd_eq(number(2.0));
-    (sin, minus.select(zero - cos, cos))
-}
+impl RowMap for Waves {
+    fn widths(&self) -> [usize; 2] {
+        [3, self.outputs]
+    }
 
-struct FrequencyForward<'a, R> {
-    stage: &'a FrequencyStage,
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-}
-
-impl<R: Real> Op for FrequencyForward<'_, R> {
-    type Number = R;
-    type Out = ();
     #[inline(always)]
-    fn call<S: Simd>(mut self, s: S) {
-        for &(axis, c) in &self.stage.inputs {
-            self.y.channel(c).copy_from_slice(self.x.channel(axis));
+    fn forward<N: Lanes>(&self, _: &[N::Real], x: Channels<N>, y: &mut ChannelsMut<N>) {
+        for &(axis, c) in &self.inputs {
+            y.set(c, x.at(axis));
         }
-        for wave in &self.stage.waves {
-            let x = self.x.channel(wave.axis);
-            let frequency = V::<S, R>::splat(s, R::of(wave.frequency));
-            let mut i = 0;
-            while i < x.len() {
-                let (sin, cos) = sin_cos_turns::<S, R>(s, load(s, x, i) * frequency);
-                if let Some(c) = wave.sin {
-                    store::<S, R>(sin, self.y.channel(c), i);
-                }
-                if let Some(c) = wave.cos {
-                    store::<S, R>(cos, self.y.channel(c), i);
-                }
-                i += V::<S, R>::LEN;
+        for wave in &self.waves {
+            let (sin, cos) = (x.at(wave.axis) * N::Real::of(wave.frequency)).sin_cos_turns();
+            if let Some(c) = wave.sin {
+                y.set(c, sin);
+            }
+            if let Some(c) = wave.cos {
+                y.set(c, cos);
             }
         }
     }
-}
 
-struct FrequencyBackward<'a, R> {
-    stage: &'a FrequencyStage,
-    x: Tile<'a, R>,
-    dy: Tile<'a, R>,
-    dx: TileMut<'a, R>,
-}
-
-impl<R: Real> Op for FrequencyBackward<'_, R> {
-    type Number = R;
-    type Out = ();
     #[inline(always)]
-    fn call<S: Simd>(mut self, s: S) {
-        self.dx.data.fill(R::ZERO);
-        for &(axis, c) in &self.stage.inputs {
-            self.dx.channel(axis).copy_from_slice(self.dy.channel(c));
-        }
-        let zero = V::<S, R>::splat(s, R::ZERO);
-        for wave in &self.stage.waves {
-            let x = self.x.channel(wave.axis);
-            let dx = self.dx.channel(wave.axis);
-            let frequency = V::<S, R>::splat(s, R::of(wave.frequency));
-            let slope = V::<S, R>::splat(s, R::of(TAU * wave.frequency));
-            let dy = |c: Option<usize>, i| c.map_or(zero, |c| load(s, self.dy.channel(c), i));
-            let mut i = 0;
-            while i < x.len() {
-                let (sin, cos) = sin_cos_turns::<S, R>(s, load(s, x, i) * frequency);
-                let d = dy(wave.sin, i) * cos - dy(wave.cos, i) * sin;
-                store::<S, R>(d.mul_add(slope, load(s, dx, i)), dx, i);
-                i += V::<S, R>::LEN;
+    fn backward<N: Lanes>(&self, _: &[N::Real], x: Channels<N>, dy: Channels<N>, grads: &mut Gradients<N>) {
+        for axis in 0..3 {
+            let own = self.inputs.iter().find(|(a, _)| *a == axis);
+            let mut d = own.map_or(x.same(0.0), |&(_, c)| dy.at(c));
+            for wave in self.waves.iter().filter(|w| w.axis == axis) {
+                let (sin, cos) = (x.at(axis) * N::Real::of(wave.frequency)).sin_cos_turns();
+                let [ds, dc] = [wave.sin, wave.cos].map(|c| c.map_or(x.same(0.0), |c| dy.at(c)));
+                d = (ds * cos - dc * sin).mul_add(x.same(TAU * wave.frequency), d);
             }
+            grads.input(axis, d);
         }
     }
-}
 
-impl<R: Real> Kernel<R> for FrequencyStage {
-    fn forward(&self, _: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(FrequencyForward { stage: self, x, y });
+    fn keep(&self, keep: &[usize]) -> Option<(Self, Vec<Range<usize>>)> {
+        let place = |c: usize| keep.iter().position(|&k| k == c);
+        let waves = self.waves.iter().map(|w| Wave { sin: w.sin.and_then(place), cos: w.cos.and_then(place), ..*w });
+        let kept = Self {
+            settings: self.settings.clone(),
+            inputs: self.inputs.iter().filter_map(|&(axis, c)| Some((axis, place(c)?))).collect(),
+            waves: waves.filter(|w| w.sin.is_some() || w.cos.is_some()).collect(),
+            outputs: keep.len(),
+        };
+        Some((kept, vec![]))
     }
 
-    fn backward(
-        &self,
-        _: &[R],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        _: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        if let Some(dx) = dx {
-            run(FrequencyBackward { stage: self, x, dy, dx });
+    fn macs(&self) -> usize {
+        self.waves.len() * 16
+    }
+
+    fn coarse_to_fine(&self) -> bool {
+        true
+    }
+
+    /// Resolving a period takes two cells.
+    fn resolutions(&self) -> Option<Vec<f64>> {
+        let mut cells = vec![1.0; self.outputs];
+        for w in &self.waves {
+            [w.sin, w.cos].into_iter().flatten().for_each(|c| cells[c] = 2.0 * w.frequency);
         }
-    }
-}
-
-impl Stage for FrequencyStage {
-    fn info(&self) -> Info {
-        Info { input: 3, output: self.outputs, macs: self.waves.len() * 16, ..Info::default() }
-    }
-
-    fn parameters(&self) -> Vec<Parameter> {
-        vec![]
-    }
-
-    fn init(&self, _: u64, _: &mut [f32]) {}
-
-    fn kernel(&self) -> &dyn Kernel<f32> {
-        self
-    }
-
-    fn reference(&self) -> Option<&dyn Kernel<f64>> {
-        Some(self)
+        Some(cells)
     }
 
     fn wgsl(&self) -> Option<Fragment> {
@@ -279,44 +201,12 @@ impl Stage for FrequencyStage {
     }
 }
 
-impl Encoder for FrequencyStage {
-    fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
-        ensure(!keep.is_empty(), "frequency", "channels", "none kept", "at least one")?;
-        let place = |c: usize| keep.iter().position(|&k| k == c);
-        let stage = Self {
-            settings: self.settings.clone(),
-            inputs: self.inputs.iter().filter_map(|&(axis, c)| Some((axis, place(c)?))).collect(),
-            waves: self
-                .waves
-                .iter()
-                .map(|w| Wave { sin: w.sin.and_then(place), cos: w.cos.and_then(place), ..w.clone() })
-                .filter(|w| w.sin.is_some() || w.cos.is_some())
-                .collect(),
-            outputs: keep.len(),
-        };
-        Ok(Reduced { stage: Box::new(stage), params: vec![], channels: vec![0, 1, 2] })
-    }
-
-    fn coarse_to_fine(&self) -> bool {
-        true
-    }
-
-    /// Resolving a period takes two cells.
-    fn resolutions(&self) -> Option<Vec<f64>> {
-        let mut cells = vec![1.0; self.outputs];
-        for w in &self.waves {
-            [w.sin, w.cos].into_iter().flatten().for_each(|c| cells[c] = 2.0 * w.frequency);
-        }
-        Some(cells)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn encode<R: Real>(stage: &FrequencyStage, x: [R; 3]) -> Vec<R> {
-        let mut y = vec![R::ZERO; stage.outputs];
+    fn encode<R: Real>(stage: &ByRow<Waves>, x: [R; 3]) -> Vec<R> {
+        let mut y = vec![R::ZERO; stage.info().output];
         stage.forward(&[], Tile::new(&x, 1), TileMut::new(&mut y, 1), TileMut::new(&mut [], 1));
         y
     }
@@ -325,7 +215,7 @@ mod tests {
     fn bands_follow_the_formula_in_both_precisions() {
         for spacing in [Spacing::Log, Spacing::Linear] {
             let settings = Frequency { spacing, ..Frequency::default() };
-            let stage = FrequencyStage::new(&settings).unwrap();
+            let stage = ByRow::new(Waves::new(&settings).unwrap());
             for i in 0..200 {
                 let x = [f64::from(i) * 0.005, 0.37 + f64::from(i) * 1e-4, 1.0 - f64::from(i) * 0.0049];
                 let x32 = x.map(|v| v as f32);
@@ -357,7 +247,7 @@ mod tests {
             (Frequency { max_frequency: f64::NAN, ..Frequency::default() }, "max_frequency"),
             (Frequency { max_frequency: 0.5, ..Frequency::default() }, "max_frequency"),
         ] {
-            let e = FrequencyStage::new(&bad).unwrap_err().to_string();
+            let e = bad.build().err().unwrap().to_string();
             assert!(e.contains(field), "{e}");
         }
     }

@@ -300,9 +300,9 @@ impl<R: Real> Encoded<R> {
         &self.log
     }
 
-    /// Removes all rows.
+    /// Removes all rows. Their numbers stay, as the next ones overwrite them.
     pub fn clear(&mut self) {
-        self.log.clear();
+        self.log.rows.clear();
     }
 
     /// Features, channel-major.

@@ -32,9 +32,13 @@ struct Sum {
 }
 
 impl Sum {
-    fn sum<R: Real>(&self, params: &[R], x: &[R]) -> R {
-        let weighted: R = x.iter().zip(params).map(|(&x, &w)| w * x).sum();
-        weighted + params[self.width]
+    #[inline(always)]
+    fn sum<N: Lanes>(&self, params: &[N::Real], x: Channels<N>) -> N {
+        let mut sum = x.same(0.0) + params[self.width];
+        for c in 0..self.width {
+            sum += x.at(c) * params[c];
+        }
+        sum
     }
 }
 
@@ -55,18 +59,20 @@ impl RowMap for Sum {
         params[self.width] = self.bias;
     }
 
-    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]) {
-        y[0] = self.sum(params, x).softplus();
+    #[inline(always)]
+    fn forward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, y: &mut ChannelsMut<N>) {
+        y.set(0, self.sum(params, x).softplus());
     }
 
-    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
-        let slope = R::of(1.0 / (1.0 + (-self.sum(params, x).f64()).exp()));
-        let d = dy[0] * slope;
+    #[inline(always)]
+    fn backward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, dy: Channels<N>, grads: &mut Gradients<N>) {
+        // The slope of the softplus is 1/(1 + exp(−sum)).
+        let d = dy.at(0) / ((-self.sum(params, x)).exp() + N::Real::ONE);
         for c in 0..self.width {
-            grads.add(c, d * x[c]);
-            dx[c] += d * params[c];
+            grads.param(c, d * x.at(c));
+            grads.input(c, d * params[c]);
         }
-        grads.add(self.width, d);
+        grads.param(self.width, d);
     }
 
     fn describe(&self) -> String {

@@ -49,17 +49,19 @@ impl RowMap for Affine {
         shift.fill(0.0);
     }
 
-    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]) {
+    #[inline(always)]
+    fn forward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, y: &mut ChannelsMut<N>) {
         for c in 0..self.width {
-            y[c] = params[c] * x[c] + params[self.width + c];
+            y.set(c, x.at(c) * params[c] + params[self.width + c]);
         }
     }
 
-    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
+    #[inline(always)]
+    fn backward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, dy: Channels<N>, grads: &mut Gradients<N>) {
         for c in 0..self.width {
-            grads.add(c, dy[c] * x[c]);
-            grads.add(self.width + c, dy[c]);
-            dx[c] += params[c] * dy[c];
+            grads.param(c, dy.at(c) * x.at(c));
+            grads.param(self.width + c, dy.at(c));
+            grads.input(c, dy.at(c) * params[c]);
         }
     }
 

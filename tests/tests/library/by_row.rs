@@ -1,7 +1,8 @@
 //! Stages that are written for one row at a time, as encoder, normalizer and field.
 
 use conefield_conformance::{Options, check_encoder, check_field, check_normalizer};
-use conefield_core::by_row::{ByRow, RowMap, Sums};
+use conefield_core::by_row::{ByRow, Channels, ChannelsMut, Gradients, RowMap};
+use conefield_core::lanes::Lanes;
 use conefield_core::simd::Real;
 use conefield_core::stage::{Encoder, Field, GradKind, Grads, Kernel, Normalizer, Stage, Tile, TileMut};
 
@@ -30,21 +31,23 @@ impl RowMap for Products {
         params.fill(0.5 + (seed % 3) as f32);
     }
 
-    fn forward<R: Real>(&self, params: &[R], x: &[R], y: &mut [R]) {
-        for (c, y) in y.iter_mut().enumerate() {
+    #[inline(always)]
+    fn forward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, y: &mut ChannelsMut<N>) {
+        for c in 0..self.output {
             let [a, b] = self.pair(c);
-            *y += params[c] * x[a].sin_cos().0 * x[b] + params[self.output];
+            y.set(c, x.at(a).sin_cos().0 * x.at(b) * params[c] + params[self.output]);
         }
     }
 
-    fn backward<R: Real>(&self, params: &[R], x: &[R], dy: &[R], grads: &mut Sums<'_, R>, dx: &mut [R]) {
-        for (c, &dy) in dy.iter().enumerate() {
+    #[inline(always)]
+    fn backward<N: Lanes>(&self, params: &[N::Real], x: Channels<N>, dy: Channels<N>, grads: &mut Gradients<N>) {
+        for c in 0..self.output {
             let [a, b] = self.pair(c);
-            let (w, (sin, cos)) = (params[c], x[a].sin_cos());
-            grads.add(c, dy * sin * x[b]);
-            grads.add(self.output, dy);
-            dx[a] += dy * w * cos * x[b];
-            dx[b] += dy * w * sin;
+            let (w, dy, (sin, cos)) = (params[c], dy.at(c), x.at(a).sin_cos());
+            grads.param(c, dy * sin * x.at(b));
+            grads.param(self.output, dy);
+            grads.input(a, dy * cos * x.at(b) * w);
+            grads.input(b, dy * sin * w);
         }
     }
 
@@ -116,16 +119,20 @@ impl RowMap for Curves {
 
     fn init(&self, _: u64, _: &mut [f32]) {}
 
-    fn forward<R: Real>(&self, _: &[R], x: &[R], y: &mut [R]) {
-        let s = x[0].sin_cos().0;
-        let two = s + R::of(2.0);
-        y.copy_from_slice(&[s.exp(), two.sqrt(), two.ln()]);
+    #[inline(always)]
+    fn forward<N: Lanes>(&self, _: &[N::Real], x: Channels<N>, y: &mut ChannelsMut<N>) {
+        let s = x.at(0).sin_cos().0;
+        let two = s + N::Real::of(2.0);
+        y.set(0, s.exp());
+        y.set(1, two.sqrt());
+        y.set(2, two.ln());
     }
 
-    fn backward<R: Real>(&self, _: &[R], x: &[R], dy: &[R], _: &mut Sums<'_, R>, dx: &mut [R]) {
-        let (s, cos) = x[0].sin_cos();
-        let two = s + R::of(2.0);
-        dx[0] += cos * (dy[0] * s.exp() + dy[1] * R::of(0.5) / two.sqrt() + dy[2] / two);
+    #[inline(always)]
+    fn backward<N: Lanes>(&self, _: &[N::Real], x: Channels<N>, dy: Channels<N>, grads: &mut Gradients<N>) {
+        let (s, cos) = x.at(0).sin_cos();
+        let two = s + N::Real::of(2.0);
+        grads.input(0, cos * (dy.at(0) * s.exp() + dy.at(1) * N::Real::of(0.5) / two.sqrt() + dy.at(2) / two));
     }
 
     fn describe(&self) -> String {

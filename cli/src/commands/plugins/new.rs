@@ -54,7 +54,7 @@ struct Start {
     files: Vec<(String, String)>,
     /// The resulting library.
     library: String,
-    /// The command that builds it.
+    /// The commands that build it; in Rust, that also run the conformance kit.
     build: &'static str,
 }
 
@@ -153,7 +153,7 @@ impl New {
             folder.display(),
         ))?;
         match self.lang {
-            Language::Rust => out::say("The first build compiles conefield's crates too, which takes some minutes."),
+            Language::Rust => out::say("The first build and test compile conefield's crates, too: some minutes each."),
             Language::C => Ok(()),
         }
     }
@@ -169,7 +169,7 @@ impl New {
         let name = self.name.replace('-', "_");
         let (prefix, suffix) = (std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
         let library = format!("target/release/{prefix}{name}{suffix}");
-        Ok(Start { files, library, build: "cargo build --release" })
+        Ok(Start { files, library, build: "cargo build --release\n  cargo test --release" })
     }
 
     fn c(&self) -> Start {
