@@ -27,39 +27,28 @@ pub trait Lanes:
     /// A single number: `f32`, or `f64` when gradients are checked.
     type Real: Real;
     /// `value` in every row. (`self` says how many rows there are.)
-    #[must_use]
     fn same(self, value: f64) -> Self;
     /// `self·factor + term`, rounded once where the processor can.
-    #[must_use]
     fn mul_add(self, factor: Self, term: Self) -> Self;
     /// `then` where `self` is below `limit`, else `otherwise`.
-    #[must_use]
     fn below(self, limit: Self, then: Self, otherwise: Self) -> Self;
     /// `f` of each number: for functions that are missing here.
-    #[must_use]
     fn each(self, f: impl Fn(Self::Real) -> Self::Real) -> Self;
     /// The larger number; NaN if one of them is.
-    #[must_use]
     fn max(self, other: Self) -> Self;
     /// The smaller number; NaN if one of them is.
-    #[must_use]
     fn min(self, other: Self) -> Self;
     /// Magnitude.
-    #[must_use]
     fn abs(self) -> Self;
     /// Square root.
-    #[must_use]
     fn sqrt(self) -> Self;
     /// Exponential; `f32`: relative error below 5e-7.
-    #[must_use]
     fn exp(self) -> Self;
     /// Natural logarithm.
-    #[must_use]
     fn ln(self) -> Self {
         self.each(Self::Real::ln)
     }
     /// Natural logarithm of `1 + exp(x)` without overflow.
-    #[must_use]
     fn softplus(self) -> Self {
         self.each(Self::Real::softplus)
     }
@@ -69,7 +58,6 @@ pub trait Lanes:
     fn sin_cos_turns(self) -> (Self, Self);
     /// Numbers of `from` from `at` on; those past the end are 0.
     #[doc(hidden)]
-    #[must_use]
     fn load(self, from: &[Self::Real], at: usize) -> Self;
     /// Stores the numbers that fit into `to` from `at` on.
     #[doc(hidden)]

@@ -141,6 +141,7 @@ impl std::fmt::Display for Sample {
 }
 
 /// What a page's directory claims.
+#[derive(Clone, Copy)]
 struct Page {
     pixels: u64,
     /// Bytes of the decompressed values.
@@ -181,41 +182,19 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
     let mut first: Option<(Page, Option<Claim>)> = None;
     let (mut pages, mut claimed, mut stored, mut end) = (0usize, [0u64; 2], 0u64, directories.end);
     loop {
-        let (width, height) = decoder.dimensions().map_err(broken)?;
-        let bits = match decoder.colortype().map_err(broken)? {
-            ColorType::Gray(bits @ (8 | 16 | 32 | 64)) => bits,
-            other => {
-                let expected = "one grey channel of 8, 16, 32 or 64 bits";
-                return Err(Error::invalid(&place, format!("page {pages}"), format!("{other:?}"), expected));
-            }
-        };
-        let pixels = u64::from(width) * u64::from(height);
-        let bytes = pixels.saturating_mul(u64::from(bits) / 8);
-        claimed = [claimed[0].saturating_add(bytes), claimed[1].saturating_add(pixels)];
-        let fits = must_unpack(packed, claimed[0], claimed[1]);
-        fits.and(if bytes == 0 { Err("at least one pixel".into()) } else { Ok(()) }).map_err(|expected| {
-            let found = format!("{height} x {width} pixels of {bits} bits in a file of {packed} bytes");
-            Error::invalid(&place, format!("page {pages}"), found, expected)
-        })?;
-        // Includes the next page's entries; a value takes 32 bytes at most.
-        let most = bytes.max(packed.saturating_mul(32));
-        let mut limits = Limits::default();
-        limits.decoding_buffer_size = usize::try_from(most).unwrap_or(usize::MAX);
-        (limits.ifd_value_size, limits.intermediate_buffer_size) = [limits.decoding_buffer_size; 2].into();
-        decoder = decoder.with_limits(limits);
-        let sample = Sample::of(&place, &mut decoder, bits)?;
-        let page = || Page { pixels, bytes, sample, size: [height as usize, width as usize] };
+        let page;
+        (decoder, page) = next(&place, decoder, pages, packed, &mut claimed)?;
         let (like, _) = first.get_or_insert_with(|| {
             let text = decoder.find_tag(Tag::ImageDescription).ok().flatten().and_then(|v| v.into_string().ok());
-            (page(), text.and_then(|t| images::claimed(&t, [u64::from(height), u64::from(width)])))
+            (page, text.and_then(|t| images::claimed(&t, page.size.map(|n| n as u64))))
         });
-        if like.size != page().size {
-            let found = format!("{height} x {width} pixels");
+        if like.size != page.size {
+            let found = format!("{} x {} pixels", page.size[0], page.size[1]);
             return Err(Error::invalid(&place, format!("page {pages}"), found, "the size of the first page"));
         }
-        if like.sample != sample {
+        if like.sample != page.sample {
             let expected = format!("{}, as on the first page", like.sample);
-            return Err(Error::invalid(&place, format!("page {pages}"), sample, expected));
+            return Err(Error::invalid(&place, format!("page {pages}"), page.sample, expected));
         }
         let mut list = |strips, tiles| {
             let tag = if decoder.get_chunk_type() == ChunkType::Tile { tiles } else { strips };
@@ -226,7 +205,7 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
             stored = stored.saturating_add(bytes);
             end = end.max(at.saturating_add(bytes));
         }
-        each(&mut decoder, page())?;
+        each(&mut decoder, page)?;
         pages += 1;
         if !decoder.more_images() {
             break;
@@ -261,6 +240,36 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
         }
     }
     Ok(images)
+}
+
+/// The page of number `number` that `decoder` has come to, in a file of `packed` bytes. Adds its bytes and pixels to
+/// `claimed`, which the file must be able to hold, and limits what the decoder may take in memory.
+fn next(place: &str, mut decoder: Pages, number: usize, packed: u64, claimed: &mut [u64; 2]) -> Result<(Pages, Page)> {
+    let broken = |e: TiffError| broken(place, &e);
+    let (width, height) = decoder.dimensions().map_err(broken)?;
+    let bits = match decoder.colortype().map_err(broken)? {
+        ColorType::Gray(bits @ (8 | 16 | 32 | 64)) => bits,
+        other => {
+            let expected = "one grey channel of 8, 16, 32 or 64 bits";
+            return Err(Error::invalid(place, format!("page {number}"), format!("{other:?}"), expected));
+        }
+    };
+    let pixels = u64::from(width) * u64::from(height);
+    let bytes = pixels.saturating_mul(u64::from(bits) / 8);
+    *claimed = [claimed[0].saturating_add(bytes), claimed[1].saturating_add(pixels)];
+    let fits = must_unpack(packed, claimed[0], claimed[1]);
+    fits.and(if bytes == 0 { Err("at least one pixel".into()) } else { Ok(()) }).map_err(|expected| {
+        let found = format!("{height} x {width} pixels of {bits} bits in a file of {packed} bytes");
+        Error::invalid(place, format!("page {number}"), found, expected)
+    })?;
+    // Includes the next page's entries; a value takes 32 bytes at most.
+    let most = bytes.max(packed.saturating_mul(32));
+    let mut limits = Limits::default();
+    limits.decoding_buffer_size = usize::try_from(most).unwrap_or(usize::MAX);
+    (limits.ifd_value_size, limits.intermediate_buffer_size) = [limits.decoding_buffer_size; 2].into();
+    decoder = decoder.with_limits(limits);
+    let sample = Sample::of(place, &mut decoder, bits)?;
+    Ok((decoder, Page { pixels, bytes, sample, size: [height as usize, width as usize] }))
 }
 
 /// Fewer bytes than this that nothing describes are gaps between the parts of a file.
