@@ -66,7 +66,8 @@ impl Activation {
             Self::None => (x, one),
             Self::Relu => {
                 let on = x.simd_gt(zero);
-                (x.max(zero), on.select(one, zero))
+                // In this order NaN stays NaN.
+                (zero.max(x), on.select(one, zero))
             }
             Self::LeakyRelu => {
                 let slope = x.simd_gt(zero).select(one, number(0.01));

@@ -161,10 +161,20 @@ impl Scene {
     }
 }
 
+/// The greatest common divisor; `a` if `b` is 0.
+fn common_divisor(a: usize, b: usize) -> usize {
+    if b == 0 { a } else { common_divisor(b, a % b) }
+}
+
 /// The 99.5th percentile of the projections: the scan's own scale, hardly moved by single hot pixels.
 fn top_projection(scan: &Scan) -> f64 {
-    let mut all: Vec<f32> =
-        scan.projections.iter().copied().step_by((scan.projections.len() / 1_000_000).max(1)).collect();
+    let columns = scan.projections.dim().2;
+    // About a million values. A step with a factor of the columns would leave out some of them in every row.
+    let mut step = (scan.projections.len() / 1_000_000).max(1);
+    while common_divisor(step, columns) > 1 {
+        step += 1;
+    }
+    let mut all: Vec<f32> = scan.projections.iter().copied().step_by(step).collect();
     let k = ((all.len() as f64 * 0.995) as usize).min(all.len() - 1);
     let (_, x, _) = all.select_nth_unstable_by(k, f32::total_cmp);
     f64::from(*x)

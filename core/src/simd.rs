@@ -162,7 +162,8 @@ impl Real for f32 {
     #[inline(always)]
     fn exp_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self> {
         // Range reduction to |r| ≤ ln2/2, then a degree-6 polynomial (relative error 2e-7), then the exponent's bits.
-        let x = x.max(S::f32s::splat(s, -87.0)).min(S::f32s::splat(s, 88.0));
+        // In this order NaN stays NaN: x86 returns the second number if one is NaN.
+        let x = S::f32s::splat(s, 88.0).min(S::f32s::splat(s, -87.0).max(x));
         let n = (x * std::f32::consts::LOG2_E).round_ties_even();
         let r = n.mul_add(S::f32s::splat(s, -0.693_359_4), x);
         let r = n.mul_add(S::f32s::splat(s, 2.121_944_4e-4), r);
@@ -176,7 +177,7 @@ impl Real for f32 {
     }
     #[inline(always)]
     fn exp2_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self> {
-        let x = x.max(S::f32s::splat(s, -126.0));
+        let x = S::f32s::splat(s, -126.0).max(x);
         let n = x.round_ties_even();
         let r = x - n;
         let mut p = S::f32s::splat(s, POWER_OF_TWO[0]);

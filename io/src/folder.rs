@@ -62,6 +62,8 @@ impl NamedFiles {
 pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> bool, mark: &[&str]) -> Result<()> {
     let place = folder.display().to_string();
     let io = |e| Error::io(folder, e);
+    // What a killed program kept aside is looked at, too.
+    crate::lease::put_back_missing(folder)?;
     if folder.symlink_metadata().is_err() {
         return Ok(());
     }

@@ -123,7 +123,9 @@ pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>,
         values.retain(|_| keep.next() == Some(&true));
         shape = vec![values.len()];
     }
-    if file.text_attribute(&data, "units").is_some_and(|u| u.to_ascii_lowercase().starts_with("rad")) {
+    // CIL calls the attribute `angle_unit`.
+    let unit = ["units", "angle_unit"].iter().find_map(|name| file.text_attribute(&data, name));
+    if unit.is_some_and(|u| u.to_ascii_lowercase().starts_with("rad")) {
         values.iter_mut().for_each(|x| *x = x.to_degrees());
     }
     Ok((shape, values))

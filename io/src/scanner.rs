@@ -427,7 +427,9 @@ fn straightened(place: &str, mut geometry: Geometry, mut projections: Array3<f32
 fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
     let all = [StackAxis::View, StackAxis::Row, StackAxis::Column];
     let lacked: Vec<StackAxis> = all.into_iter().filter(|a| !table.axes.contains(a)).collect();
-    let axes = <[StackAxis; 3]>::try_from([&table.axes[..], &lacked].concat()).ok();
+    // Files of images that lack the views are stacked along the first axis.
+    let all = if lacked == [StackAxis::View] { [&lacked, &table.axes[..]] } else { [&table.axes[..], &lacked] };
+    let axes = <[StackAxis; 3]>::try_from(all.concat()).ok();
     let Some(axes) = axes.filter(|_| lacked.len() < 2) else {
         let expected = "each of \"view\", \"row\" and \"column\" once, or two of them";
         return Err(Error::invalid(place, "layout.axes", format!("{:?}", table.axes), expected));

@@ -18,9 +18,9 @@ use crate::input::must_unpack;
 use crate::number::{ByteOrder, Number};
 use crate::{memory, text};
 use conefield_core::finite::stray;
-use conefield_core::{Error, Result, allowance, files};
+use conefield_core::{Error, Result, allowance, files, parallel};
 use entries::AsStored;
-use images::Claim;
+use images::{Calibration, Claim};
 use ndarray::Array3;
 use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
@@ -81,6 +81,18 @@ fn stack(path: &Path, first: impl FnOnce(&mut Pages) -> Result<()>) -> Result<(S
     if let Some(rest) = &images.rest {
         rest.read(path, &mut values)?;
     }
+    match images.calibration {
+        Some(Calibration::Line([at, times])) => {
+            tracing::info!("{place}: ImageJ's calibration is applied: {at} + {times} times the stored integer");
+            let shown = |v: f32| (at + times * f64::from(v)) as f32;
+            parallel::change(&mut values, [], |part, []| part.iter_mut().for_each(|v| *v = shown(*v)));
+        }
+        Some(Calibration::Other(function)) => {
+            let what = format!("ImageJ's calibration function {function} is not applied: numbers are as stored");
+            text::warn(&place, Some(what));
+        }
+        None => {}
+    }
     text::warn(&place, images.remarks.iter().cloned());
     if images.white > 0 {
         tracing::info!("{place}: {} pages say that white is zero; the numbers are taken as stored", images.white);
@@ -105,6 +117,11 @@ struct Sample {
 }
 
 impl Sample {
+    /// Whether ImageJ calibrates such numbers.
+    fn is_calibrated(self) -> bool {
+        self.format != 3 && self.bits <= 16
+    }
+
     fn of(place: &str, decoder: &mut Pages, bits: u8) -> Result<Self> {
         let format = decoder.find_tag_unsigned_vec::<u16>(Tag::SampleFormat).map_err(|e| broken(place, &e))?;
         Ok(Self { format: format.and_then(|f| f.first().copied()).unwrap_or(1), bits })
@@ -161,6 +178,8 @@ struct Images {
     rest: Option<Rest>,
     /// The text's claim.
     claim: Option<Claim>,
+    /// ImageJ's calibration of the first page.
+    calibration: Option<Calibration>,
     /// Number of pages in which white is zero.
     white: usize,
     /// Warnings for the user.
@@ -179,14 +198,16 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
     let white = directories.white.len();
     let mut decoder =
         Decoder::new(BufReader::new(AsStored { reader: file, white: directories.white, at: 0 })).map_err(broken)?;
-    let mut first: Option<(Page, Option<Claim>)> = None;
+    let mut first: Option<(Page, Option<Claim>, Option<Calibration>)> = None;
     let (mut pages, mut claimed, mut stored, mut end) = (0usize, [0u64; 2], 0u64, directories.end);
     loop {
         let page;
         (decoder, page) = next(&place, decoder, pages, packed, &mut claimed)?;
-        let (like, _) = first.get_or_insert_with(|| {
+        let (like, ..) = first.get_or_insert_with(|| {
             let text = decoder.find_tag(Tag::ImageDescription).ok().flatten().and_then(|v| v.into_string().ok());
-            (page, text.and_then(|t| images::claimed(&t, page.size.map(|n| n as u64))))
+            let text = text.unwrap_or_default();
+            let calibration = Calibration::of(&text).filter(|_| page.sample.is_calibrated());
+            (page, images::claimed(&text, page.size.map(|n| n as u64)), calibration)
         });
         if like.size != page.size {
             let found = format!("{} x {} pixels", page.size[0], page.size[1]);
@@ -212,11 +233,11 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
         }
         decoder.next_image().map_err(broken)?;
     }
-    let Some((page, claim)) = first else {
+    let Some((page, claim, calibration)) = first else {
         return Err(Error::invalid(&place, "TIFF", "no page", "at least one"));
     };
-    let mut images =
-        Images { count: pages, size: page.size, sample: page.sample, rest: None, claim, white, remarks: vec![] };
+    let (size, sample) = (page.size, page.sample);
+    let mut images = Images { count: pages, size, sample, rest: None, claim, calibration, white, remarks: vec![] };
     match claim {
         Some(claim) if claim.images > pages as u64 => {
             let rest = Rest::of(&place, &mut decoder, &page, pages, claim.images, packed)?;
@@ -556,6 +577,52 @@ mod tests {
             let found = read(&path).unwrap();
             assert_eq!(found.values.as_slice().unwrap(), want, "{}", found.numbers);
         }
+    }
+
+    /// ImageJ writes a signed integer unsigned, 32768 larger, and shows it by a calibration.
+    #[test]
+    fn a_calibration_of_imagej_is_applied_to_integers() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.tif");
+        let line = "ImageJ=1.54f\nimages=3\nslices=3\ncf=0\nc0=-32768.0\nc1=2.0\nvunit=Gray Value\n";
+        for (text, at, times) in [
+            (line.to_owned(), -32768.0, 2.0),
+            (line.replace("cf=0", "cf=3"), 0.0, 1.0),
+            (line.replace("c0=-32768.0", "c0=NaN"), 0.0, 1.0),
+        ] {
+            std::fs::write(&path, three(false, 1, &text)).unwrap();
+            let found = read(&path).unwrap();
+            let want: Vec<f32> = (0..18).map(|i| at + times * i as f32).collect();
+            assert_eq!(found.values.iter().copied().collect::<Vec<_>>(), want, "{text}");
+        }
+        let floats: Vec<u8> = [0.25f32, -3.0].iter().flat_map(|x| x.to_le_bytes()).collect();
+        let text = line.replace('3', "1");
+        let entries = [
+            (256, 4, 1, 2),
+            (257, 4, 1, 1),
+            (258, 3, 1, 32),
+            (259, 3, 1, 1),
+            (262, 3, 1, 1),
+            (270, 2, text.len() as u32, 512),
+            (273, 4, 1, 1024),
+            (277, 3, 1, 1),
+            (278, 4, 1, 1),
+            (279, 4, 1, 8),
+            (339, 3, 1, 3),
+        ];
+        std::fs::write(&path, one_page(false, &entries, &text, &floats)).unwrap();
+        assert_eq!(read(&path).unwrap().values.as_slice().unwrap(), [0.25, -3.0]);
+    }
+
+    /// A set of one image per file, each of which describes the whole set.
+    #[test]
+    fn a_file_of_an_ome_set_has_its_own_pages() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a_Z000.ome.tif");
+        let whole = "<OME><Image><Pixels SizeX=\"3\" SizeY=\"2\" SizeZ=\"100\"><TiffData FirstZ=\"0\">\
+                     <UUID FileName=\"a_Z000.ome.tif\"/></TiffData></Pixels></Image></OME>";
+        std::fs::write(&path, &three(false, 1, whole)[..1024 + 6]).unwrap();
+        assert_eq!(read(&path).unwrap().values.dim(), (1, 2, 3));
     }
 
     fn refused(bytes: &[u8], words: &[&str]) {

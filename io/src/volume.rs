@@ -76,7 +76,7 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
         return Err(Error::unsupported(what, "convert it to NIfTI-1 (.nii or .nii.gz)"));
     }
     if dicom::is_header(&head) {
-        if dicom::enhanced::has_frames(path) {
+        if dicom::enhanced::has_frames(path)? {
             return Ok(VolumeFile::Enhanced);
         }
         let what = format!("{}: one DICOM file", path.display());
@@ -212,7 +212,7 @@ pub fn write_voxels_of(
 }
 
 /// Voxels that are read layer by layer along z. Lines of a volume run along z, so that one layer of a volume on the
-/// disk touches every page of it: many layers are read at once there, and held.
+/// disk touches every page of it: many layers are read at once there, and held. Parts of layers pass through.
 struct Layers<'a> {
     voxels: &'a mut dyn Voxels,
     /// The number of layers that are read at once.
@@ -247,7 +247,7 @@ impl Voxels for Layers<'_> {
     fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
         let [nx, ny, nz] = self.grid().shape;
         let [x, y, z] = part.clone();
-        if self.many >= nz || z.len() == nz {
+        if self.many >= nz || z.len() == nz || x.len() < nx {
             return self.voxels.fill(part, out);
         }
         if z.start < self.first || self.first + self.held.dim().2 < z.end {

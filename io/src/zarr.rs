@@ -21,7 +21,8 @@ use flate2::Compression;
 use flate2::write::ZlibEncoder;
 use ndarray::{Array3, ArrayView3, s};
 use serde_json::{Value, json};
-use std::fs;
+use std::fs::{self, File};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Voxels along each side of a chunk.
@@ -108,7 +109,8 @@ impl Pyramid<'_> {
             }
         } else {
             for octant in 0..8 {
-                let side = [octant & 1, octant >> 1 & 1, octant >> 2];
+                // Chunks above each other follow each other: they share pages of a volume on the disk.
+                let side = [octant >> 2, octant >> 1 & 1, octant & 1];
                 let below: [usize; 3] = std::array::from_fn(|k| 2 * at[k] + side[k]);
                 if (0..3).any(|k| below[k] * SIDE >= self.shapes[level - 1][k]) {
                     continue;
@@ -138,7 +140,8 @@ impl Pyramid<'_> {
         }
         let mut packed = ZlibEncoder::new(Vec::new(), Compression::fast());
         number::write(&mut packed, whole.as_slice().unwrap_or_default()).map_err(io)?;
-        fs::write(&file, packed.finish().map_err(io)?).map_err(io)
+        let mut to = File::create(&file).map_err(io)?;
+        to.write_all(&packed.finish().map_err(io)?).and_then(|()| to.sync_all()).map_err(io)
     }
 }
 

@@ -185,7 +185,9 @@ impl Plan for ChainPlan {
             }
             let left = merged[i..].iter().filter(|merged| merged.is_none()).count();
             let before: u64 = merged[..i].iter().rev().map_while(|passes| *passes).sum();
+            // A number of passes here replaces the method's own end in seconds.
             let passes = self.links[i].passes().map(|own| own + before);
+            let passes = passes.filter(|_| before > 0 || job.limits.then.is_some());
             let limits = match i {
                 0 => job.limits,
                 _ => later(&job.limits, made.counts.train_s, left, passes),

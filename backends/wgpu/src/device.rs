@@ -115,7 +115,8 @@ impl Adapter {
             .into(),
             driver: [info.driver, info.driver_info].join(" ").trim().into(),
             software: info.device_type == wgpu::DeviceType::Cpu,
-            binding_bytes: limits.max_storage_buffer_binding_size,
+            // Metal states more, but its kernels count bytes in 32 bits.
+            binding_bytes: limits.max_storage_buffer_binding_size.min((1 << 31) - 16),
             uniform_bytes: limits.max_uniform_buffer_binding_size.min(1 << 16),
             buffer_bytes: limits.max_buffer_size,
             storage_buffers: limits.max_storage_buffers_per_shader_stage,

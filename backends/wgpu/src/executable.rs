@@ -475,7 +475,8 @@ fn of_blocks(prior: usize) -> String {
 
 impl Executable for Wgpu {
     fn admits(&self, loss: &dyn Loss, priors: &[Box<dyn Prior>]) -> Result<()> {
-        sources(loss, priors.iter().map(|p| p.as_ref())).map(drop)
+        let all = sources(loss, priors.iter().map(|p| p.as_ref()))?;
+        all.iter().try_for_each(|(label, source)| validate(source).and_then(|()| fits(self.gpu(), label, source)))
     }
 
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats> {

@@ -209,7 +209,42 @@ const RAY_FAULTS: &[Fault] = faults! {
     fault "a fitted projector whose lengths are 10 % too long",
         instead "weights[i] = length", "weights[i] = n % 2 == 1 ? 1.1f * length : length",
         ["", "fitted to a scene", ""];
+    fault "an adjoint that writes nothing", instead RAY_FUNCTIONS, NO_ADJOINT,
+        ["", "of its derivatives is left unwritten", "of its derivatives is left unwritten"];
+    fault "an adjoint that writes past its end", instead RAY_FUNCTIONS, LONG_ADJOINT, ["", "it writes outside its derivatives", "it writes outside its derivatives"];
 };
+
+/// Where a projector gets more functions.
+const RAY_FUNCTIONS: &str = "static const struct ConefieldProjector FUNCTIONS = {";
+
+/// As after a panic.
+const NO_ADJOINT: &str =
+    "static double integrate(const void *stage, const float *weights, const double *mu, size_t count) {
+    double sum = 0;
+    for (size_t i = 0; i < count; i++) sum += weights[i] * mu[i];
+    return sum;
+}
+
+static void adjoint(const void *stage, const float *weights, double dline, double *dmu, size_t count) {}
+
+static const struct ConefieldProjector FUNCTIONS = {
+    .integrate = integrate,
+    .adjoint = adjoint,";
+
+const LONG_ADJOINT: &str =
+    "static double integrate(const void *stage, const float *weights, const double *mu, size_t count) {
+    double sum = 0;
+    for (size_t i = 0; i < count; i++) sum += weights[i] * mu[i];
+    return sum;
+}
+
+static void adjoint(const void *stage, const float *weights, double dline, double *dmu, size_t count) {
+    for (size_t i = 0; i <= count; i++) dmu[i] = dline;
+}
+
+static const struct ConefieldProjector FUNCTIONS = {
+    .integrate = integrate,
+    .adjoint = adjoint,";
 
 /// Learns nothing from a scan.
 const FITTED_LOSS: Edit = instead(

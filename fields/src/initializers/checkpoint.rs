@@ -39,7 +39,7 @@ pub struct CheckpointInitializer {
 
 impl Initializer for CheckpointInitializer {
     fn check(&self, layout: &Layout) -> Result<()> {
-        self.apply(layout, &mut Arena::new(layout.len())).map(drop)
+        self.weights.check(&self.path, layout, |_| true).map(drop)
     }
 
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {

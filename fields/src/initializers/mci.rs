@@ -34,6 +34,11 @@ impl InitializerSpec for Mci {
     }
 }
 
+/// Whether a block of this name is loaded.
+fn takes(name: &str) -> bool {
+    !name.starts_with("encoder.")
+}
+
 /// The initializer that [`Mci`] builds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MciInitializer {
@@ -43,15 +48,15 @@ pub struct MciInitializer {
 
 impl Initializer for MciInitializer {
     fn check(&self, layout: &Layout) -> Result<()> {
-        self.apply(layout, &mut Arena::new(layout.len())).map(drop)
+        if !layout.blocks.iter().any(|b| takes(&b.name)) {
+            return Err(Error::unsupported("mci", "neither normalizers nor field of this pipeline have weights"));
+        }
+        self.weights.check(&self.path, layout, takes).map(drop)
     }
 
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {
-        let take = |name: &str| !name.starts_with("encoder.");
-        if !layout.blocks.iter().any(|b| take(&b.name)) {
-            return Err(Error::unsupported("mci", "neither normalizers nor field of this pipeline have weights"));
-        }
-        let mut report = self.weights.load(&self.path, layout, &mut arena.params, take)?;
+        self.check(layout)?;
+        let mut report = self.weights.load(&self.path, layout, &mut arena.params, takes)?;
         for (_, why) in &mut report.fresh {
             *why = "the encoder starts afresh".into();
         }

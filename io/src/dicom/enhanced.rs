@@ -223,8 +223,8 @@ impl Head {
 }
 
 /// Whether the DICOM file `path` has functional groups of frames: only those are volumes.
-pub(crate) fn has_frames(path: &Path) -> bool {
-    Head::read(path).is_ok_and(|head| head.object.get(PER_FRAME).is_some())
+pub(crate) fn has_frames(path: &Path) -> Result<bool> {
+    Ok(Head::read(path)?.object.get(PER_FRAME).is_some())
 }
 
 /// Number of voxels that [`read`] returns.

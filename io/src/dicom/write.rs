@@ -159,7 +159,8 @@ impl Series {
             let mut file = BufWriter::new(File::create(&path).map_err(|e| Error::io(&path, e))?);
             self.head(&path, &mut file, self.slice(k), &self.digest.uid(&format!("slice {k}")), 1)?;
             self.pixels(&path, &mut file, 1)?;
-            file.flush().map_err(|e| Error::io(&path, e))?;
+            let file = file.into_inner().map_err(|e| Error::io(&path, e.into_error()))?;
+            file.sync_all().map_err(|e| Error::io(&path, e))?;
         }
         Ok(())
     }

@@ -102,7 +102,7 @@ impl Layout {
                         Err(file.invalid("image_key", "no such frame", format!("frames of {what}")))
                     }
                     Some(keys) => {
-                        file.one_each(&data, keys.len(), file.shape(&data)?[0])?;
+                        file.one_each(&data, keys.len(), file.shape(&data)?.first().copied().unwrap_or_default())?;
                         Ok((data, Some(keys.iter().map(|k| *k == key).collect())))
                     }
                 }

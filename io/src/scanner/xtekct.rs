@@ -64,7 +64,7 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
         projections,
         open: Open::Number(white),
         response: Response::Counts,
-        volume: volume(&keys, [rows, columns], at_axis, &mut remarks)?,
+        volume: volume(&keys, [rows, columns], at_axis, aside - aside_detector * object / detector, &mut remarks)?,
         remarks,
     })
 }
@@ -170,10 +170,16 @@ fn projections(keys: &Keys, path: &Path, count: usize, remarks: &mut Vec<String>
 }
 
 /// The volume in the file, else one as wide as the detector's field of view.
-fn volume(keys: &Keys, detector: [usize; 2], at_axis: [f64; 2], remarks: &mut Vec<String>) -> Result<VoxelGrid> {
+fn volume(
+    keys: &Keys,
+    detector: [usize; 2],
+    at_axis: [f64; 2],
+    aside: f64,
+    remarks: &mut Vec<String>,
+) -> Result<VoxelGrid> {
     let axes = ["X", "Y", "Z"];
     if !axes.iter().all(|a| keys.has(&format!("Voxels{a}"))) {
-        return field_of_view(keys.place(), detector, at_axis, 0.0, remarks);
+        return field_of_view(keys.place(), detector, at_axis, aside, remarks);
     }
     let numbers =
         |name: &str| -> Result<Vec<f64>> { axes.iter().map(|a| keys.length(&format!("{name}{a}"))).collect() };

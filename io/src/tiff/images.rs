@@ -13,6 +13,29 @@ pub(super) struct Claim {
     pub whole: bool,
 }
 
+/// What ImageJ shows for a stored 8- or 16-bit integer.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Calibration {
+    /// The first number plus the second times the integer. ImageJ writes signed 16-bit integers like that.
+    Line([f64; 2]),
+    /// The function of this number.
+    Other(u32),
+}
+
+impl Calibration {
+    /// The calibration in ImageJ's lines; `None` if it shows integers as they are stored.
+    pub fn of(text: &str) -> Option<Self> {
+        let entry = |name: &str| text.lines().find_map(|l| l.strip_prefix(name)?.strip_prefix('='));
+        let number = |name| entry(name)?.trim().parse::<f64>().ok().filter(|x| x.is_finite());
+        let function: u32 = entry("cf").filter(|_| text.starts_with("ImageJ="))?.trim().parse().ok()?;
+        match (function, number("c0"), number("c1")) {
+            (0, Some(0.0), Some(1.0)) => None,
+            (0, Some(at), Some(times)) => Some(Self::Line([at, times])),
+            _ => Some(Self::Other(function)),
+        }
+    }
+}
+
 /// The claim of `text` for images of `rows` × `columns`: ImageJ's lines, tifffile's `{"shape": [...]}` or OME's XML.
 pub(super) fn claimed(text: &str, [rows, columns]: [u64; 2]) -> Option<Claim> {
     let text = text.trim_start();
@@ -26,6 +49,10 @@ pub(super) fn claimed(text: &str, [rows, columns]: [u64; 2]) -> Option<Claim> {
     }
     if text.starts_with('{') {
         return shaped(&serde_json::from_str(text.trim_end_matches('\0')).ok()?, [rows, columns]);
+    }
+    // A set of several files: the text counts the images of all.
+    if text.contains("FileName=") {
+        return None;
     }
     let (mut images, mut volumes) = (0u64, 0u64);
     // A prefix of the namespace may stand before the name.

@@ -23,6 +23,9 @@ const FIRST_STAGE: usize = size_of::<ConefieldStage>();
 /// Maximum number of stages in a library.
 const MOST_STAGES: usize = 1024;
 
+/// Largest entry of the table of stages, in bytes: later versions may append fields.
+const MOST_STAGE: usize = 4096;
+
 /// A loaded library.
 pub struct Library {
     /// Its file.
@@ -173,11 +176,12 @@ impl Library {
         ensure(!name.is_empty(), place, "name", "nothing", "the plugin's name")?;
         ensure((1..=MOST_STAGES).contains(&t.stage_count), place, "stages", t.stage_count, "1 to 1024")?;
         ensure(
-            t.stage_size >= FIRST_STAGE && t.stage_size.is_multiple_of(align_of::<ConefieldStage>()),
+            (FIRST_STAGE..=MOST_STAGE).contains(&t.stage_size)
+                && t.stage_size.is_multiple_of(align_of::<ConefieldStage>()),
             place,
             "stage table",
             format!("{} bytes per stage", t.stage_size),
-            format!("at least {FIRST_STAGE}"),
+            format!("{FIRST_STAGE} to {MOST_STAGE}"),
         )?;
         ensure(!t.stages.is_null() && t.stages.is_aligned(), place, "stages", "nothing", "a table")?;
         let owner = format!("{name} {version} ({})", path.display());
@@ -372,9 +376,9 @@ impl Handle {
     pub fn describe(&self) -> String {
         let mut text = Text::new();
         // SAFETY: the stage is alive.
-        unsafe { (self.ty.describe)(self.stage, text.room()) };
+        let status = unsafe { (self.ty.describe)(self.stage, text.room()) };
         let text = text.text();
-        let line = text.lines().next().unwrap_or_default();
+        let line = if status == CONEFIELD_OK { text.lines().next().unwrap_or_default() } else { &self.ty.name };
         if line.starts_with(&self.ty.name) { line.into() } else { format!("{}: {line}", self.ty.name) }
     }
 }
@@ -417,6 +421,9 @@ pub(crate) fn whole_text(
             continue;
         }
         let text = String::from_utf8_lossy(&bytes[..n.min(bytes.len())]).into_owned();
+        if status == CONEFIELD_OK && n > bytes.len() {
+            return Err((CONEFIELD_FAILED, format!("its text has {n} bytes, more than {LONGEST_TEXT}")));
+        }
         return if status == CONEFIELD_OK { Ok(text) } else { Err((status, text)) };
     }
     Err((CONEFIELD_FAILED, "its text changes in length".into()))

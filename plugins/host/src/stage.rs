@@ -22,6 +22,9 @@ use std::ptr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
+/// Bytes that no stage holds: a larger number, such as that of a panic, counts as this one.
+const MOST_BYTES: u64 = 1 << 60;
+
 /// The first error of a stage's functions since the last query.
 #[derive(Default)]
 struct Fault {
@@ -113,8 +116,14 @@ impl<F: FunctionsOf> Foreign<F> {
     fn fragment(&self, wgsl: Option<WgslFn>) -> Option<Fragment> {
         let wgsl = wgsl?;
         // SAFETY: the stage is alive; all arguments live during the call.
-        let source = whole_text(|room| unsafe { wgsl(self.handle.stage, room) }).ok()?;
-        Some(Fragment { source: format!("{source}\n{FOREIGN}") })
+        match whole_text(|room| unsafe { wgsl(self.handle.stage, room) }) {
+            Ok(source) => Some(Fragment { source: format!("{source}\n{FOREIGN}") }),
+            Err((CONEFIELD_UNSUPPORTED, _)) => None,
+            Err((status, why)) => {
+                self.fault.set(self.ty().failed("wgsl", status, &why));
+                None
+            }
+        }
     }
 
     /// The stage that `call` derives from this one by `f`, which writes its address; `None` if there is none. Errors

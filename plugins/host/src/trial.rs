@@ -214,6 +214,13 @@ pub(crate) fn projector(ty: &Type, cast: impl Fn(&UnitRay, Option<u64>, usize) -
     Ok(())
 }
 
+/// Tries the adjoint of a projector of type `ty`, which writes `count` derivatives.
+pub(crate) fn derivatives(ty: &Type, count: usize, adjoint: impl Fn(&mut [f64])) -> Result<()> {
+    let mut dmu = Guarded::<f64>::new(count);
+    adjoint(dmu.inner());
+    settled(ty, dmu.complaint("derivatives"))
+}
+
 /// Tries a loss of type `ty`: `at` compares pairs of a predicted and a measured value.
 pub(crate) fn loss(ty: &Type, at: impl Fn(&[f64], &[f64], [&mut [f64]; 2]) -> Result<()>) -> Result<()> {
     let values: Vec<f64> = (0..16).map(|i| 0.25 * f64::from(i) - 0.5).collect();
@@ -258,12 +265,12 @@ pub(crate) fn prior(ty: &Type, points: usize, block: impl Fn(&[f64], &mut [f64])
 pub(crate) fn regularizer(
     ty: &Type,
     count: usize,
-    mut prox: impl FnMut(&[f32], *mut f32) -> Result<f64>,
+    mut prox: impl FnMut(&[f32], &mut [f32]) -> Result<f64>,
 ) -> Result<()> {
     let mut v = Guarded::of(&drawn(count).map(|x| x - 0.3).collect::<Vec<f32>>());
     for _ in 0..2 {
         let mut u = Guarded::<f32>::new(count);
-        let value = prox(v.inner(), u.inner().as_mut_ptr())?;
+        let value = prox(v.inner(), u.inner())?;
         settled(ty, u.complaint("coefficients").or_else(|| v.broken("input")))?;
         settled(ty, below_zero("the penalty", value))?;
         let negative = u.inner().iter().find(|u| **u < 0.0).map(|u| format!("its proximal map gives {u}"));

@@ -79,6 +79,12 @@ impl DetectorNoise {
     }
 }
 
+/// The count where no distribution can be drawn from: 0 for a mean of 0, the mean itself above 1.8e19, where its noise is
+/// below 1e-9 of it. An infinite mean makes the line integral infinite, and the scan is refused.
+fn certain(mean: f64) -> f64 {
+    if mean > 1.0 { mean } else { 0.0 }
+}
+
 struct Detector {
     scale: f64,
     i0: f64,
@@ -88,11 +94,11 @@ struct Detector {
 
 impl Detector {
     fn read(&self, mut pixels: ArrayViewMut2<f32>, random: &mut ChaCha8Rng) {
-        // Both are `None` only for numbers that `validate` refuses: no noise is drawn then.
+        // `None` only for numbers that `validate` refuses: no noise is drawn then.
         let read_out = if self.sigma > 0.0 { Normal::new(0.0, self.sigma).ok() } else { None };
         pixels.mapv_inplace(|a| {
             let expected = self.i0 * (-f64::from(a) / self.scale).exp();
-            let mut count = Poisson::new(expected).map_or(0.0, |p| p.sample(random));
+            let mut count = Poisson::new(expected).map_or_else(|_| certain(expected), |p| p.sample(random));
             if let Some(read_out) = &read_out {
                 count += read_out.sample(random);
             }

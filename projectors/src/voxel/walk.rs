@@ -66,6 +66,10 @@ impl Walk for SiddonWalk {
         let lower = [slab.start as f64 - 0.5, -0.5, -0.5];
         let upper = [slab.end as f64 - 0.5, n[1] as f64 - 0.5, n[2] as f64 - 0.5];
         let Some([near, far]) = ray.clip(lower, upper) else { return };
+        // A ray within the plane between two slabs is in both: it counts in the one that begins there.
+        if ray.ahead[0] == 0.0 && !slab.contains(&((ray.source[0] + 0.5).floor().max(0.0) as usize).min(n[0] - 1)) {
+            return;
+        }
         let first = [slab.start, 0, 0];
         let last = [slab.end - 1, n[1] - 1, n[2] - 1];
         // Just inside, so that rounding cannot put the first voxel outside.

@@ -201,12 +201,20 @@ fn cells(volume: &Volume, scene: &Scene, threshold: f32, count: usize) -> Vec<Be
         let mean: f64 = sum / n;
         above.then(|| Cell { differing: (square - sum * mean).max(0.0), mean, first, side })
     };
-    let corners = |n: usize| (0..n).step_by(LARGEST);
-    let firsts: Vec<[usize; 3]> = corners(shape[0])
-        .flat_map(|x| corners(shape[1]).flat_map(move |y| corners(shape[2]).map(move |z| [x, y, z])))
-        .collect();
-    let mut heap: BinaryHeap<Cell> =
-        parallel::map(firsts, |_, first| look(first, LARGEST)).into_iter().flatten().collect();
+    let cells = |side: usize| -> BinaryHeap<Cell> {
+        let corners = |n: usize| (0..n).step_by(side);
+        let firsts: Vec<[usize; 3]> = corners(shape[0])
+            .flat_map(|x| corners(shape[1]).flat_map(move |y| corners(shape[2]).map(move |z| [x, y, z])))
+            .collect();
+        parallel::map(firsts, |_, first| look(first, side)).into_iter().flatten().collect()
+    };
+    let mut side = LARGEST;
+    let mut heap = cells(side);
+    // A large object has more cells than there may be Gaussians.
+    while heap.len() > count.max(1) {
+        side *= 2;
+        heap = cells(side);
+    }
     let mut done = vec![];
     while heap.len() + done.len() + 7 <= count {
         let Some(cell) = heap.pop() else { break };

@@ -49,6 +49,11 @@ pub trait Iteration {
         Ok(())
     }
 
+    /// What a user can change if it diverges.
+    fn advice(&self) -> Option<&'static str> {
+        None
+    }
+
     /// Scalars of the state.
     fn numbers(&mut self) -> Vec<&mut f64> {
         vec![]
@@ -160,7 +165,7 @@ impl<'a> Run<'a> {
         let pass = method.pass(self.problem, self.step)?;
         method.fault()?;
         self.step += 1;
-        self.check(&pass)?;
+        self.check(&pass, method)?;
         self.clock.pause();
         let record = self.look(&pass, method)?;
         observer.record(&record);
@@ -175,11 +180,12 @@ impl<'a> Run<'a> {
     }
 
     /// Refuses a growing residual that is ten times that of an empty volume: the iteration diverges.
-    fn check(&mut self, pass: &Pass) -> Result<()> {
+    fn check(&mut self, pass: &Pass, method: &dyn Iteration) -> Result<()> {
         let away = pass.residual > 100.0 * self.empty && self.residual.is_some_and(|last| pass.residual > last);
         if away || !pass.residual.is_finite() {
             let times = (pass.residual / self.empty).sqrt();
-            let what = format!("the residual is {times:.3e} times that of an empty volume; try a smaller relaxation");
+            let advice = method.advice().map(|advice| format!("; {advice}")).unwrap_or_default();
+            let what = format!("the residual is {times:.3e} times that of an empty volume{advice}");
             return Err(Error::Diverged { step: self.step, what });
         }
         self.residual = Some(pass.residual);
@@ -188,7 +194,7 @@ impl<'a> Run<'a> {
 
     /// Evaluates the volume after a pass, keeps the best one, and checks the stopping rules.
     fn look(&mut self, pass: &Pass, method: &mut dyn Iteration) -> Result<Record> {
-        let pixels = self.job.scan.projections.len() as f64;
+        let pixels = self.problem.scan.projections.len() as f64;
         // A method may have to compute its volume first.
         let volume = if self.monitor.looks() { Some(method.volume(self.problem)?) } else { None };
         let (mut held_out, mut psnr) = (None, None);

@@ -409,26 +409,43 @@ impl Arrays {
         Ok((all * norm2(place, &self.gradient)? / met.max(1.0)).sqrt())
     }
 
-    /// An upper bound for the largest eigenvalue of `n·(A_s·B)ᵀW(A_s·B)` over n subsets, W the curvature of `data`.
-    /// Uses `before` as working memory.
-    fn largest_eigenvalue(&mut self, problem: &Problem<'_>, data: &dyn Misfit, subsets: &[Vec<usize>]) -> Result<f64> {
-        let Some(first) = subsets.first() else { return Ok(0.0) };
+    /// An upper bound for the largest eigenvalue of `n·(A_s·B)ᵀW(A_s·B)` over n subsets, W the curvature of `data`, and
+    /// the first subset whose rays meet the volume. Uses `before` as working memory.
+    fn largest_eigenvalue(
+        &mut self,
+        problem: &Problem<'_>,
+        data: &dyn Misfit,
+        subsets: &[Vec<usize>],
+    ) -> Result<(f64, usize)> {
         let place = problem.place;
-        place.fill(&mut self.before, 1.0)?;
-        self.model.outside(problem, &mut self.before, 0.0)?;
-        self.curved(problem, data, first)?;
+        let mut first = 0;
+        let mut size = self.curved_ones(problem, data, &subsets[first])?;
+        while size == 0.0 && first + 1 < subsets.len() {
+            first += 1;
+            size = self.curved_ones(problem, data, &subsets[first])?;
+        }
+        ensure(size > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
         let mut worst = 0.0f64;
         for probe in 0..PROBES {
-            let size = norm2(place, &self.gradient)?.sqrt();
             if size == 0.0 {
-                return Ok(0.0);
+                // The last subset's rays miss the volume.
+                size = self.curved_ones(problem, data, &subsets[first])?;
             }
             place.map(&DIVIDE, [size, 0.0], &mut self.before, &[&self.gradient])?;
             self.model.outside(problem, &mut self.before, 0.0)?;
             self.curved(problem, data, &subsets[probe * subsets.len() / PROBES])?;
-            worst = worst.max(norm2(place, &self.gradient)?.sqrt());
+            size = norm2(place, &self.gradient)?.sqrt();
+            worst = worst.max(size);
         }
-        Ok(SAFETY * subsets.len() as f64 * worst)
+        Ok((SAFETY * subsets.len() as f64 * worst, first))
+    }
+
+    /// [`Arrays::curved`] of a volume of ones, and the norm of the result.
+    fn curved_ones(&mut self, problem: &Problem<'_>, data: &dyn Misfit, views: &[usize]) -> Result<f64> {
+        problem.place.fill(&mut self.before, 1.0)?;
+        self.model.outside(problem, &mut self.before, 0.0)?;
+        self.curved(problem, data, views)?;
+        Ok(norm2(problem.place, &self.gradient)?.sqrt())
     }
 
     /// Overwrites `gradient` with `(A_s·B)ᵀW(A_s·B)·v`, v in `before`.
@@ -482,10 +499,11 @@ impl FistaIterate {
         let views = problem.scan.geometry.views.len();
         let subsets = settings.subsets.of(views);
         let grid = arrays.model.grid();
+        let (lipschitz, first) = arrays.largest_eigenvalue(problem, data.as_ref(), &subsets)?;
         // One back-projection, however many priors ask.
         let mut gain = None;
         let noise = &mut |k: f64| {
-            let gain = gain.get_or_insert_with(|| arrays.noise_gain(problem, data.as_ref(), &subsets[0]));
+            let gain = gain.get_or_insert_with(|| arrays.noise_gain(problem, data.as_ref(), &subsets[first]));
             k * data.noise() * gain.as_ref().map_or(0.0, |gain| *gain)
         };
         let weights = settings.prior.weights(&grid, noise).map_err(|e| e.within("prior"))?;
@@ -494,10 +512,8 @@ impl FistaIterate {
         if lambda > 0.0 {
             arrays.penalty.share(&weights.iter().map(|weight| weight / lambda).collect::<Vec<_>>());
         }
-        let lipschitz = arrays.largest_eigenvalue(problem, data.as_ref(), &subsets)?;
         arrays.model.fault()?;
         data.fault()?;
-        ensure(lipschitz > 0.0, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
         Ok(Self {
             arrays,
             data,
@@ -548,7 +564,8 @@ impl FistaIterate {
         // For unions of the previous subsets their bound still holds.
         if self.subsets % fewer != 0.0 {
             let fewer = split(self.views, fewer as usize);
-            self.lipschitz = self.pulled * self.arrays.largest_eigenvalue(problem, self.data.as_ref(), &fewer)?;
+            let (lipschitz, _) = self.arrays.largest_eigenvalue(problem, self.data.as_ref(), &fewer)?;
+            self.lipschitz = self.pulled * lipschitz;
         }
         self.subsets = fewer;
         Ok(())

@@ -11,7 +11,7 @@ use super::sart::column_sums;
 use super::shared::Shared;
 use super::{Iteration, Pass, Problem, Stop, drive::drive};
 use conefield_core::data_term::Misfit;
-use conefield_core::error::Result;
+use conefield_core::error::{Result, ensure};
 use conefield_core::input_file::InputFile;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
@@ -162,6 +162,7 @@ impl MlemIterate {
             problem.forward(views, &self.work, &mut self.pixels)?;
             longest = longest.max(place.reduce(Reduction::Maximum, &self.pixels, &self.pixels)?);
         }
+        ensure(longest > 0.0, "scan", "geometry", "rays that all miss the object's support", "rays through it")?;
         let top = f64::from(problem.scan.projections.iter().fold(0.0f32, |m, p| m.max(*p)));
         // The first update has the same result for a uniform start of any size.
         let uniform = if top > 0.0 { top / longest } else { 0.0 };

@@ -65,7 +65,7 @@ impl<T: Iterative> Plan for IterativePlan<T> {
 
     fn needs(&self, scan: &ScanHeader) -> Needs {
         let shared = self.0.shared();
-        let working = self.0.bytes(scan) + mask_bytes(&shared.scene.support, scan);
+        let working = self.0.bytes(scan) + mask_bytes(&shared.scene.support, &self.0.seen(scan));
         let [surround, corrected] = surround::bytes(shared.scene.surround, scan);
         let corrected = corrected + solid::bytes(&shared.scene.support, scan);
         Needs { surround, corrected, working, resume: working + 4 * scan.voxels(), volume: true, ..Needs::default() }

@@ -52,7 +52,7 @@ impl Regions {
         let Bounds { low, high } =
             self.all.iter().rev().find(|(region, _)| region.holds(p)).map_or(bounds, |(_, b)| *b);
         let free = self.support.as_ref().is_none_or(|support| support.holds(p));
-        if free { Bounds { low, high } } else { Bounds { low: low.min(0.0), high: high.max(0.0) } }
+        if free { Bounds { low, high } } else { Bounds { low: 0.0, high: high.max(0.0) } }
     }
 
     /// Lower and upper bounds of all voxels of `grid`, in standard order.

@@ -254,6 +254,10 @@ struct SartIterate {
 }
 
 impl Iteration for SartIterate {
+    fn advice(&self) -> Option<&'static str> {
+        Some("try a smaller relaxation")
+    }
+
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         if let Some(before) = &mut self.before {
             copy(problem.place, &self.sweep.x, before)?;

@@ -194,6 +194,15 @@ fn what_makes_no_chain_is_refused() {
     }
 }
 
+/// A later method ends by its own time, however many passes it may make.
+#[test]
+fn a_later_method_ends_by_its_own_seconds() {
+    let scan = scan();
+    let text = chain(FIRST, THEN, 500).replace("{ passes = 500 }", "{ passes = 500, seconds = 1e-9 }");
+    let solution = Case::of(&scan).run(&text, &mut Heard::default()).unwrap();
+    assert_eq!(solution.steps, 4);
+}
+
 #[test]
 fn limits_apply_to_the_first_and_the_outline_shows_both() {
     let scan = scan();

@@ -276,6 +276,50 @@ fn a_checkpoint_of_another_volume_is_refused() {
     }
 }
 
+/// A binned scan of a smooth body has about the residual of each pixel, not that of their sum.
+#[test]
+fn the_loss_counts_the_pixels_of_a_binned_scan() {
+    let scan = scan();
+    let loss = |bin: usize| {
+        let text =
+            spec("fista-tv", &format!("bin = {bin}\nsubsets = 1\nprior.weight = {{ fixed = 0.0 }}\n{}", passes(1)));
+        Case::of(&scan).volume(&text).1.losses()[0]
+    };
+    let (all, binned) = (loss(1), loss(2));
+    assert!((binned / all - 1.0).abs() < 0.1, "{binned} and {all}");
+}
+
+/// Views that see nothing, as the first ones of a helix.
+#[test]
+fn a_subset_may_miss_the_volume() {
+    let mut scan = scan();
+    let seen = Case::of(&scan).volume(&spec("fista-tv", &format!("subsets = \"views\"\n{}", passes(6)))).0;
+    for i in [0, 8] {
+        let mut away = scan.geometry.views[i];
+        for p in [&mut away.source, &mut away.detector] {
+            p[2] += 300.0;
+        }
+        scan.geometry.views[i] = away;
+        scan.projections.index_axis_mut(ndarray::Axis(0), i).fill(0.0);
+    }
+    for prior in ["{ fixed = 0.0 }", "{ noise = 0.5 }"] {
+        let settings = format!("subsets = \"views\"\nprior.weight = {prior}\n{}", passes(6));
+        let volume = Case::of(&scan).volume(&spec("fista-tv", &settings)).0;
+        let (found, whole) = (psnr(&volume, &truth()), psnr(&seen, &truth()));
+        assert!(found > whole - 2.0, "{prior}: {found} and {whole} dB");
+    }
+}
+
+/// A support beside all rays.
+#[test]
+fn likelihood_needs_rays_through_the_support() {
+    let mut scan = scan();
+    scan.geometry.volume.shape = [24, 24, 96];
+    let away = "scene.support = { cuboid = { low = [-4.0, -4.0, 82.0], high = [4.0, 4.0, 92.0] } }";
+    let e = Case::of(&scan).run(&spec("mlem", &format!("{away}\n{}", passes(2))), &mut Heard::default()).err().unwrap();
+    assert!(e.to_string().contains("rays that all miss the object's support"), "{e}");
+}
+
 #[test]
 fn passes_time_or_a_small_change_end_a_run() {
     let scan = scan();

@@ -75,25 +75,28 @@ fn levels_open_one_by_one() {
     }
 }
 
-/// Wherever a run is interrupted, it goes on to the same bits.
+/// Wherever a run is interrupted, it goes on to the same bits and records.
 #[test]
 fn a_run_resumes_to_the_same_bits() {
-    let (scan, backend) = (scan(), Cpu::new());
+    let ((scan, held), backend) = (scan().split(&[1]).unwrap(), Cpu::new());
     let spec = spec(&settings(hash_grid(), opening(2, 0.5))).unwrap();
     let solve = |resume: Option<&Resume>, at| {
         let mut stop = Stop::at(at);
-        let job = Job { seed: 7, resume, ..Job::new(&scan, &backend) };
+        let job = Job { seed: 7, held_out: Some(&held), resume, ..Job::new(&scan, &backend) };
         let result = plan(&spec, &backend, &Weights::default()).unwrap().run(&job, &mut stop);
         (result, stop)
     };
+    let records = |s: &Stop| s.heard.iter().map(|r| (r.step, r.held_out, r.events.clone())).collect::<Vec<_>>();
     let bits = |m: Model| m.arena.params.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
-    let whole = model(solve(None, u64::MAX).0.unwrap());
+    let (whole, heard) = solve(None, u64::MAX);
+    let whole = model(whole.unwrap());
     assert_eq!(whole.pipeline.open_channels(), whole.pipeline.encoder.info().output);
     let whole = bits(whole);
     for at in [7, 15, 40] {
         let (_, stopped) = solve(None, at);
-        let again = solve(stopped.kept.as_ref(), u64::MAX).0.unwrap();
-        assert!(bits(model(again)) == whole, "at {at}");
+        let (again, second) = solve(stopped.kept.as_ref(), u64::MAX);
+        assert!(bits(model(again.unwrap())) == whole, "at {at}");
+        assert_eq!([records(&stopped), records(&second)].concat(), records(&heard), "at {at}");
     }
 }
 

@@ -88,6 +88,23 @@ fn regions_overlap_and_end_at_the_support() {
     }
 }
 
+/// A region that admits less than 0 ends at the support, too.
+#[test]
+fn negative_bounds_end_at_the_support() {
+    let regions = json!([{"within": {"cylinder": {"radius": 60.0}}, "low": -0.03, "high": 0.03}]);
+    let scan = scan();
+    for prior in [json!("none"), json!("total-variation"), json!("patches")] {
+        let mut method = within(json!({"type": "fista", "prior": prior, "stop": {"passes": 2}}), &regions);
+        method["scene"]["support"] = json!({"cylinder": {"radius": 40.0}});
+        let found = volume(&method, &scan);
+        let outside =
+            |x: usize, y: usize| [x, y].map(|i| 10.0 * (i as f64 - 7.5)).iter().map(|p| p * p).sum::<f64>() > 1600.0;
+        let wrong = found.indexed_iter().filter(|((x, y, _), v)| outside(*x, *y) && **v != 0.0).count();
+        assert_eq!(wrong, 0, "{prior}");
+        assert!(found.iter().any(|v| *v > 0.0), "{prior}");
+    }
+}
+
 #[test]
 fn regions_that_make_no_sense_are_refused() {
     let cuboid = json!({"cuboid": {"low": BOX[0], "high": BOX[1]}});

@@ -21,7 +21,7 @@ use conefield_core::geometry::Geometry;
 use conefield_core::parallel;
 use conefield_core::place::{
     Array, FilteredViews, Map, Mask, MeasuredViews, Place, ProximalStep, Reduction, SPARE, Streamed, VariationSlope,
-    Weighing, prox_on_host,
+    Weighing, prox_on_host, zeros_with_spare,
 };
 use conefield_core::regularizer::{Kernels, Penalty};
 use conefield_core::voxel::VoxelProjector;
@@ -169,8 +169,8 @@ impl Place for DevicePlace {
     }
 
     fn views<'a>(&self, measured: &'a Array3<f32>) -> Result<MeasuredViews<'a>> {
-        // Views that do not fit are loaded in every pass.
-        let here = match self.zeros(measured.dim().into()) {
+        // Views that do not fit beside what a pass takes for a moment are loaded in every pass.
+        let here = match zeros_with_spare(self, measured.dim().into()) {
             Ok(mut here) => {
                 self.load(measured.view(), &mut here, 0)?;
                 Some(here)

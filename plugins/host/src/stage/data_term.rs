@@ -2,7 +2,7 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, call, make, said};
+use super::{Foreign, MOST_BYTES, call, make, said};
 use crate::library::Handle;
 use crate::trial;
 use conefield_core::prelude::*;
@@ -35,7 +35,7 @@ impl DataTermStage {
             // SAFETY: the stage is alive, both numbers are writable.
             unsafe { f(self.0.handle.stage, shape.as_ptr(), &mut held, &mut brief) };
         }
-        [held, brief]
+        [held, brief].map(|bytes: u64| bytes.min(MOST_BYTES))
     }
 }
 
@@ -58,21 +58,27 @@ impl DataTerm for DataTermStage {
 /// A data term that a library made for one scan.
 pub(crate) struct MisfitOn(Foreign<ConefieldDataTerm>);
 
+/// The common length: a library gets one.
+fn same(measured: &[f32], out: &[f32]) -> usize {
+    assert_eq!(measured.len(), out.len(), "a number for each pixel");
+    out.len()
+}
+
 impl Misfit for MisfitOn {
     fn differentiate(&self, view: usize, measured: &[f32], residuals: &mut [f32]) -> f64 {
         let mut sum = f64::NAN;
-        let (from, count, to) = (measured.as_ptr(), measured.len(), residuals.as_mut_ptr());
+        let (from, count, to) = (measured.as_ptr(), same(measured, residuals), residuals.as_mut_ptr());
         let done = call!(self.0, differentiate(view, from, count, to, &mut sum));
         self.0.noted(done.map(|()| sum), f64::NAN)
     }
 
     fn curve(&self, view: usize, measured: &[f32], values: &mut [f32]) {
-        let (from, count, to) = (measured.as_ptr(), measured.len(), values.as_mut_ptr());
+        let (from, count, to) = (measured.as_ptr(), same(measured, values), values.as_mut_ptr());
         self.0.noted(call!(self.0, curve(view, from, count, to)), ());
     }
 
     fn spread(&self, view: usize, measured: &[f32], values: &mut [f32]) {
-        let (from, count, to) = (measured.as_ptr(), measured.len(), values.as_mut_ptr());
+        let (from, count, to) = (measured.as_ptr(), same(measured, values), values.as_mut_ptr());
         self.0.noted(call!(self.0, spread(view, from, count, to)), ());
     }
 

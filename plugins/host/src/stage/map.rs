@@ -15,6 +15,9 @@ use std::{ptr, slice};
 /// Upper bound of the numbers of parameters, channels, … of a stage: more would overflow computations of hosts.
 const MOST: usize = 1 << 40;
 
+/// Most channels, of input, output and tape.
+const WIDEST: usize = 1 << 20;
+
 /// Maximum number of forward passes: a host does some work for each.
 const MOST_PASSES: usize = 1 << 16;
 
@@ -66,7 +69,12 @@ impl MapStage {
             unsafe { *out = r.stage };
             status
         })?;
-        let smaller = Self::of(self.own.derived("reduce", made)?)?;
+        let derived = self.own.derived("reduce", made)?;
+        let smaller = trial::timed(self.own.ty(), move || {
+            let smaller = Self::of(derived)?;
+            trial::map(smaller.own.ty(), &smaller)?;
+            Ok(smaller)
+        })?;
         if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
             return Err(self.own.wrong("reduce", "it keeps more than there is"));
         }
@@ -99,8 +107,12 @@ unsafe fn many<'a, T>(data: *const T, n: usize) -> &'a [T] {
 /// The reported properties, if they make sense.
 fn sound(i: &ConefieldInfo) -> Result<Info, String> {
     let &ConefieldInfo { input, output, params, tape, macs, .. } = i;
-    if [input, output].contains(&0) || [input, output, params, tape, macs].iter().any(|&n| n > MOST) {
-        return Err(format!("{input} channels in, {output} out, {params} parameters"));
+    let wide = [input, output, tape].iter().any(|&n| n > WIDEST);
+    if [input, output].contains(&0) || wide || [params, macs].iter().any(|&n| n > MOST) {
+        return Err(format!("{input} channels in, {output} out, {tape} on tape, {params} parameters"));
+    }
+    if i.blocks > params || i.partitions > params.max(1) {
+        return Err(format!("{} blocks and {} partitions of {params} parameters", i.blocks, i.partitions));
     }
     let scope = match i.scope {
         CONEFIELD_SCOPE_ROW => Scope::Row,
@@ -201,7 +213,7 @@ fn partition(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Range
         let mut r = ConefieldRange::default();
         // SAFETY: the stage is alive, `r` is writable.
         let status = unsafe { f(own.handle.stage, index, &mut r) };
-        if status != CONEFIELD_OK || r.start != end || r.end < r.start || r.end > i.params {
+        if status != CONEFIELD_OK || r.start != end || r.end <= r.start || r.end > i.params {
             return Err(wrong(format!("range {index} is {}..{} after {end} of {}", r.start, r.end, i.params)));
         }
         all.push(r.start..r.end);

@@ -43,7 +43,7 @@ impl Prior for PriorStage {
     }
 
     fn block(&self, values: &[f64], scale: f64, gradient: &mut [f64]) -> f64 {
-        debug_assert_eq!(values.len(), gradient.len());
+        assert_eq!(values.len(), gradient.len(), "a derivative for each value");
         self.own.noted(self.penalty(values, scale, gradient.as_mut_ptr()), f64::NAN)
     }
 

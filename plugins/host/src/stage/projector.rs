@@ -23,6 +23,7 @@ impl ProjectorStage {
         trial::projector(stage.0.ty(), |ray, seed, guard| {
             let mut samples = Samples::default();
             stage.sample_guarded(ray, seed, guard, &mut samples)?;
+            trial::derivatives(stage.0.ty(), samples.weights.len(), |dmu| stage.derive(&samples.weights, 1.0, dmu))?;
             Ok(stage.integrate(&samples.weights, &vec![1.0; samples.weights.len()]))
         })?;
         Ok(stage)
@@ -44,6 +45,17 @@ impl ProjectorStage {
         out.points.truncate(start + n);
         out.weights.truncate(start + n);
         done.map(drop)
+    }
+
+    /// Writes the adjoint of a line integral.
+    fn derive(&self, weights: &[f32], dline: f64, dmu: &mut [f64]) {
+        match self.0.functions.adjoint {
+            // SAFETY: the stage is alive, both slices have that length.
+            Some(f) => unsafe {
+                f(self.0.handle.stage, weights.as_ptr(), dline, dmu.as_mut_ptr(), weights.len().min(dmu.len()));
+            },
+            None => dmu.iter_mut().zip(weights).for_each(|(d, &w)| *d = f64::from(w) * dline),
+        }
     }
 
     fn fill(
@@ -99,12 +111,11 @@ impl Projector for ProjectorStage {
     }
 
     fn adjoint(&self, weights: &[f32], dline: f64, dmu: &mut [f64]) {
-        match self.0.functions.adjoint {
-            // SAFETY: the stage is alive, both slices have that length.
-            Some(f) => unsafe {
-                f(self.0.handle.stage, weights.as_ptr(), dline, dmu.as_mut_ptr(), weights.len().min(dmu.len()));
-            },
-            None => dmu.iter_mut().zip(weights).for_each(|(d, &w)| *d = f64::from(w) * dline),
+        // What the library leaves unwritten, as after a panic, is not taken for a derivative of 0.
+        dmu.fill(f64::NAN);
+        self.derive(weights, dline, dmu);
+        if dmu.iter().any(|d| d.is_nan()) && dline.is_finite() {
+            self.0.fault.set(self.0.wrong("adjoint", "a derivative is left unwritten or is NaN"));
         }
     }
 

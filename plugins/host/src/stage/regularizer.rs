@@ -2,7 +2,7 @@
 
 #![allow(unsafe_code)]
 
-use super::{Foreign, SMALL, call, make, raw_grid, said};
+use super::{Foreign, MOST_BYTES, SMALL, call, make, raw_grid, said};
 use crate::library::{Handle, text};
 use crate::trial;
 use conefield_core::prelude::*;
@@ -52,7 +52,7 @@ impl Regularizer for RegularizerStage {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         // SAFETY: the stage is alive, the grid lives during the call.
         let bytes = self.0.functions.bytes.map_or(0, |f| unsafe { f(self.0.handle.stage, &raw_grid(grid)) });
-        space.hold(bytes);
+        space.hold(bytes.min(MOST_BYTES));
         // A tally only counts bytes: nothing is built for the actual grid.
         let grid = if space.is_tally() { &SMALL } else { grid };
         Ok(Box::new(self.made_on(grid)?))
@@ -82,13 +82,15 @@ struct PenaltyOn {
 
 impl PenaltyOn {
     fn try_value(&self, x: &[f32]) -> Result<f64> {
+        assert_eq!(x.len(), self.count, "the coefficients of its grid");
         let mut value = f64::NAN;
         call!(self.own, value(x.as_ptr(), x.len(), &mut value))?;
         Ok(value)
     }
 
-    fn try_prox(&mut self, v: &[f32], tau: f32, u: *mut f32) -> Result<()> {
-        call!(self.own, prox(v.as_ptr(), v.len(), tau, u))
+    fn try_prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) -> Result<()> {
+        assert_eq!([v.len(), u.len()], [self.count; 2], "the coefficients of its grid");
+        call!(self.own, prox(v.as_ptr(), v.len(), tau, u.as_mut_ptr()))
     }
 
     /// Entry `index` of its state; `None` after the last.
@@ -145,22 +147,24 @@ impl Penalty for PenaltyOn {
     }
 
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
-        if let Err(e) = self.try_prox(v, tau, u.as_mut_ptr()) {
+        if let Err(e) = self.try_prox(v, tau, u) {
             self.own.fault.set(e);
             u.fill(f32::NAN);
         }
     }
 
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
-        let mut all = vec![];
-        for (i, (name, length)) in self.state.iter().enumerate() {
-            if let Some(found) = self.entry(i).ok().flatten().filter(|e| e.length == *length) {
-                // SAFETY: the plugin guarantees that this many numbers are valid while the penalty lives; entries do
-                // not overlap.
-                all.push((name.as_str(), StatePart::Host(unsafe { slice::from_raw_parts_mut(found.data, *length) })));
-            }
-        }
-        all
+        let part = |(i, (name, length)): (usize, &'_ (String, usize))| -> Result<_> {
+            let found = self.entry(i)?.filter(|e| e.length == *length && !e.data.is_null());
+            let found = found.ok_or_else(|| self.own.wrong("state", &format!("{name:?} changes")))?;
+            // SAFETY: the plugin guarantees that this many numbers are valid while the penalty lives; entries do not
+            // overlap.
+            Ok((i, unsafe { slice::from_raw_parts_mut(found.data, *length) }))
+        };
+        let all: Result<Vec<_>> = self.state.iter().enumerate().map(part).collect();
+        // Without one entry all are without meaning: the fault ends the run.
+        let all = self.own.noted(all, vec![]);
+        all.into_iter().map(|(i, numbers)| (self.state[i].0.as_str(), StatePart::Host(numbers))).collect()
     }
 
     said! { own: fault }

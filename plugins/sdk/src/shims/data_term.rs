@@ -8,6 +8,8 @@ table! { ConefieldDataTerm: bytes of noise differentiate curve spread }
 
 shims! {
     fn bytes(term: data_term, shape: *const usize, held: *mut u64, brief: *mut u64) -> (), or (), {
+        // After a panic the host refuses the run.
+        (*held, *brief) = (u64::MAX, u64::MAX);
         let header = header([0; 3], *shape.cast());
         (*held, *brief) = (term.held(&header), term.scratch(&header));
     }

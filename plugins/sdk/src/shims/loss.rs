@@ -21,9 +21,10 @@ shims! {
 
     fn fitted(loss: loss, noise: *const ConefieldNoise, out: *mut *mut c_void; error) {
         let ConefieldNoise { sigma, growth, measured, count } = *noise;
-        if let Some(fitted) = loss.fitted(&NoiseModel { sigma, growth, measured: many(measured, count) }) {
+        let fitted = loss.fitted(&NoiseModel { sigma, growth, measured: many(measured, count) });
+        loss.fault()?;
+        if let Some(fitted) = fitted {
             *out = hand_over(fitted);
         }
-        loss.fault()?;
     }
 }

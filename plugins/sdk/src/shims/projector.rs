@@ -21,7 +21,7 @@ thread_local! {
 }
 
 shims! {
-    fn max_samples(projector: projector, at: *const ConefieldRay) -> usize, or 0, { projector.max_samples(&ray(&*at)) }
+    fn max_samples(projector: projector, at: *const ConefieldRay) -> usize, or usize::MAX, { projector.max_samples(&ray(&*at)) }
 
     fn sample(
         projector: projector, at: *const ConefieldRay, seed: *const u64, points: *mut f32, weights: *mut f32,

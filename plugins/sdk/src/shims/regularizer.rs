@@ -10,7 +10,7 @@ use std::sync::Arc;
 table! { ConefieldRegularizer: bytes on weight value prox state adapt }
 
 shims! {
-    fn bytes(regularizer: regularizer, voxels: *const ConefieldGrid) -> u64, or 0, {
+    fn bytes(regularizer: regularizer, voxels: *const ConefieldGrid) -> u64, or u64::MAX, {
         let grid = grid(voxels);
         let space = Space::tally(header(grid.shape, [0; 3]));
         regularizer.on(&grid, &space)?;

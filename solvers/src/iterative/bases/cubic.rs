@@ -48,7 +48,11 @@ impl Basis for Cubic {
         let longest = grid.shape.into_iter().max().unwrap_or(1) as f64;
         let spacing = self.samples.map_or(self.spacing, |n| self.spacing.max(longest / f64::from(n)));
         let shape = grid.shape.map(|n| ((n as f64 / spacing).round() as usize).max(1));
-        let spacing = std::array::from_fn(|k| grid.spacing[k] * grid.shape[k] as f64 / shape[k] as f64);
+        let spacing = std::array::from_fn(|k| match grid.shape[k] == shape[k] {
+            // To the bit: a grid of as many samples is the grid of voxels.
+            true => grid.spacing[k],
+            false => grid.spacing[k] * grid.shape[k] as f64 / shape[k] as f64,
+        });
         let axes = std::array::from_fn(|k| Axis::new(shape[k], grid.shape[k]));
         Ok(Box::new(Spline { samples: VoxelGrid { shape, spacing, center: grid.center }, voxels: grid.shape, axes }))
     }
@@ -347,6 +351,15 @@ mod tests {
         let x = Array3::from_shape_fn((4, 5, 6), |(i, j, k)| ((5 * i + 3 * j + 7 * k) % 13) as f64);
         let voxels = expand(spline(shape, 1.0).as_ref(), shape, &x);
         assert!(voxels.iter().zip(&x).all(|(a, b)| (a - b).abs() < 1e-8));
+    }
+
+    /// To the bit, so that the grid is known to be that of the voxels.
+    #[test]
+    fn a_grid_of_as_many_samples_is_the_grid_of_voxels() {
+        for (n, mm) in [(48, 0.1), (96, 0.2), (96, 0.4), (192, 0.7), (384, 0.1)] {
+            let grid = VoxelGrid { shape: [n, n + 1, 7], spacing: [mm; 3], center: [0.1; 3] };
+            assert_eq!(Cubic { spacing: 1.0, samples: None }.on(&grid).unwrap().coefficients(), grid);
+        }
     }
 
     #[test]

@@ -60,6 +60,17 @@ impl CoarseToFine {
         let more = (closed as f64 * (share / self.until).min(1.0) + 1e-9).floor() as usize;
         (self.levels + more).min(all)
     }
+
+    /// Enables the levels of step `step`. Returns an event if that changes their number.
+    fn enable(&self, run: &mut Run<'_>, step: u64) -> Result<Option<String>> {
+        let ends = ends(run.model.pipeline.encoder.as_ref());
+        let open = self.open(ends.len(), run.clock.share(step));
+        if ends[open - 1] == run.model.pipeline.open_channels() {
+            return Ok(None);
+        }
+        run.open(ends[open - 1])?;
+        Ok(Some(format!("coarse-to-fine: {open} of {} levels are open", ends.len())))
+    }
 }
 
 /// End of each level in the encoder's channels.
@@ -89,13 +100,17 @@ impl Callback for Opener {
         Opened::new(encoder.clone(), ends[self.0.levels - 1]).map(drop).map_err(|e| refused(&format!("({e})")))
     }
 
+    /// A resumed run may evaluate a record before its first step: with the levels of the step before.
+    fn begin(&mut self, run: &mut Run<'_>) -> Result<()> {
+        match run.step.checked_sub(1) {
+            Some(before) => self.0.enable(run, before).map(drop),
+            None => Ok(()),
+        }
+    }
+
     fn before_step(&mut self, run: &mut Run<'_>) -> Result<()> {
-        let ends = ends(run.model.pipeline.encoder.as_ref());
-        let open = self.0.open(ends.len(), run.clock.share(run.step));
-        let channels = ends[open - 1];
-        if channels != run.model.pipeline.open_channels() {
-            run.open(channels)?;
-            run.tally.window.events.push(format!("coarse-to-fine: {open} of {} levels are open", ends.len()));
+        if let Some(event) = self.0.enable(run, run.step)? {
+            run.tally.window.events.push(event);
         }
         Ok(())
     }
