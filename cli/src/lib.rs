@@ -15,7 +15,7 @@ mod signals;
 
 use clap::Parser;
 use conefield::{memory, plugins, ranks};
-use conefield_core::Error;
+use conefield_core::{Error, simd};
 use std::ffi::OsString;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -91,6 +91,12 @@ fn obey(cli: Cli) -> u8 {
     {
         log::error(&format!("{n} threads: {e}"));
         return FAILURE;
+    }
+    if let Some(found) = simd::other_level() {
+        let used = simd::level_name();
+        tracing::warn!(
+            "CONEFIELD_SIMD: found {found:?}, expected avx512, avx2 or baseline, if this machine has it; {used} is used"
+        );
     }
     // A plugin under check is loaded only in a separate process.
     if !matches!(&cli.command, commands::Command::Plugins(p) if p.is_check()) {

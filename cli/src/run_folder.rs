@@ -10,6 +10,7 @@ use conefield::scratch;
 use conefield::tradeoff::json::{LONGEST, read_json};
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
+use conefield_core::method::Record;
 use conefield_core::scan::Unit;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::text::bytes;
@@ -132,6 +133,17 @@ impl RunFolder {
         conefield_io::write_text_atomic(&path, &kept)?;
         let file = File::options().append(true).open(&path).map_err(io)?;
         Ok((path, file))
+    }
+
+    /// Loss and held-out error of the last record of metrics.jsonl.
+    pub fn last_record(&self) -> Result<Option<Record>> {
+        let path = self.file("metrics.jsonl");
+        let text = fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
+        let last = text.lines().rev().find_map(|line| serde_json::from_str::<Value>(line).ok());
+        let number = |value: &Value| value.as_f64();
+        let known =
+            |r: Value| Record { loss: number(&r["loss"]), held_out: number(&r["held_out"]), ..Record::default() };
+        Ok(last.map(known))
     }
 
     /// Finishes the run: removes its checkpoint and the run it replaced.

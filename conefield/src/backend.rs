@@ -140,6 +140,10 @@ impl Backend for Auto {
         "auto"
     }
 
+    fn describe(&self) -> String {
+        self.cpu.describe()
+    }
+
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
         let (exe, mut explain) = self.cpu.compile(pipeline)?;
         explain.notes.insert(0, self.note());

@@ -52,6 +52,10 @@ impl Backend for Devices {
         self.members[0].name()
     }
 
+    fn describe(&self) -> String {
+        self.members.iter().map(|member| member.device.describe()).collect::<Vec<_>>().join("; ")
+    }
+
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
         self.members[0].compile(pipeline)
     }

@@ -52,6 +52,8 @@ pub struct RunRecord {
     pub backend: Explain,
     /// Bytes that crossed between the host and the backend's device; 0 on the CPU.
     pub moved: Moved,
+    /// Number of processes.
+    pub processes: usize,
     /// The instruction set.
     pub simd: String,
     /// Number of threads.

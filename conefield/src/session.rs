@@ -11,7 +11,7 @@ use crate::method::{self, Planned, Read};
 use crate::record::{Ends, RunRecord, Written};
 use crate::tradeoff::front::Front;
 use crate::tradeoff::schedule::{Budget, Schedule};
-use crate::{plugins, score, specs};
+use crate::{plugins, ranks, score, specs};
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Silent, Solution};
@@ -218,6 +218,11 @@ impl Run<'_> {
     pub fn record(&self, solved: &Solved, last: Option<&Record>, written: Written) -> RunRecord {
         let Solved { solution, prepare_s } = solved;
         let (method, best) = (&self.method, solution.best);
+        let mut backend = method.plan.outline().backend();
+        if backend.backend.is_empty() {
+            // Only a field is compiled when it is planned.
+            backend.backend = self.backend.describe();
+        }
         RunRecord {
             version: env!("CARGO_PKG_VERSION"),
             spec: method.loaded.spec.name.clone(),
@@ -231,7 +236,8 @@ impl Run<'_> {
             reference: None,
             hounsfield: None,
             plugins: plugins::used(&method.loaded.tree),
-            backend: method.plan.outline().backend(),
+            backend,
+            processes: ranks::count(),
             moved: self.moved(),
             simd: simd_level(),
             threads: rayon::current_num_threads(),

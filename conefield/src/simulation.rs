@@ -84,7 +84,11 @@ pub fn changed(mut p: Protocol, changes: &Changes, place: &str) -> Result<Protoc
             if let Some(views) = changes.views {
                 p.angles = match p.angles {
                     Angles::Even { start_deg, arc_deg, .. } => Angles::Even { views, start_deg, arc_deg },
-                    Angles::ListDeg(_) => Angles::Even { views, start_deg: 0.0, arc_deg: 360.0 },
+                    Angles::ListDeg(_) => {
+                        let (found, expected) =
+                            (format!("--views {views}"), "--angles, or no --views: the protocol lists its angles");
+                        return Err(Error::invalid(place, "--views", found, expected));
+                    }
                 };
             }
         }

@@ -117,8 +117,16 @@ fn sigmoid<S: Simd, R: Real>(s: S, x: V<S, R>) -> V<S, R> {
 const AT_ONCE: usize = 4;
 
 /// `h = f(z)`, `z = f'(z)`.
-#[inline(always)]
+#[inline(never)]
 pub fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R]) {
+    s.vectorize(
+        #[inline(always)]
+        || activate_all(s, act, z, h),
+    );
+}
+
+#[inline(always)]
+fn activate_all<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R]) {
     // One loop per activation, so that no loop branches inside.
     macro_rules! each {
         ($($a:ident),*) => {

@@ -108,6 +108,10 @@ pub struct Explain {
 pub trait Backend: Send + Sync {
     /// Its name on the command line.
     fn name(&self) -> &'static str;
+    /// The same with the instruction set or the device, for records.
+    fn describe(&self) -> String {
+        self.name().into()
+    }
     /// Checks that this backend can run every stage and describes how; never falls back silently.
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)>;
     /// Where this backend keeps volumes and views.

@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result, ensure};
 use crate::simd::Real;
-use crate::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Stage, Tile, TileMut};
+use crate::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Precision, Stage, Tile, TileMut};
 use crate::wgsl::{Fragment, functions, hosted};
 use std::ops::Range;
 use std::sync::Arc;
@@ -41,96 +41,50 @@ impl Opened {
         Ok(Self { whole, open: Arc::from(kept.stage), channels, params })
     }
 
-    fn forward_of<R: Real>(
-        &self,
-        kernel: &dyn Kernel<R>,
-        pass: Option<usize>,
-        params: &[R],
-        x: Tile<'_, R>,
-        y: TileMut<'_, R>,
-        tape: TileMut<'_, R>,
-    ) {
-        let (open, closed) = y.data.split_at_mut(self.channels * x.rows);
-        let (params, y) = (&params[..self.params], TileMut::new(open, x.rows));
-        if pass.unwrap_or(0) == 0 {
+    /// The open channels and the parameters that they have; clears the closed channels.
+    fn apart<'a, R: Real>(&self, params: &'a [R], y: TileMut<'a, R>, clear: bool) -> (&'a [R], TileMut<'a, R>) {
+        let (open, closed) = y.data.split_at_mut(self.channels * y.rows);
+        if clear {
             closed.fill(R::ZERO);
         }
-        match pass {
-            Some(pass) => kernel.forward_pass(pass, params, x, y, tape),
-            None => kernel.forward(params, x, y, tape),
+        (&params[..self.params], TileMut::new(open, y.rows))
+    }
+}
+
+impl<R: Precision> Kernel<R> for Opened {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        let (params, y) = self.apart(params, y, true);
+        if let Some(kernel) = R::kernel(&*self.open) {
+            kernel.forward(params, x, y, tape);
         }
     }
 
-    fn backward_of<R: Real>(
+    fn passes(&self) -> usize {
+        R::kernel(&*self.open).map_or(0, |kernel| kernel.passes())
+    }
+
+    fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        let (params, y) = self.apart(params, y, pass == 0);
+        if let Some(kernel) = R::kernel(&*self.open) {
+            kernel.forward_pass(pass, params, x, y, tape);
+        }
+    }
+
+    fn backward(
         &self,
-        kernel: &dyn Kernel<R>,
         params: &[R],
-        (x, tape, dy): (Tile<'_, R>, TileMut<'_, R>, Tile<'_, R>),
+        x: Tile<'_, R>,
+        tape: TileMut<'_, R>,
+        dy: Tile<'_, R>,
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
         let range = grads.range.start.min(self.params)..grads.range.end.min(self.params);
-        if range.is_empty() && dx.is_none() {
-            return;
-        }
+        let Some(kernel) = R::kernel(&*self.open).filter(|_| !range.is_empty() || dx.is_some()) else { return };
         let values = &mut grads.values[..range.len()];
         let dy = Tile::new(dy.channels(0..self.channels), x.rows);
         kernel.backward(&params[..self.params], x, tape, dy, Grads { values, range }, dx);
     }
-}
-
-/// The kernels of one precision, for the open channels.
-macro_rules! kernels {
-    ($real:ty, $pick:ident) => {
-        impl Kernel<$real> for Opened {
-            fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
-                if let Some(kernel) = $pick(&*self.open) {
-                    self.forward_of(kernel, None, params, x, y, tape);
-                }
-            }
-
-            fn passes(&self) -> usize {
-                $pick(&*self.open).map_or(0, |kernel| kernel.passes())
-            }
-
-            fn forward_pass(
-                &self,
-                pass: usize,
-                params: &[$real],
-                x: Tile<'_, $real>,
-                y: TileMut<'_, $real>,
-                tape: TileMut<'_, $real>,
-            ) {
-                if let Some(kernel) = $pick(&*self.open) {
-                    self.forward_of(kernel, Some(pass), params, x, y, tape);
-                }
-            }
-
-            fn backward(
-                &self,
-                params: &[$real],
-                x: Tile<'_, $real>,
-                tape: TileMut<'_, $real>,
-                dy: Tile<'_, $real>,
-                grads: Grads<'_, $real>,
-                dx: Option<TileMut<'_, $real>>,
-            ) {
-                if let Some(kernel) = $pick(&*self.open) {
-                    self.backward_of(kernel, params, (x, tape, dy), grads, dx);
-                }
-            }
-        }
-    };
-}
-kernels!(f32, single);
-kernels!(f64, double);
-
-fn single(open: &dyn Encoder) -> Option<&dyn Kernel<f32>> {
-    Some(open.kernel())
-}
-
-fn double(open: &dyn Encoder) -> Option<&dyn Kernel<f64>> {
-    open.reference()
 }
 
 impl Stage for Opened {

@@ -122,6 +122,9 @@ impl Real for f32 {
     }
     #[inline(always)]
     fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+        if !shuffles(s) {
+            return one_by_one(s, line, at);
+        }
         let len = S::f32s::LEN;
         let (first, last) = (at.as_slice()[0], at.as_slice()[len - 1]);
         let base = first as usize;
@@ -137,6 +140,9 @@ impl Real for f32 {
     }
     #[inline(always)]
     fn window<S: Simd, const K: usize, const W: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+        if !shuffles(s) {
+            return one_by_one(s, line, at);
+        }
         let len = S::f32s::LEN;
         let line = &line[..W * len];
         let register = |k: usize| S::f32s::from_slice(s, &line[k.min(W - 1) * len..][..len]);
@@ -262,9 +268,12 @@ impl Real for f32 {
     fn dispatch<O: Op>(op: O) -> O::Out {
         #[cfg(target_arch = "x86_64")]
         match level() {
-            Level::Avx512(s) => return with(s, op),
-            Level::Avx2(s) => return with(s, op),
-            _ => (),
+            Level::Avx512(s) if const { O::WIDE } => return with(s, op),
+            level => {
+                if let Some(s) = level.as_avx2() {
+                    return with(s, op);
+                }
+            }
         }
         at_baseline(op)
     }
@@ -367,6 +376,20 @@ fn numbers<S: Simd>(x: S::f32s) -> S::u32s {
     signed.bitcast()
 }
 
+/// Whether registers are shuffled faster than memory is read lane by lane. The baseline of x86-64 has no such instruction.
+#[inline(always)]
+fn shuffles<S: Simd>(s: S) -> bool {
+    #[cfg(target_arch = "x86_64")]
+    {
+        matches!(s.level(), Level::Avx2(_) | Level::Avx512(_))
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    {
+        let _ = s;
+        true
+    }
+}
+
 /// The element of `low` followed by `high` at the index in each lane of `number`.
 #[inline(always)]
 fn pick<S: Simd>(s: S, low: S::f32s, high: S::f32s, number: S::u32s) -> S::f32s {
@@ -462,6 +485,8 @@ pub trait Op {
     type Number: Real;
     /// Result of the work.
     type Out;
+    /// Whether vectors of 512 bits make it faster: otherwise it is not compiled for them.
+    const WIDE: bool = true;
     /// Does the work with the instructions of `s`.
     fn call<S: Simd>(self, s: S) -> Self::Out;
 }
@@ -511,6 +536,12 @@ pub fn level() -> Level {
         #[cfg(not(target_arch = "x86_64"))]
         best
     })
+}
+
+/// The content of `CONEFIELD_SIMD`, if it names other instructions than [`level`].
+pub fn other_level() -> Option<String> {
+    let wanted = std::env::var_os("CONEFIELD_SIMD")?.to_string_lossy().into_owned();
+    (wanted != level_name()).then_some(wanted)
 }
 
 /// The name of [`level`], as in `CONEFIELD_SIMD`.

@@ -273,6 +273,24 @@ pub trait Stage: Send + Sync {
     fn describe(&self) -> String;
 }
 
+/// Numbers that stages compute with.
+pub trait Precision: Real {
+    /// The kernel of a stage for them, if it has one.
+    fn kernel(stage: &dyn Stage) -> Option<&dyn Kernel<Self>>;
+}
+
+impl Precision for f32 {
+    fn kernel(stage: &dyn Stage) -> Option<&dyn Kernel<Self>> {
+        Some(stage.kernel())
+    }
+}
+
+impl Precision for f64 {
+    fn kernel(stage: &dyn Stage) -> Option<&dyn Kernel<Self>> {
+        stage.reference()
+    }
+}
+
 /// A stage without some of its channels, with the remaining parameters and channels.
 pub struct Reduced<S: ?Sized> {
     /// The smaller stage.

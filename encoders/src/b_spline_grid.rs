@@ -231,7 +231,6 @@ impl levels::Level for SplineLevel {
         }
     }
 
-    #[inline(always)]
     fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
         let &Rows { located, table, .. } = rows;
         let weight = located.weight.each_ref().map(|w| w[i]);

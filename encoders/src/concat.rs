@@ -4,7 +4,9 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::random::mix;
 use conefield_core::settings::EncoderSpec;
 use conefield_core::simd::Real;
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
+use conefield_core::stage::{
+    Encoder, GradKind, Grads, Info, Kernel, Parameter, Precision, Reduced, Stage, Tile, TileMut,
+};
 use conefield_core::wgsl::{Fragment, functions, hosted};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -100,47 +102,33 @@ impl ConcatStage {
     }
 }
 
-/// The kernel of a part in one precision.
-type Pick<R> = fn(&ConcatMember) -> Option<&dyn Kernel<R>>;
-
 fn channels<'a, R: Real>(data: &'a mut [R], range: &Range<usize>, rows: usize) -> TileMut<'a, R> {
     TileMut::new(&mut data[range.start * rows..range.end * rows], rows)
 }
 
 impl ConcatStage {
-    fn forward_parts<R: Real>(
-        &self,
-        pick: Pick<R>,
-        params: &[R],
-        x: Tile<'_, R>,
-        y: TileMut<'_, R>,
-        tape: TileMut<'_, R>,
-    ) {
-        for part in &self.parts {
+    /// The parts with their kernels.
+    fn kernels<R: Precision>(&self) -> impl Iterator<Item = (&ConcatMember, &dyn Kernel<R>)> {
+        self.parts.iter().filter_map(|part| Some((part, R::kernel(&*part.stage)?)))
+    }
+}
+
+impl<R: Precision> Kernel<R> for ConcatStage {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        for (part, kernel) in self.kernels::<R>() {
             let y = channels(y.data, &part.outputs, x.rows);
             let tape = channels(tape.data, &part.tape, x.rows);
-            if let Some(kernel) = pick(part) {
-                kernel.forward(&params[part.params.clone()], x, y, tape);
-            }
+            kernel.forward(&params[part.params.clone()], x, y, tape);
         }
     }
 
     /// Sum of the passes of all parts.
-    fn passes_of_parts<R: Real>(&self, pick: Pick<R>) -> usize {
-        self.parts.iter().map(|part| pick(part).map_or(0, Kernel::passes)).sum()
+    fn passes(&self) -> usize {
+        self.kernels::<R>().map(|(_, kernel)| kernel.passes()).sum()
     }
 
-    fn forward_pass_of_parts<R: Real>(
-        &self,
-        pick: Pick<R>,
-        mut pass: usize,
-        params: &[R],
-        x: Tile<'_, R>,
-        y: TileMut<'_, R>,
-        tape: TileMut<'_, R>,
-    ) {
-        for part in &self.parts {
-            let Some(kernel) = pick(part) else { continue };
+    fn forward_pass(&self, mut pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        for (part, kernel) in self.kernels::<R>() {
             if pass >= kernel.passes() {
                 pass -= kernel.passes();
                 continue;
@@ -151,9 +139,8 @@ impl ConcatStage {
         }
     }
 
-    fn backward_parts<R: Real>(
+    fn backward(
         &self,
-        pick: Pick<R>,
         params: &[R],
         x: Tile<'_, R>,
         tape: TileMut<'_, R>,
@@ -165,7 +152,7 @@ impl ConcatStage {
         // Parts overwrite their input gradient, so every part except the first needs its own buffer.
         let mut one = if dx.is_some() && self.parts.len() > 1 { vec![R::ZERO; 3 * n] } else { vec![] };
         let range = &grads.range;
-        for (i, part) in self.parts.iter().enumerate() {
+        for (i, (part, kernel)) in self.kernels::<R>().enumerate() {
             let (from, to) = (part.params.start.max(range.start), part.params.end.min(range.end));
             let own = if from < to { from..to } else { part.params.start..part.params.start };
             if own.is_empty() && dx.is_none() {
@@ -180,7 +167,6 @@ impl ConcatStage {
             let part_dx = dx.as_mut().map(|dx| TileMut::new(if i == 0 { &mut *dx.data } else { &mut one }, n));
             let (tape, grads) = (channels(tape.data, &part.tape, n), Grads { values, range: own });
             let dy = Tile::new(dy.channels(part.outputs.clone()), n);
-            let Some(kernel) = pick(part) else { continue };
             kernel.backward(&params[part.params.clone()], x, tape, dy, grads, part_dx);
             if let (Some(dx), true) = (&mut dx, i > 0) {
                 dx.data.iter_mut().zip(&one).for_each(|(sum, &d)| *sum += d);
@@ -188,46 +174,6 @@ impl ConcatStage {
         }
     }
 }
-
-/// The kernels of one precision, from the parts' kernels that `$pick` finds.
-macro_rules! kernels {
-    ($real:ty, $pick:expr) => {
-        impl Kernel<$real> for ConcatStage {
-            fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
-                self.forward_parts($pick, params, x, y, tape);
-            }
-
-            fn passes(&self) -> usize {
-                self.passes_of_parts::<$real>($pick)
-            }
-
-            fn forward_pass(
-                &self,
-                pass: usize,
-                params: &[$real],
-                x: Tile<'_, $real>,
-                y: TileMut<'_, $real>,
-                tape: TileMut<'_, $real>,
-            ) {
-                self.forward_pass_of_parts($pick, pass, params, x, y, tape);
-            }
-
-            fn backward(
-                &self,
-                params: &[$real],
-                x: Tile<'_, $real>,
-                tape: TileMut<'_, $real>,
-                dy: Tile<'_, $real>,
-                grads: Grads<'_, $real>,
-                dx: Option<TileMut<'_, $real>>,
-            ) {
-                self.backward_parts($pick, params, x, tape, dy, grads, dx);
-            }
-        }
-    };
-}
-kernels!(f32, |p| Some(p.stage.kernel()));
-kernels!(f64, |p| p.stage.reference());
 
 impl Stage for ConcatStage {
     fn info(&self) -> Info {

@@ -112,7 +112,6 @@ impl levels::Level for DenseLevel {
         }
     }
 
-    #[inline(always)]
     fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], _: [R; 3], i: usize) -> [R; 3] {
         let &Rows { located, table, .. } = rows;
         let cell = &table[located.base(i)..];

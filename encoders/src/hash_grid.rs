@@ -378,7 +378,6 @@ impl levels::Level for HashLevel {
         }
     }
 
-    #[inline(always)]
     fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
         let &Rows { located, table, .. } = rows;
         let mut v = [R::ZERO; 8];

@@ -140,7 +140,7 @@ pub trait Level: Clone + Send + Sync + 'static {
         own: &Range<usize>,
     );
 
-    /// Given the derivatives `dy` by the features of row `i`, those by its point `x`.
+    /// Given the derivatives `dy` by the features of row `i`, those by its point `x`. Scalar.
     fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3];
 
     /// The fields of its `stage_Level` in WGSL but the last one, the first parameter.
@@ -278,21 +278,30 @@ fn locate<S: Simd, L: Level, R: Real>(s: S, level: &L, to: &mut L::Located<R>, x
     );
 }
 
+/// [`locate`] with the instructions of this machine.
+struct Locate<'a, L: Level, R: Real> {
+    level: &'a L,
+    to: &'a mut L::Located<R>,
+    x: Tile<'a, R>,
+    at: usize,
+    n: usize,
+}
+
+impl<L: Level, R: Real> Op for Locate<'_, L, R> {
+    type Number = R;
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        locate(s, self.level, self.to, self.x, self.at, self.n);
+    }
+}
+
 /// Where a point lies on a level.
 #[cfg(test)]
 pub fn located<L: Level, R: Real>(level: &L, x: [R; 3]) -> L::Located<R> {
-    struct Locate<'a, L, R>(&'a L, [R; 3]);
-    impl<L: Level, R: Real> Op for Locate<'_, L, R> {
-        type Number = R;
-        type Out = L::Located<R>;
-        #[inline(always)]
-        fn call<S: Simd>(self, s: S) -> Self::Out {
-            let mut to = L::Located::default();
-            locate(s, self.0, &mut to, Tile::new(&self.1, 1), 0, 1);
-            to
-        }
-    }
-    run(Locate(level, x))
+    let mut to = L::Located::default();
+    run(Locate { level, to: &mut to, x: Tile::new(&x, 1), at: 0, n: 1 });
+    to
 }
 
 struct LevelsForward<'a, L: Level, R> {
@@ -329,21 +338,17 @@ struct LevelsBackward<'a, L: Level, R> {
     x: Tile<'a, R>,
     dy: Tile<'a, R>,
     grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
 }
 
 impl<L: Level, R: Real> LevelsBackward<'_, L, R> {
     #[inline(always)]
     fn features<S: Simd, const F: usize>(mut self, s: S) {
         let mut located = L::Located::default();
-        let (mut dy, mut slopes) = ([[R::ZERO; F]; BLOCK], [[R::ZERO; 3]; BLOCK]);
-        if let Some(dx) = &mut self.dx {
-            dx.data.fill(R::ZERO);
-        }
+        let mut dy = [[R::ZERO; F]; BLOCK];
         for part in &self.stage.parts {
             let level = &part.level;
             let mut asked = Asked::of(&self.grads, &part.range(), level.slices() == 1);
-            if asked.is_empty() && self.dx.is_none() {
+            if asked.is_empty() {
                 continue;
             }
             let (table, _) = self.params[part.range()].as_chunks::<F>();
@@ -352,22 +357,41 @@ impl<L: Level, R: Real> LevelsBackward<'_, L, R> {
                 let n = BLOCK.min(self.x.rows - at);
                 part.take(self.dy, &mut dy, at, n);
                 locate(s, level, &mut located, self.x, at, n);
-                let rows = Rows { located: &located, table, n };
-                if !own.is_empty() {
-                    level.scatter(s, &rows, &dy, grads, &own);
-                }
-                let Some(dx) = &mut self.dx else { continue };
-                let x = [0, 1, 2].map(|d| &self.x.channel(d)[at..at + n]);
-                for i in 0..n {
-                    slopes[i] = level.slope(&rows, &dy[i], x.map(|x| x[i]), i);
-                }
-                for d in 0..3 {
-                    for (dx, slope) in dx.channel(d)[at..at + n].iter_mut().zip(&slopes) {
-                        *dx += slope[d];
-                    }
-                }
+                level.scatter(s, &Rows { located: &located, table, n }, &dy, grads, &own);
             }
             asked.finish(&mut self.grads);
+        }
+    }
+}
+
+/// Overwrites `dx` with the derivatives by the input, which no training asks for: scalar, and with no copies for sets
+/// of instructions.
+fn slopes<L: Level, R: Real, const F: usize>(
+    parts: &[Part<L>],
+    params: &[R],
+    x: Tile<'_, R>,
+    dy: Tile<'_, R>,
+    dx: &mut TileMut<'_, R>,
+) {
+    let mut located = L::Located::default();
+    let (mut by, mut slopes) = ([[R::ZERO; F]; BLOCK], [[R::ZERO; 3]; BLOCK]);
+    dx.data.fill(R::ZERO);
+    for part in parts {
+        let (table, _) = params[part.range()].as_chunks::<F>();
+        for at in (0..x.rows).step_by(BLOCK) {
+            let n = BLOCK.min(x.rows - at);
+            part.take(dy, &mut by, at, n);
+            run(Locate { level: &part.level, to: &mut located, x, at, n });
+            let rows = Rows { located: &located, table, n };
+            let x = [0, 1, 2].map(|d| &x.channel(d)[at..at + n]);
+            for i in 0..n {
+                slopes[i] = part.level.slope(&rows, &by[i], x.map(|x| x[i]), i);
+            }
+            for d in 0..3 {
+                for (dx, slope) in dx.channel(d)[at..at + n].iter_mut().zip(&slopes) {
+                    *dx += slope[d];
+                }
+            }
         }
     }
 }
@@ -378,6 +402,7 @@ macro_rules! by_features {
         impl<L: Level, R: Real> Op for $op<'_, L, R> {
             type Number = R;
             type Out = ();
+            const WIDE: bool = false;
             #[inline(always)]
             fn call<S: Simd>(self, s: S) {
                 match self.stage.features {
@@ -416,7 +441,16 @@ impl<L: Level, R: Real> Kernel<R> for Levels<L> {
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(LevelsBackward { stage: self, params, x, dy, grads, dx });
+        if let Some(dx) = &mut { dx } {
+            let slopes = match self.features {
+                1 => slopes::<L, R, 1>,
+                2 => slopes::<L, R, 2>,
+                4 => slopes::<L, R, 4>,
+                _ => slopes::<L, R, 8>,
+            };
+            slopes(&self.parts, params, x, dy, dx);
+        }
+        run(LevelsBackward { stage: self, params, x, dy, grads });
     }
 }
 

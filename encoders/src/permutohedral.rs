@@ -296,7 +296,6 @@ impl levels::Level for SimplexLevel {
         scatter(s, grads, located, dy, n);
     }
 
-    #[inline(always)]
     fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
         let &Rows { located, table, .. } = rows;
         let v: [R; 4] = located.corners(i).map(|c| (0..F).map(|f| table[c as usize][f] * dy[f]).sum());

@@ -257,7 +257,6 @@ impl levels::Level for Factor {
         }
     }
 
-    #[inline(always)]
     fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
         let &Rows { located, table, .. } = rows;
         let (plane, line) = table.split_at(self.plane(1));

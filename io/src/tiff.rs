@@ -621,7 +621,7 @@ mod tests {
         let path = dir.path().join("a_Z000.ome.tif");
         let whole = "<OME><Image><Pixels SizeX=\"3\" SizeY=\"2\" SizeZ=\"100\"><TiffData FirstZ=\"0\">\
                      <UUID FileName=\"a_Z000.ome.tif\"/></TiffData></Pixels></Image></OME>";
-        std::fs::write(&path, &three(false, 1, whole)[..1024 + 6]).unwrap();
+        std::fs::write(&path, &three(false, 1, whole)[..1024 + 12]).unwrap();
         assert_eq!(read(&path).unwrap().values.dim(), (1, 2, 3));
     }
 

@@ -186,9 +186,12 @@ pub fn write_voxels_of(
         return Err(Error::invalid(path.display().to_string(), "file name", file_name(path), expected));
     }
     voxels.grid().validate(&path.display().to_string())?;
+    if format == VolumeFormat::Zarr {
+        // Its chunks come in an order of their own.
+        return zarr::write(path, voxels);
+    }
     let voxels = &mut Layers::new(voxels, allowance::room());
     match format {
-        VolumeFormat::Zarr => return zarr::write(path, voxels),
         VolumeFormat::Dicom => return dicom::write(path, voxels, template),
         VolumeFormat::EnhancedDicom => return dicom::enhanced::write(path, voxels, template),
         VolumeFormat::MetaImageHeader => return metaimage::write_raw(path, voxels),
@@ -212,7 +215,7 @@ pub fn write_voxels_of(
 }
 
 /// Voxels that are read layer by layer along z. Lines of a volume run along z, so that one layer of a volume on the
-/// disk touches every page of it: many layers are read at once there, and held. Parts of layers pass through.
+/// disk touches every page of it: many layers are read at once there, and held.
 struct Layers<'a> {
     voxels: &'a mut dyn Voxels,
     /// The number of layers that are read at once.
@@ -247,7 +250,7 @@ impl Voxels for Layers<'_> {
     fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
         let [nx, ny, nz] = self.grid().shape;
         let [x, y, z] = part.clone();
-        if self.many >= nz || z.len() == nz || x.len() < nx {
+        if self.many >= nz || z.len() == nz {
             return self.voxels.fill(part, out);
         }
         if z.start < self.first || self.first + self.held.dim().2 < z.end {

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from typing import Any
 
 from . import _native
 from ._arrays import as_floats, counts, pair
 from ._errors import invalid
+from ._spec import encoded
 from ._volume import as_volume
 
 Scan = _native.Scan
@@ -100,4 +100,4 @@ def simulate(
         "values": values,
         "source": os.fspath(volume) if isinstance(volume, (str, os.PathLike)) else "an array",
     }
-    return _native.simulate(as_volume(volume, "volume", geometry), json.dumps(wanted), geometry)
+    return _native.simulate(as_volume(volume, "volume", geometry), encoded(wanted), geometry)

@@ -96,13 +96,15 @@ pub fn backproject<'py>(
     run(py, Way::Adjoint, geometry, projector, projections)
 }
 
-/// Predicted views of `scan` for a volume in 1/unit of the scan; with `residual` measured minus predicted ones.
+/// Predicted views of `scan` for a volume in 1/unit of the scan; with `residual` measured minus predicted ones. An array
+/// that is not `sized`, without a voxel size, fills the volume of the scan.
 #[pyfunction]
 pub fn project_scan<'py>(
     py: Python<'py>,
     scan: &Bound<'py, Scan>,
     projector: &str,
     volume: &Bound<'py, PyAny>,
+    sized: bool,
     residual: bool,
 ) -> PyResult<Bound<'py, PyArray3<f32>>> {
     let projector: Value = arguments::read(py, projector)?;
@@ -110,7 +112,10 @@ pub fn project_scan<'py>(
     let views = without_lock(py, |_| {
         let projector = projection::projector(projector)?;
         let mut geometry = scan.geometry.clone();
-        geometry.volume = projection::placed(&volume, &geometry.volume, true);
+        geometry.volume = projection::placed(&volume, &scan.geometry.volume, sized);
+        if let Some(odd) = projection::oddity(&geometry.volume, &scan.geometry.volume) {
+            tracing::warn!("{odd}");
+        }
         check_memory(projector.as_ref(), &geometry)?;
         let mut views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref())?;
         if residual {

@@ -58,6 +58,21 @@ def test_project_predicts_the_same_views(command, folder, scan, tmp_path):
         np.testing.assert_array_equal(conefield.project(volume, scan, residual=residual), theirs)
 
 
+def test_an_array_of_other_voxels_fills_the_volume_as_a_file_without_sizes_does(command, folder, scan, tmp_path):
+    shape = conefield.read_volume(folder / "truth.nii.gz").shape
+    coarse = np.random.default_rng(0).random([n // 2 for n in shape], dtype=np.float32)
+    np.save(tmp_path / "coarse.npy", coarse)
+    command("project", tmp_path / "coarse.npy", "--like", folder, "-o", tmp_path / "p")
+    theirs = conefield.read_scan(tmp_path / "p").projections
+    np.testing.assert_array_equal(conefield.project(coarse, scan), theirs)
+
+
+def test_a_seed_of_numpy_is_a_seed(folder):
+    truth = conefield.read_volume(folder / "truth.nii.gz")
+    ours = [conefield.simulate(truth, views=4, noise="tigre", seed=seed).projections for seed in (3, np.int64(3))]
+    np.testing.assert_array_equal(*ours)
+
+
 def test_scores_are_the_same(command, folder, tmp_path):
     truth = conefield.read_volume(folder / "truth.nii.gz")
     other = conefield.Volume(truth.data + 0.01 * np.sin(np.arange(truth.data.size)).reshape(truth.shape), truth.spacing)

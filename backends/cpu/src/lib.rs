@@ -42,6 +42,10 @@ impl Backend for Cpu {
         "cpu"
     }
 
+    fn describe(&self) -> String {
+        format!("cpu, {}, {} threads", simd::level_name(), rayon::current_num_threads())
+    }
+
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
         let mut notes = vec![];
         for (name, stage) in pipeline.stages() {
@@ -67,11 +71,7 @@ impl Backend for Cpu {
         }
         let kernels = kernels(pipeline);
         let evaluating = rayon::current_num_threads() * CHUNK_ROWS * kernels.encoded_numbers() * size_of::<f32>();
-        let explain = Explain {
-            backend: format!("cpu, {}, {} threads", simd::level_name(), rayon::current_num_threads()),
-            notes,
-            scratch_bytes: Slots::bytes(&kernels) + evaluating,
-        };
+        let explain = Explain { backend: self.describe(), notes, scratch_bytes: Slots::bytes(&kernels) + evaluating };
         Ok((Box::new(CpuExecutable { slots: None, clean: false }), explain))
     }
 }

@@ -102,12 +102,16 @@ impl Backend for Wgpu {
         "wgpu"
     }
 
+    fn describe(&self) -> String {
+        format!("wgpu, {}", self.shared.gpu.adapter)
+    }
+
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
         let shared = &self.shared;
         if let Some(lines) = pipeline.field.lines() {
             let field = lines.on_device(Box::new(Programs::new(shared.clone())))?;
             let notes = vec![format!("{}: kernels of its own", titled("field", &pipeline.field.describe()))];
-            let explain = Explain { backend: format!("wgpu, {}", shared.gpu.adapter), notes, scratch_bytes: 0 };
+            let explain = Explain { backend: self.describe(), notes, scratch_bytes: 0 };
             return Ok((Box::new(Alone { field, loaded: false }), explain));
         }
         let chain = Chain::new(pipeline, shared.target())?;
@@ -147,7 +151,7 @@ impl Backend for Wgpu {
             ));
         }
         let explain = Explain {
-            backend: format!("wgpu, {adapter}"),
+            backend: self.describe(),
             notes,
             // A software device uses the machine's memory.
             scratch_bytes: running.host_bytes() + if adapter.software { device_bytes as usize } else { 0 },

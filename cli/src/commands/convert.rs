@@ -88,7 +88,8 @@ impl ConvertArgs {
             if self.units.hu.as_ref().is_some_and(|how| *how != How::Already) {
                 parse::must_be_attenuation(volume)?;
             }
-            let unit = if self.values == Values::AsIs { unit_of(&self.input)? } else { None };
+            let wanted = self.units.hu.is_some() && self.values == Values::AsIs;
+            let unit = if wanted { unit_of(&self.input)? } else { None };
             let hu = self.units.open(&self.input, unit.as_ref(), &volume.grid, volume.affine.as_ref())?;
             match hu.map(|hu| hu.measure(&mut volume)).transpose()? {
                 Some(levels) => write_voxels_of(&self.output, &mut levels.of(&mut volume), template.as_ref())?,

@@ -181,6 +181,7 @@ impl Shared<'_> {
     /// Runs a method called `name`, and writes what "conefield reconstruct" writes to the folder `run`.
     fn compete(&self, name: &'static str, run: &'static str, session: Session<'_>) -> Result<Entry> {
         let mut folder = RunFolder::take(&self.folder.join(run))?;
+        folder.may_begin(true)?;
         let input = Input::new(self.scan.clone(), vec![], Some(self.truth.clone()), Some(1.0))?;
         let mut method = session.plan(input, 0.0, &|| false)?;
         folder.begin()?;

@@ -51,7 +51,7 @@ impl ExportArgs {
         let template = self.dicom_template.as_ref().map(DicomTemplate::read).transpose()?;
         conefield_io::check_shape(&self.output, grid.shape)?;
         let unknown = || Unit { name: "unknown, no record.json names it".into(), mm: opened.field.unit_mm };
-        let unit = unit_of(&opened.file)?.unwrap_or_else(unknown);
+        let unit = if self.units.hu.is_some() { unit_of(&opened.file)? } else { None }.unwrap_or_else(unknown);
         let hu = self.units.of_attenuation()?.open(&opened.file, Some(&unit), &grid, None)?;
         let backend = self.trained.backend.open()?;
         signals::listen()?;

@@ -49,7 +49,7 @@ impl InfoArgs {
         let found = if ends("safetensors") {
             no_picture(path, png)?;
             weights(path)?
-        } else if ends("xml") {
+        } else if ends("xml") && conefield_io::scan_size(path).is_err() {
             no_picture(path, png)?;
             geometry(path)?
         } else if RunOnDisk::is(path) {

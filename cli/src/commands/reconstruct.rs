@@ -218,6 +218,7 @@ impl ReconstructArgs {
             return Err(Error::Aborted { part: "preparation".into() });
         }
         folder.warn_without_room(4 * run.input.scan.header().voxels());
+        let earlier = if resumed.is_some() { folder.last_record()? } else { None };
         let (metrics, resume) = match resumed {
             Some((metrics, resume)) => (metrics, Some(resume)),
             None => {
@@ -235,7 +236,8 @@ impl ReconstructArgs {
         if ranks::count() > 1 {
             tracing::info!("{} processes; this one sent {} to the others", ranks::count(), bytes(ranks::sent()));
         }
-        let last = progress.records().last().cloned();
+        // A run resumed after its last pass adds no record.
+        let last = progress.records().last().cloned().or(earlier);
         let board = progress.take_board();
         drop(progress);
 
@@ -243,12 +245,19 @@ impl ReconstructArgs {
         let hounsfield = match &hu {
             Some(hu) => {
                 let mut voxels = solved.solution.result.voxels(backend.as_ref())?;
-                outgoing::write_only(&folder.file("volume-hu.nii.gz"), voxels.as_mut(), affine, Some(hu), None)?
+                outgoing::write_only(&folder.file("volume-hu.nii.gz"), voxels.as_mut(), affine, Some(hu), None)
             }
-            None => None,
+            None => Ok(None),
         };
-        if let Some(mut board) = board {
-            board.picture(solved.solution.steps, "slices", &folder.file("slices.png"))?;
+        // What fails from here on does not take the finished run with it.
+        let (hounsfield, failed) = match hounsfield {
+            Ok(levels) => (levels, None),
+            Err(e) => (None, Some(e)),
+        };
+        let pictured =
+            board.map(|mut board| board.picture(solved.solution.steps, "slices", &folder.file("slices.png")));
+        if let Some(Err(e)) = pictured {
+            tracing::warn!("{e}");
         }
         let path = |p: &PathBuf| p.display().to_string();
         let record = RunRecord {
@@ -260,6 +269,9 @@ impl ReconstructArgs {
         };
         conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
         folder.finish()?;
+        if let Some(e) = failed {
+            return Err(e);
+        }
         self.doubt(&run.input.scan, record.held_out);
         if self.json { out::json(&record) } else { out::say(&summary(&record, &scan, &self.output)) }
     }

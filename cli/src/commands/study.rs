@@ -3,7 +3,7 @@
 use super::cell::{self, Start, is_done};
 use super::protocol::RunProtocol;
 use super::{EndOptions, General, trial};
-use crate::boundary::Inputs;
+use crate::boundary::{Inputs, refuse_existing};
 use crate::{out, program, signals};
 use clap::Args;
 use conefield::study::definition::{Cell, Source, Study};
@@ -49,7 +49,7 @@ pub struct StudyArgs {
     #[arg(long, value_name = "K/N", value_parser = parse::part, conflicts_with = "force")]
     shard: Option<[usize; 2]>,
     /// Run nothing; write a script that runs the study as an array of Slurm jobs.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["force", "resume", "shard", "json"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["resume", "shard", "json"])]
     slurm: Option<PathBuf>,
     /// Jobs of that array [default: one per run, 1000 at most].
     #[arg(long, value_name = "N", requires = "slurm", value_parser = clap::value_parser!(u16).range(1..))]
@@ -172,6 +172,7 @@ impl StudyArgs {
             count,
             general: &general,
         };
+        refuse_existing(file, self.force)?;
         conefield_io::write_text_atomic(file, &jobs.script()?)?;
         out::say(&format!("{}: {count} jobs for {runs} runs; sbatch {} submits them", file.display(), file.display()))
     }

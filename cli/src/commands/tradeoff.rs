@@ -9,6 +9,7 @@ use clap::Args;
 use conefield::backend::{self, BackendChoice};
 use conefield::machine::simd_level;
 use conefield::parse::{self, HoldOut};
+use conefield::specs;
 use conefield::tradeoff::levers::{self, Candidate, Levers};
 use conefield::tradeoff::report::TradeoffReport;
 use conefield::tradeoff::search::{CONTENTS, Due, Earlier, Search};
@@ -99,7 +100,9 @@ impl TradeoffArgs {
         };
         let named = self.reference.iter().filter(|r| *r != Path::new("truth"));
         let inputs = Inputs::of(&self.scans).and(named).and(&self.levers);
-        inputs.spare_folder(output)?;
+        // Also the specs that a list of levers names.
+        let bases: Vec<_> = search.candidates.iter().map(|c| specs::read(&c.spec, &c.sets)).collect::<Result<_>>()?;
+        bases.iter().fold(inputs, |inputs, base| inputs.and_spec(base)).spare_folder(output)?;
         let mut lease = Lease::take(output, CONTENTS)?;
         let mut over = search.look(output, earlier)?;
         signals::listen()?;
@@ -129,6 +132,7 @@ impl TradeoffArgs {
             format!("{all} volumes"),
             format!("{}, one per scan", self.scans.len()),
         )?;
+        self.backend.open_for_run(self.budgets.first().copied())?;
         let ranked = all > 0 || self.hold_out.0.is_some();
         ensure(ranked, "tradeoff", "--hold-out", "none", "views to rank by, as there is no --reference")?;
         let references: Vec<PathBuf> =

@@ -35,6 +35,9 @@ fn a_plan_names_every_part_and_the_record_holds_them_against_it() {
         let total = number("total_s");
         assert!(parts.iter().all(|p| *p >= 0.0) && parts.iter().sum::<f64>() <= total + 1e-3, "{parts:?} of {total}");
         assert_eq!((number("budget_s"), &record["limits"]["seconds"]), (3.0, &Value::Null));
+        // Also methods without a field say where they ran.
+        assert!(record["backend"]["backend"].as_str().unwrap().starts_with("cpu, "), "{spec}: {}", record["backend"]);
+        assert_eq!(record["processes"], 1, "{spec}");
         let plan = &record["plan"];
         assert!(plan["point"].is_null() && plan["why"].as_str().unwrap().contains("requested"), "{plan}");
         assert!(plan["train_s"].as_f64().unwrap() > 0.0 && plan["steps"].as_u64().unwrap() > 0, "{plan}");

@@ -294,6 +294,12 @@ fn a_script_for_slurm_names_every_share() {
     assert_eq!(read(&out.join("table.json"))["runs"].as_array().unwrap().len(), 12);
     let said = refused(1, &["study", &text(&file), "-o", &text(&out), "--slurm", &text(&file)]);
     assert!(said.contains("this command reads"), "{said}");
+    // A script that is there is replaced only if that is asked for.
+    fs::write(&script, "mine").unwrap();
+    let again = ["study", &text(&file), "-o", &text(&out), "--slurm", &text(&script)];
+    assert!(refused(1, &again).contains("--force") && fs::read_to_string(&script).unwrap() == "mine");
+    done(&[&again[..], &["--force"]].concat());
+    assert!(fs::read_to_string(&script).unwrap().contains("#SBATCH"));
 }
 
 #[test]

@@ -162,6 +162,10 @@ impl Reading<'_> {
         if let Some(v) = views.as_ref().filter(|_| !simulated) {
             return Err(Error::invalid(self.at(v), "views", found, "volumes beside it"));
         }
+        if let Some(s) = simulate.as_ref().filter(|_| !simulated) {
+            return Err(Error::invalid(self.at(s), "simulate", found, "volumes beside it"));
+        }
+        let simulate = simulate.map(Spanned::into_inner).unwrap_or_default();
         ensure(simulated || !scans.is_empty(), &place, "volumes", "neither volumes nor scans", "at least one of them")?;
         let reference = protocol.reference.as_deref();
         if let Some(r) = reference.filter(|r| scans.is_empty() && *r != "truth") {
@@ -197,7 +201,7 @@ impl Reading<'_> {
             let source = self.scan(entry, scan, reference)?;
             self.add(&mut cases, entry, Case { name, source, window: own })?;
         }
-        let backend = protocol.backend.clone().unwrap_or_default().open_for_run(None)?;
+        let backend = protocol.backend.clone().unwrap_or_default().open_for_run(protocol.budget)?;
         let mut methods: Vec<Method> = vec![];
         for entry in &specs {
             let method = self.method(entry, &protocol, backend.as_ref())?;

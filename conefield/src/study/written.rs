@@ -48,8 +48,8 @@ pub struct Written {
     #[schemars(with = "Option<[f32; 2]>")]
     pub window: Option<Spanned<[f32; 2]>>,
     /// How scans are simulated, as in "conefield simulate".
-    #[serde(default)]
-    pub simulate: WrittenSimulation,
+    #[schemars(with = "WrittenSimulation")]
+    pub simulate: Option<Spanned<WrittenSimulation>>,
     /// Options of every run, as in "conefield compare".
     #[serde(default)]
     #[schemars(with = "Protocol")]

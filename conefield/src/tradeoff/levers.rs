@@ -154,6 +154,8 @@ impl Base {
     fn of(written: WrittenBase, field: &str, place: &str, folder: &Path) -> Result<Self> {
         let beside = folder.join(&written.spec);
         let shipped = SHIPPED.iter().any(|s| s.name == written.spec);
+        // A front names it, which is read in other folders.
+        let beside = std::path::absolute(&beside).unwrap_or(beside);
         let spec = if shipped || !beside.is_file() { written.spec } else { beside.display().to_string() };
         let found = format!("{spec:?}");
         let refused = |e: Error| Error::invalid(place, format!("{field}.spec"), &found, e.to_string());

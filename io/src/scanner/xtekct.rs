@@ -253,11 +253,11 @@ mod tests {
                 assert!((0..3).all(|k| (found[k] - want[k]).abs() < 1e-9), "{i}: {found:?} {want:?}");
             }
         }
-        // Default voxel sizes are the pixel sizes at the axis.
+        // Default voxel sizes are the pixel sizes at the axis, which lies 1 mm beside the middle of 5 columns.
         let without: String = TEXT.lines().filter(|l| !l.starts_with("Voxel")).flat_map(|l| [l, "\n"]).collect();
         let (_dir, path) = written(&without);
         let grid = read_scan(&path).unwrap().geometry.volume;
-        assert_eq!((grid.shape, grid.spacing), ([5, 5, 4], [1.25, 1.25, 0.9375]));
+        assert_eq!((grid.shape, grid.spacing), ([7, 7, 4], [1.25, 1.25, 0.9375]));
     }
 
     /// The views of `TEXT` with the axis in the middle, after a change.

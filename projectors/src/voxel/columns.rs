@@ -516,22 +516,32 @@ impl<R: Real> Op for Adjoint<'_, R> {
                     }
                     let plane = &mut self.gathered[p * lines * stride..(p + 1) * lines * stride];
                     let from = [pixels, &q];
+                    if hit.taps > TAPS {
+                        q.resize(pixels.len(), R::ZERO);
+                        c.places(s, -(PAD as f64), &mut q);
+                        hit.scatter([pixels, &q], plane, stride);
+                        continue;
+                    }
+                    // Double precision checks the arithmetic: compiled once, for the largest number of rows.
+                    if const { size_of::<R>() == size_of::<f64>() } {
+                        if c.is_upright() {
+                            hit.gather_upright::<S, R, TAPS>(s, pixels, plane, stride, &mut windows);
+                        } else {
+                            hit.gather::<S, R, TAPS>(s, from, plane, stride, &mut windows);
+                        }
+                        continue;
+                    }
                     match (hit.taps, c.is_upright()) {
                         (0..=2, true) => hit.gather_upright::<S, R, 2>(s, pixels, plane, stride, &mut windows),
                         (3, true) => hit.gather_upright::<S, R, 3>(s, pixels, plane, stride, &mut windows),
                         (4, true) => hit.gather_upright::<S, R, 4>(s, pixels, plane, stride, &mut windows),
                         (5..=6, true) => hit.gather_upright::<S, R, 6>(s, pixels, plane, stride, &mut windows),
-                        (7..=TAPS, true) => hit.gather_upright::<S, R, TAPS>(s, pixels, plane, stride, &mut windows),
+                        (_, true) => hit.gather_upright::<S, R, TAPS>(s, pixels, plane, stride, &mut windows),
                         (0..=2, _) => hit.gather::<S, R, 2>(s, from, plane, stride, &mut windows),
                         (3, _) => hit.gather::<S, R, 3>(s, from, plane, stride, &mut windows),
                         (4, _) => hit.gather::<S, R, 4>(s, from, plane, stride, &mut windows),
                         (5..=6, _) => hit.gather::<S, R, 6>(s, from, plane, stride, &mut windows),
-                        (7..=TAPS, _) => hit.gather::<S, R, TAPS>(s, from, plane, stride, &mut windows),
-                        _ => {
-                            q.resize(pixels.len(), R::ZERO);
-                            c.places(s, -(PAD as f64), &mut q);
-                            hit.scatter([pixels, &q], plane, stride);
-                        }
+                        _ => hit.gather::<S, R, TAPS>(s, from, plane, stride, &mut windows),
                     }
                 }
             }
