@@ -36,7 +36,7 @@ pub fn cases() -> Vec<Case> {
             STUDY, ["study.toml:1:12: volumes"];
         "a time that is none", with("[protocol]\nseconds = -3\n"), STUDY, ["study.toml:4:11: protocol.seconds", "positive time"];
         "two ends that exclude each other", with("[protocol]\nbudget = 9\nsteps = 3\n"), STUDY, ["study.toml:3:1: budget"];
-        "a simulation of nothing", study("scans = ['scan']\nspecs = ['fdk']\n[simulate]\nnoise = 'tigre'\n"),
+        "a simulation of nothing", study("scans = ['scan']\nspecs = ['fdk']\n[simulate]\nnoise = 'tigre:1e4,10'\n"),
             STUDY, ["study.toml:3:1: simulate", "no volumes", "volumes beside it"];
         "a baseline that is no method", with("baseline = 'sirt'\n"), STUDY, ["study.toml:3:12: baseline", "fdk"];
         "a name that leads out of the folder",

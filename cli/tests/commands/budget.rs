@@ -87,7 +87,7 @@ fn a_chain_that_ends_with_gaussians_has_a_plan() {
 fn without_a_spec_the_best_of_the_shipped_front_is_taken() {
     let (dir, scan) = scan();
     let run = text(&dir.path().join("run"));
-    let record = json(&["reconstruct", &text(&scan), "-o", &run, "--budget", "10s", "--json"]);
+    let record = json(&["reconstruct", &text(&scan), "-o", &run, "--budget", "5s", "--json"]);
     let plan = &record["plan"];
     assert!(plan["point"].is_string() && plan["why"].as_str().unwrap().contains("front"), "{plan}");
     // The run can be repeated from its spec.

@@ -67,8 +67,7 @@ fn run(name: &str, page: &str, dir: &Path) -> usize {
         match (block.language, file) {
             ("toml", Some(file)) => fs::write(dir.join(file), block.text).unwrap(),
             ("sh", _) if !block.above.starts_with("<!-- not run: ") => {
-                // A budget is short here, but planning takes seconds in an unoptimized build beside other tests.
-                let script = block.text.replace("--budget 60s", "--budget 8s");
+                let script = block.text.replace("--budget 60s", "--budget 4s");
                 let output = Command::new("bash")
                     .args(["-euo", "pipefail", "-c", &script])
                     .current_dir(dir)

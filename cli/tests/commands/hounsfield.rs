@@ -116,9 +116,12 @@ fn hounsfield_units_without_a_unit_or_a_calibration_are_refused() {
     assert!(wrong("water=0.02").contains("such as water=0.0206,air=0"));
     assert!(wrong("2keV").contains("5 to 1250 keV"));
     // A record of another program beside the volume matters for Hounsfield units only.
-    std::fs::write(dir.path().join("scan/record.json"), "{\"spec\": \"mine\"}").unwrap();
-    done(&["convert", &at("scan/truth.nii.gz"), &at("a.nii")]);
-    assert!(convert("water=0.02,air=0").contains("record.json"));
+    std::fs::create_dir(dir.path().join("other")).unwrap();
+    std::fs::copy(dir.path().join("scan/truth.nii.gz"), dir.path().join("other/a.nii.gz")).unwrap();
+    std::fs::write(dir.path().join("other/record.json"), "{\"spec\": \"mine\"}").unwrap();
+    done(&["convert", &at("other/a.nii.gz"), &at("a.nii")]);
+    let said = refused(1, &["convert", &at("other/a.nii.gz"), &at("b.nii"), "--hu", "water=0.02,air=0"]);
+    assert!(said.contains("record.json"), "{said}");
 }
 
 #[test]

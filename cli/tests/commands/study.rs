@@ -310,7 +310,7 @@ fn shipped_studies_are_studies() {
     for entry in fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
         let (out, script) = (text(&dir.path().join("out")), text(&dir.path().join("s.sh")));
-        done(&["study", &text(&path), "-o", &out, "--slurm", &script]);
+        done(&["study", &text(&path), "-o", &out, "--slurm", &script, "--force"]);
         count += 1;
     }
     assert!(count >= 3);

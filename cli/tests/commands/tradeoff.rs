@@ -50,11 +50,59 @@ fn names(list: &Value) -> Vec<&str> {
     list.as_array().unwrap().iter().map(|n| n.as_str().unwrap()).collect()
 }
 
+/// The trials of a search that is interrupted after two of them.
+#[cfg(unix)]
+fn interrupted(first: &[String], out: &Path) -> Vec<Value> {
+    use std::process::{Command, Stdio};
+    use std::time::{Duration, Instant};
+    let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
+    let child = command.arg("--quiet").args(first).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let state = out.join("tradeoff.json");
+    let until = Instant::now() + Duration::from_secs(60);
+    let trials = || if state.is_file() { read(&state)["trials"].as_array().unwrap().clone() } else { vec![] };
+    while trials().len() < 2 && Instant::now() < until {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert!(Command::new("sh").arg("-c").arg(format!("kill -INT {}", child.id())).status().unwrap().success());
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(130), "{said}");
+    assert!(said.contains("interrupted during") && said.contains("--resume"), "{said}");
+    let before = trials();
+    assert!((2..8).contains(&before.len()) && !out.join("front.png").exists());
+    before
+}
+
+#[cfg(not(unix))]
+fn interrupted(_: &[String], _: &Path) -> Vec<Value> {
+    vec![]
+}
+
+/// One search, interrupted and resumed: finished trials keep their measured times, and the result is that of a whole one.
 #[test]
 fn halving_front_and_specs_agree() {
     let (dir, scan, levers) = made();
     let out = dir.path().join("out");
-    let found = json(&words(&line(&scan, &levers, &out, &["--reference", "truth", "--json"])));
+    let first = line(&scan, &levers, &out, &["--reference", "truth"]);
+    let before = interrupted(&first, &out);
+    if !before.is_empty() {
+        for (more, want) in [(&["--seed", "1"][..], "--resume: "), (&["--peak", "2"], "--resume: peak")] {
+            let all = line(&scan, &levers, &out, &[&["--reference", "truth", "--resume"], more].concat());
+            let said = refused(1, &words(&all));
+            assert!(said.contains(want), "{said}");
+        }
+        let said = refused(1, &words(&first));
+        assert!(said.contains("an earlier search"), "{said}");
+    }
+    let resumed = line(&scan, &levers, &out, &["--reference", "truth", "--resume", "--json"]);
+    let found = json(&words(&resumed));
+    assert_eq!(found["trials"].as_array().unwrap()[..before.len()], before[..]);
+    // The search is complete: nothing runs again, and the front is the same.
+    assert_eq!(json(&words(&resumed)), found);
+    assert!(out.join("front.png").exists());
+    let all = line(&scan, &levers, dir.path(), &["--force"]);
+    let said = refused(1, &words(&all));
+    assert!(said.contains("in it, which this command reads") && scan.join("scan.toml").exists(), "{said}");
     assert_eq!(found, read(&out.join("tradeoff.json")));
     let candidates: Vec<_> = found["search"]["candidates"].as_array().unwrap().iter().map(|c| &c["name"]).collect();
     assert_eq!(candidates, ["fdk", "os-sart", "tiny", "fdk-1", "os-sart-1"]);
@@ -146,49 +194,6 @@ fn without_a_reference_views_rank() {
         points.iter().min_by(|a, b| a["held_out"].as_f64().unwrap().total_cmp(&b["held_out"].as_f64().unwrap()));
     assert!(names(&found["front"]).contains(&least.unwrap()["name"].as_str().unwrap()));
     assert!(fs::read_to_string(out.join("tradeoff.md")).unwrap().starts_with("| front | budget | held-out error |"));
-}
-
-#[cfg(unix)]
-#[test]
-fn a_search_that_was_interrupted_repeats_no_finished_trial() {
-    use std::process::{Command, Stdio};
-    use std::time::{Duration, Instant};
-    let (dir, scan, levers) = made();
-    let out = dir.path().join("out");
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
-    let first = line(&scan, &levers, &out, &["--reference", "truth"]);
-    let child = command.arg("--quiet").args(&first).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    let state = out.join("tradeoff.json");
-    let until = Instant::now() + Duration::from_secs(60);
-    let trials = || if state.is_file() { read(&state)["trials"].as_array().unwrap().clone() } else { vec![] };
-    while trials().len() < 2 && Instant::now() < until {
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    assert!(Command::new("sh").arg("-c").arg(format!("kill -INT {}", child.id())).status().unwrap().success());
-    let output = child.wait_with_output().unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(130), "{said}");
-    assert!(said.contains("interrupted during") && said.contains("--resume"), "{said}");
-    let before = trials();
-    assert!((2..8).contains(&before.len()) && !out.join("front.png").exists());
-
-    for (more, want) in [(&["--seed", "1"][..], "--resume: "), (&["--peak", "2"], "--resume: peak")] {
-        let all = line(&scan, &levers, &out, &[&["--reference", "truth", "--resume"], more].concat());
-        let said = refused(1, &words(&all));
-        assert!(said.contains(want), "{said}");
-    }
-    let said = refused(1, &words(&first));
-    assert!(said.contains("an earlier search"), "{said}");
-    let found = json(&words(&line(&scan, &levers, &out, &["--reference", "truth", "--resume", "--json"])));
-    // Finished trials keep their measured times.
-    assert_eq!(found["trials"].as_array().unwrap()[..before.len()], before[..]);
-    assert!(found["trials"].as_array().unwrap().len() >= 8 && out.join("front.png").exists());
-    // The search is complete: nothing runs again, and the front is the same.
-    let again = json(&words(&line(&scan, &levers, &out, &["--reference", "truth", "--resume", "--json"])));
-    assert_eq!(again, found);
-    let all = line(&scan, &levers, dir.path(), &["--force"]);
-    let said = refused(1, &words(&all));
-    assert!(said.contains("in it, which this command reads") && scan.join("scan.toml").exists(), "{said}");
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::Mutex;
+use std::sync::{Mutex, OnceLock};
 
 /// conefield's sources.
 pub fn sources() -> &'static Path {
@@ -33,9 +33,11 @@ pub fn library(name: &str) -> PathBuf {
     target().join("release").join(format!("{}{name}{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX))
 }
 
-/// A plugin of the workspace of examples, built.
+/// A plugin of the workspace of examples, all of which are built once.
 pub fn example(name: &str) -> PathBuf {
-    cargo(&sources().join("plugins/examples"), &["build", "--release", "--locked", "-p", name]);
+    static BUILT: OnceLock<()> = OnceLock::new();
+    BUILT
+        .get_or_init(|| cargo(&sources().join("plugins/examples"), &["build", "--release", "--locked", "--workspace"]));
     library(name)
 }
 

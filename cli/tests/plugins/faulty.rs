@@ -468,7 +468,8 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
         fits(fault.what, "reconstruct", &run, fault.reconstruct);
         Row::of(fault.what, [&list, &check, &run], [fault.list, fault.check, fault.reconstruct])
     });
-    let mut rows: Vec<Row> = rows.collect();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
+    let mut rows: Vec<Row> = pool.install(|| rows.collect());
     let panics = example("rehashed");
     let folder = panics.parent().unwrap();
     for (i, (what, when, [check, run])) in PANICS.iter().enumerate() {

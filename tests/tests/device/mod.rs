@@ -34,15 +34,22 @@ pub fn shared(what: &str) -> Option<Arc<Shared>> {
 }
 
 /// Backends on the device: with its own limits, and with lower ones: no atomic sums; buffers so small that everything is
-/// cut into pieces; no subgroup operations.
+/// cut into pieces; no subgroup operations. Opened once a program, so that a kernel is compiled once for each.
 #[allow(dead_code)]
-pub fn backends(what: &str) -> Vec<(&'static str, Wgpu)> {
+pub fn backends(what: &str) -> Vec<(&'static str, &'static Wgpu)> {
+    static OPENED: OnceLock<Vec<(&'static str, Wgpu)>> = OnceLock::new();
+    OPENED.get_or_init(|| alone(what)).iter().map(|(name, backend)| (*name, backend)).collect()
+}
+
+/// The same, for one test alone: what they move and launch is its own.
+#[allow(dead_code)]
+pub fn alone(what: &str) -> Vec<(&'static str, Wgpu)> {
     let small = Limits { binding_bytes: Some(2048), uniform_bytes: Some(0), ..Limits::default() };
     let exchange = Limits { compare_exchange: true, ..Limits::default() };
-    let alone = Limits { no_subgroups: true, ..Limits::default() };
+    let apart = Limits { no_subgroups: true, ..Limits::default() };
     let plain = Limits::default();
     let all =
-        [("own limits", plain), ("compare and exchange", exchange), ("small buffers", small), ("no subgroups", alone)];
+        [("own limits", plain), ("compare and exchange", exchange), ("small buffers", small), ("no subgroups", apart)];
     let opened: Vec<_> = all.into_iter().filter_map(|(name, limits)| Some((name, open(limits)?))).collect();
     if opened.is_empty() {
         eprintln!("SKIPPED: no adapter for {what}");

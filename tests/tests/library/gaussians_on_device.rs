@@ -61,7 +61,7 @@ fn mixture(least: f32) -> Model {
 }
 
 /// Devices whose buffers are large enough.
-fn on_devices() -> Vec<(&'static str, Wgpu)> {
+fn on_devices() -> Vec<(&'static str, &'static Wgpu)> {
     backends("Gaussians").into_iter().filter(|(limits, _)| *limits != "small buffers").collect()
 }
 
@@ -139,7 +139,7 @@ fn gradients_and_updates_are_those_of_the_cpu() {
             let both = Both::new(source, ssim, prior);
             let corners = [[0.2, 0.3, 0.25], [0.45, 0.1, 0.5]];
             let priors = both.blocks(&corners);
-            let backends: [&dyn Backend; 2] = [&Cpu::new(), &backend];
+            let backends: [&dyn Backend; 2] = [&Cpu::new(), backend];
             let [host, device] = backends.map(|backend| {
                 let pulls = Arc::new(Mutex::new(Pulls::new(MOST)));
                 let (mut model, mut exe) = (mixture(0.01), both.on(backend, resident, &pulls));
@@ -192,11 +192,10 @@ fn values_and_line_integrals_are_those_of_the_cpu() {
     // Lists larger than a buffer: a grid in pieces, fewer cells.
     let little = Limits { binding_bytes: Some(40_000), ..Limits::default() };
     let mut backends = on_devices();
-    if !backends.is_empty() {
-        backends.push(("small lists", Wgpu::with_limits(None, little).unwrap()));
-    }
+    let little = (!backends.is_empty()).then(|| Wgpu::with_limits(None, little).unwrap());
+    backends.extend(little.iter().map(|little| ("small lists", little)));
     for (limits, backend) in backends {
-        for (name, (found, wanted)) in ["grid", "points", "rays"].iter().zip(all(&backend).iter().zip(&wanted)) {
+        for (name, (found, wanted)) in ["grid", "points", "rays"].iter().zip(all(backend).iter().zip(&wanted)) {
             let largest = wanted.iter().fold(0.0f32, |m, x| m.max(x.abs()));
             assert!(largest > 0.0);
             for (i, (a, b)) in found.iter().zip(wanted).enumerate() {
@@ -216,7 +215,7 @@ fn a_run_ends_where_the_cpu_does() {
     });
     let (wanted, _) = psnr(&settings, &Cpu::new());
     for (limits, backend) in on_devices() {
-        let (found, records) = psnr(&settings, &backend);
+        let (found, records) = psnr(&settings, backend);
         println!("{limits}: {found:.3} dB, the CPU {wanted:.3} dB");
         assert!((found - wanted).abs() < 0.3, "{found} {wanted}");
         assert!(records.iter().any(|r| r.events.iter().any(|e| e.contains("cloned"))), "no density control");

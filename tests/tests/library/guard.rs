@@ -270,7 +270,7 @@ fn a_device_goes_back_too() {
             value["optimizer"]["decay"] = json!("none");
             value["training"]["rays"] = json!(8);
             value["projector"]["samples"] = json!(4);
-            let backend = Faulty { fault, device: Some(&device) };
+            let backend = Faulty { fault, device: Some(device) };
             let (solution, _) = solve_on(&backend, &value, &scan(), &Weights::default()).unwrap();
             (solution.rollbacks, model(solution).arena)
         };

@@ -129,7 +129,7 @@ fn several_devices_end_where_one_does() {
     for method in &methods() {
         for some in [&devices[..devices.len() / 2], &devices[devices.len() / 2..]] {
             let Some((_, one)) = some.first() else { return };
-            let want = volume(method, &scan, one);
+            let want = volume(method, &scan, *one);
             let places: Vec<_> = some.iter().map(|(_, device)| device.place()).collect();
             let found = on(&places, |backend| volume(method, &scan, backend));
             let error = [off(&found[0], &want), rms(&found[0], &want)];
@@ -144,7 +144,7 @@ fn several_devices_end_where_one_does() {
 #[test]
 fn a_pass_moves_the_views_between_devices() {
     let scan = larger();
-    let devices = backends("bytes between devices");
+    let devices = crate::device::alone("bytes between devices");
     let Some(some) = devices.get(..2) else { return };
     let moved = |passes: u64| {
         let before: Vec<_> = some.iter().map(|(_, device)| device.moved()).collect();

@@ -96,7 +96,7 @@ fn steps_agree(settings: &Value) {
         // Limits change what surrounds a loss, not the loss: one is enough for all of them. Compilation takes seconds.
         let tried = if k == 0 { devices.len() } else { 1 };
         for (name, backend) in devices.iter().take(tried) {
-            let (stats, grads) = on(backend);
+            let (stats, grads) = on(*backend);
             let (e, on_cpu) = (worst(&pipeline, &grads, &exact), worst(&pipeline, &cpu, &exact));
             println!("{text}, {name}: gradients {e:.1e} (CPU {on_cpu:.1e}), loss {} and {}", stats.loss, want.loss);
             assert!(e < limit, "{text}, {name}: {e:e}");
@@ -180,7 +180,7 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
     let want = run(&Cpu::new());
     for (name, backend) in crate::device::backends("a trained model") {
         for (what, (found, want)) in
-            ["values", "features", "lines", "parameters"].iter().zip(run(&backend).iter().zip(&want))
+            ["values", "features", "lines", "parameters"].iter().zip(run(backend).iter().zip(&want))
         {
             let top = want.iter().fold(0.0f32, |m, v| m.max(v.abs()));
             let e = found.iter().zip(want).map(|(a, b)| (a - b).abs()).fold(0.0f32, f32::max) / top;
@@ -199,7 +199,7 @@ fn a_run_with_held_out_views_and_a_prior_ends_where_the_cpu_does() {
     s["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 4, "edge": 4}]);
     let (want, records) = psnr(&s, &Cpu::new());
     for (name, backend) in crate::device::backends("a run").into_iter().take(1) {
-        let (found, on_device) = psnr(&s, &backend);
+        let (found, on_device) = psnr(&s, backend);
         println!("{name}: {found:.3} dB, CPU {want:.3} dB");
         assert!((found - want).abs() < 0.1, "{name}: {found} dB, CPU {want} dB");
         let losses = |r: &[Record]| (r[0].loss.unwrap(), r.last().unwrap().loss.unwrap());
@@ -216,7 +216,7 @@ fn masked_channels_leave_the_kernels() {
     s["encoder"]["base_resolution"] = json!(2);
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
     s["callbacks"] = json!([{"type": "rollback"}, mask]);
-    let (solution, records) = solve_on(&backend, &s, &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve_on(backend, &s, &scan(), &Weights::default()).unwrap();
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), 1, "{events:?}");
     let kept = model(solution).pipeline.encoder.info().output;
@@ -242,7 +242,7 @@ fn pretraining_on_several_volumes_is_that_of_the_cpu() {
     };
     let (want, _) = run(&Cpu::new());
     for (name, backend) in crate::device::backends("pretraining").into_iter().take(1) {
-        let (found, params) = run(&backend);
+        let (found, params) = run(backend);
         assert!(params.iter().all(|p| p.is_finite()));
         for (a, b) in found.iter().zip(&want) {
             assert!((a - b).abs() < 0.02 * b, "{name}: {found:?} {want:?}");
@@ -256,7 +256,7 @@ fn a_run_begun_on_one_backend_goes_on_on_the_other() {
     let (scan, spec) = (scan(), spec(&settings()).unwrap());
     let whole = psnr(&settings(), &Cpu::new()).1.last().unwrap().loss.unwrap();
     let cpu = Cpu::new();
-    let pairs: [[&dyn Backend; 2]; 3] = [[&cpu, &device], [&device, &cpu], [&device, &device]];
+    let pairs: [[&dyn Backend; 2]; 3] = [[&cpu, device], [device, &cpu], [device, device]];
     for [first, second] in pairs {
         let mut stop = Stop::at(20);
         let planned = |backend| plan(&spec, backend, &Weights::default()).unwrap();
