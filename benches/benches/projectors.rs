@@ -10,7 +10,7 @@ use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid, norm};
 use conefield_core::method::{Context, Job, Silent};
 use conefield_core::place::Host;
-use conefield_core::regularizer::Update;
+use conefield_core::regularizer::{Penalty, Update};
 use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::space::Space;
 use conefield_core::spec::load::parse;
@@ -63,14 +63,15 @@ fn main() -> Result<()> {
     let (driven, driven_tilted) = (drive(&geometry), drive(&turned));
     let header = ScanHeader { views: 0, detector: [0; 2], volume: geometry.volume.shape };
     let mut prox =
-        TvProx::new(geometry.volume.shape, [1.0; 3], &Space::new(header, std::sync::Arc::new(Host))).unwrap();
+        TvProx::new(geometry.volume.shape, [1.0; 3], STEPS, 1.0, &Space::new(header, std::sync::Arc::new(Host)))
+            .unwrap();
     let (noisy, mut smooth) = (volume.as_slice().unwrap_or_default(), vec![0.0; volume.len()]);
-    let dual = times(RUNS, || prox.apply(noisy, 0.1, STEPS, &mut smooth));
+    let dual = times(RUNS, || prox.prox(noisy, 0.1, &mut smooth));
     let mut arrays: [Vec<f32>; 3] = std::array::from_fn(|_| noisy.to_vec());
     let update = times(RUNS, || {
         let [gradient, ahead, x] = &mut arrays;
         let update = Update { gradient, ahead, x, step: -0.1, momentum: 0.5, towards: None, inside: None };
-        assert!(prox.update(update, 0.1, STEPS).is_none());
+        prox.update(update, 0.1);
     });
     let value = times(RUNS, || assert!(total_variation(volume.view(), [1.0; 3], None, None) > 0.0));
     let scan = Scan { geometry, projections, unit: Unit::default(), provenance: serde_json::Value::Null };

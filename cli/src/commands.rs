@@ -36,7 +36,7 @@ use conefield_core::Result;
 use conefield_core::method::Limits;
 use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// The subcommands; their help is that of their arguments.
 #[derive(Subcommand)]
@@ -126,16 +126,18 @@ impl General {
         if self.quiet {
             all.push("--quiet".into());
         }
+        // A script may run in another folder.
+        let whole = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.into()).into_os_string();
         for path in &self.plugins {
             all.push("--plugin".into());
-            all.push(path.into());
+            all.push(whole(path));
         }
         if self.allow_plugins_from_spec {
             all.push("--allow-plugins-from-spec".into());
         }
         if let Some(folder) = &self.scratch {
             all.push("--scratch".into());
-            all.push(folder.into());
+            all.push(whole(folder));
         }
         let numbers = [("--threads", self.threads.map(u64::from)), ("--memory", self.memory)];
         for (flag, number) in numbers {

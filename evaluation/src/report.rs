@@ -29,7 +29,7 @@ pub mod text;
 mod testing;
 
 #[cfg(feature = "plots")]
-pub use curves::{Band, Corner, CurveOptions, Panel, curves_png, curves_png_with, panels_png};
+pub use curves::{Band, CurveOptions, Panel, curves_png, panels_png};
 pub use middle::MiddleSlices;
 #[cfg(feature = "plots")]
 pub use pixels::{Pixels, Rgb};

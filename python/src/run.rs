@@ -11,6 +11,7 @@ use conefield::explain::Explanation;
 use conefield::input::{self, Input};
 use conefield::memory::{self, Memory};
 use conefield::method::{self, Planned, Read};
+use conefield::record::{RunRecord, ScanRecord};
 use conefield::session::{self, InMemory, Request, Run, Session};
 use conefield::{files, pretraining, score, specs};
 use conefield_core::backend::Backend;
@@ -23,7 +24,7 @@ use conefield_evaluation::metrics::{dice, label_map};
 use pyo3::prelude::*;
 use serde::Deserialize;
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -159,6 +160,9 @@ pub fn callback(argument: CallbackArgument) -> Option<Callback> {
     })
 }
 
+/// The place of an array in a record.
+const IN_MEMORY: &str = "memory";
+
 /// Volume, record and trained field.
 type Reconstructed<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, Option<Field>);
 
@@ -180,6 +184,7 @@ pub fn reconstruct<'py>(
         let backend =
             arguments::backend(&wanted.backend)?.open_for_run(arguments::seconds("budget", wanted.budget.as_ref())?)?;
         let reference = wanted.reference(scan, reference)?;
+        let given = reference.as_ref().map(|_| wanted.truth);
         let mut run = wanted.planned(scan.scan.clone(), reference, start.as_ref(), backend.as_ref(), watch, begin)?;
         let mut progress = Progress::new(watch, function);
         let solved = run.solve(start.as_ref(), None, &mut progress)?;
@@ -187,7 +192,13 @@ pub fn reconstruct<'py>(
         let InMemory { volume, written, .. } =
             run.in_memory(&solved, |result, backend| collect(result.voxels(backend)?.as_mut(), &|| watch.cancelled()))?;
         let loaded = &run.method.loaded;
-        let mut record = json!(run.record(&solved, progress.records().last(), written));
+        let init = wanted.init.as_ref().map(|path| path.display().to_string());
+        let mut record = json!(RunRecord {
+            scan: Some(ScanRecord::of(scan.path.as_deref().unwrap_or(Path::new(IN_MEMORY)), &scan.scan)?),
+            init: init.or(start.as_ref().map(|_| IN_MEMORY.into())),
+            reference: given.map(|file| if file { "truth" } else { IN_MEMORY }.into()),
+            ..run.record(&solved, progress.records().last(), written)
+        });
         record["spec_toml"] = to_toml(&loaded.spec)?.into();
         record["records"] = json!(progress.records());
         for absent in ["plan", "best_step"].into_iter().filter(|key| record.get(*key).is_none()).collect::<Vec<_>>() {

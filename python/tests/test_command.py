@@ -38,6 +38,7 @@ def test_volumes_are_the_same_bits(command, folder, scan, tmp_path, spec, steps,
         np.testing.assert_array_equal(ours.volume.data, theirs.data)
         assert ours.scores["psnr"] == pytest.approx(record["scores"]["psnr"], abs=1e-9)
         assert ours.record["steps"] == record["steps"]
+        assert ours.record["scan"] == record["scan"] and ours.record["reference"] == record["reference"]
         assert ours.record["spec_toml"] == (run / "spec.toml").read_text()
     np.testing.assert_allclose(ours.volume.spacing, theirs.spacing, rtol=1e-6)
 

@@ -2,7 +2,7 @@
 //! `curves [--steps | --drift] OUT.png TITLE NAME=RUN_FOLDER...`. Runs of one name have one colour.
 
 use conefield_benches::{metrics, quality};
-use conefield_evaluation::report::{CurveOptions, curves_png_with};
+use conefield_evaluation::report::{CurveOptions, curves_png};
 use serde_json::Value;
 use std::error::Error;
 
@@ -25,7 +25,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let curves: Vec<Curve> = runs.iter().map(|r| read(r, points)).collect::<Result<_, _>>()?;
     let options = CurveOptions { log_y: option.as_deref() == Some("--drift"), ..CurveOptions::default() };
-    curves_png_with(out, title, x, y, &curves, &options)?;
+    curves_png(out, title, [x, y], &curves, &options)?;
     Ok(())
 }
 

@@ -1,7 +1,7 @@
 //! Draws quality against the number of views and writes a table, from comparisons of `views.sh`:
 //! `views OUT_FOLDER TITLE VIEWS=COMPARISON_FOLDER...`. Writes psnr.png, ssim.png and views.md.
 
-use conefield_evaluation::report::curves_png;
+use conefield_evaluation::report::{CurveOptions, curves_png};
 use conefield_io::write_text_atomic;
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -78,7 +78,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     comparisons.iter().try_for_each(|c| found.read(c))?;
     found.views.sort_unstable();
     for (i, (_, picture, label)) in SCORES.into_iter().enumerate() {
-        curves_png(Path::new(out).join(picture), title, "views", label, &found.curves(i))?;
+        let options = CurveOptions::default();
+        curves_png(Path::new(out).join(picture), title, ["views", label], &found.curves(i), &options)?;
     }
     write_text_atomic(Path::new(out).join("views.md"), &found.table()?)?;
     Ok(())

@@ -27,6 +27,7 @@ use conefield_core::method::{Observer, Record};
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
+use conefield_evaluation::hounsfield::Calibration;
 use conefield_evaluation::report::MiddleSlices;
 use conefield_evaluation::report::text::bytes;
 use std::collections::BTreeMap;
@@ -149,14 +150,7 @@ impl ReconstructArgs {
         memory::allow_scratch(boundary::folder_of(&self.output));
         let backend = self.protocol.backend.open()?;
         let session = self.session(backend.as_ref(), begin)?;
-        let (input, scan) = self.input()?;
-        let resume = match session.requested() {
-            Some(loaded) if self.resume => {
-                let identity = identity(loaded, &self.protocol, &input.held, &scan)?;
-                Some(files::read_checkpoint(&self.output.join(CHECKPOINT), &identity)?)
-            }
-            _ => None,
-        };
+        let (input, _, resume) = self.input(&session)?;
         let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
         let mut run = session.plan(input, spent, &|| false)?;
         signals::listen()?;
@@ -196,19 +190,13 @@ impl ReconstructArgs {
             _ => inputs,
         };
         inputs.spare_folder(&self.output)?;
-        let (input, scan) = self.input()?;
+        let (input, scan, resume) = self.input(&session)?;
         conefield_io::check_shape(folder.file("volume.nii.gz"), input.scan.geometry.volume.shape)?;
         let affine = input.reference.as_ref().and_then(|r| r.affine);
         let (unit, grid) = (&input.scan.unit, &input.scan.geometry.volume);
         let hu = self.units.of_attenuation()?.open(&self.scan, Some(unit), grid, affine.as_ref())?;
 
-        let resumed = match session.requested() {
-            Some(loaded) if self.resume => {
-                Some(self.reopen(&folder, &identity(loaded, &self.protocol, &input.held, &scan)?)?)
-            }
-            _ => None,
-        };
-        let spent = resumed.as_ref().map_or(0.0, |(_, r)| r.standing.seconds);
+        let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
         let mut run = session.plan(input, spent, &|| signals::caught().is_some())?;
         let loaded = &run.method.loaded;
         let identity = identity(loaded, &self.protocol, &run.input.held, &scan)?;
@@ -218,16 +206,10 @@ impl ReconstructArgs {
             return Err(Error::Aborted { part: "preparation".into() });
         }
         folder.warn_without_room(4 * run.input.scan.header().voxels());
-        let earlier = if resumed.is_some() { folder.last_record()? } else { None };
-        let (metrics, resume) = match resumed {
-            Some((metrics, resume)) => (metrics, Some(resume)),
-            None => {
-                inputs.and_spec(loaded).spare_folder(&self.output)?;
-                folder.begin()?;
-                conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
-                (folder.metrics()?, None)
-            }
-        };
+        if resume.is_none() {
+            inputs.and_spec(loaded).spare_folder(&self.output)?;
+        }
+        let (metrics, earlier) = begin_or_go_on(&mut folder, loaded, resume.as_ref())?;
         if let Some(port) = self.watch {
             watch::serve(&self.output, port)?;
         }
@@ -241,39 +223,52 @@ impl ReconstructArgs {
         let board = progress.take_board();
         drop(progress);
 
-        let (written, _) = write(&folder, &run, &solved, self.protocol.seed, backend.as_ref())?;
-        let hounsfield = match &hu {
-            Some(hu) => {
-                let mut voxels = solved.solution.result.voxels(backend.as_ref())?;
-                outgoing::write_only(&folder.file("volume-hu.nii.gz"), voxels.as_mut(), affine, Some(hu), None)
-            }
-            None => Ok(None),
-        };
-        // What fails from here on does not take the finished run with it.
-        let (hounsfield, failed) = match hounsfield {
-            Ok(levels) => (levels, None),
-            Err(e) => (None, Some(e)),
-        };
-        let pictured =
-            board.map(|mut board| board.picture(solved.solution.steps, "slices", &folder.file("slices.png")));
-        if let Some(Err(e)) = pictured {
+        let (record, failed) =
+            self.results(&folder, &run, &solved, hu.as_ref(), &scan, last.as_ref(), backend.as_ref())?;
+        let picture = folder.file("slices.png");
+        if let Some(Err(e)) = board.map(|mut board| board.picture(solved.solution.steps, "slices", &picture)) {
             tracing::warn!("{e}");
         }
-        let path = |p: &PathBuf| p.display().to_string();
-        let record = RunRecord {
-            scan: Some(scan.clone()),
-            init: self.init.as_ref().map(path),
-            reference: self.protocol.reference.as_ref().map(path),
-            hounsfield,
-            ..run.record(&solved, last.as_ref(), written)
-        };
-        conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
         folder.finish()?;
         if let Some(e) = failed {
             return Err(e);
         }
         self.doubt(&run.input.scan, record.held_out);
         if self.json { out::json(&record) } else { out::say(&summary(&record, &scan, &self.output)) }
+    }
+
+    /// Writes the volumes, the scores and the record. Returns the record, and an error that only the volume in Hounsfield
+    /// units had: the finished run stays.
+    fn results(
+        &self,
+        folder: &RunFolder,
+        run: &Run<'_>,
+        solved: &Solved,
+        hu: Option<&Calibration>,
+        scan: &ScanRecord,
+        last: Option<&Record>,
+        backend: &dyn Backend,
+    ) -> Result<(RunRecord, Option<Error>)> {
+        let affine = run.input.reference.as_ref().and_then(|r| r.affine);
+        let (written, _) = write(folder, run, solved, self.protocol.seed, backend)?;
+        let hounsfield = hu.map(|hu| {
+            let mut voxels = solved.solution.result.voxels(backend)?;
+            outgoing::write_only(&folder.file("volume-hu.nii.gz"), voxels.as_mut(), affine, Some(hu), None)
+        });
+        let (hounsfield, failed) = match hounsfield.transpose() {
+            Ok(levels) => (levels.flatten(), None),
+            Err(e) => (None, Some(e)),
+        };
+        let path = |p: &PathBuf| p.display().to_string();
+        let record = RunRecord {
+            scan: Some(scan.clone()),
+            init: self.init.as_ref().map(path),
+            reference: self.protocol.reference.as_ref().map(path),
+            hounsfield,
+            ..run.record(solved, last, written)
+        };
+        conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
+        Ok((record, failed))
     }
 
     /// If held-out views are predicted badly, checks whether the geometry is the cause. The run is complete, so an
@@ -310,12 +305,20 @@ impl ReconstructArgs {
         Session::open(request, backend, run, begin)
     }
 
-    /// Reads all inputs.
-    fn input(&self) -> Result<(Input, ScanRecord)> {
+    /// Reads all inputs, and the checkpoint that a resumed run continues from.
+    fn input(&self, session: &Session<'_>) -> Result<(Input, ScanRecord, Option<Resume>)> {
         let (whole, reference) = input::read(&self.scan, self.protocol.reference.as_deref())?;
         let held = self.protocol.held_out(whole.geometry.views.len())?;
         let record = ScanRecord::of(&self.scan, &whole)?;
-        Ok((Input::new(Arc::new(whole), held, reference, self.protocol.peak)?, record))
+        let input = Input::new(Arc::new(whole), held, reference, self.protocol.peak)?;
+        let resume = match session.requested() {
+            Some(loaded) if self.resume => {
+                let identity = identity(loaded, &self.protocol, &input.held, &record)?;
+                Some(files::read_checkpoint(&self.output.join(CHECKPOINT), &identity)?)
+            }
+            _ => None,
+        };
+        Ok((input, record, resume))
     }
 
     /// Display and recording of the run.
@@ -347,14 +350,22 @@ impl ReconstructArgs {
             None => self.resume.then(|| (self.output.join("spec.toml").display().to_string(), vec![])),
         }
     }
+}
 
-    /// The file for metrics of an interrupted run, and the checkpoint to continue from.
-    fn reopen(&self, folder: &RunFolder, identity: &BTreeMap<String, String>) -> Result<((PathBuf, File), Resume)> {
-        let resume = files::read_checkpoint(&folder.file(CHECKPOINT), identity)?;
+/// Begins a run in its folder, or resumes it. Returns its file of metrics, and the last record that it keeps.
+fn begin_or_go_on(
+    folder: &mut RunFolder,
+    loaded: &Loaded,
+    resume: Option<&Resume>,
+) -> Result<((PathBuf, File), Option<Record>)> {
+    if let Some(resume) = resume {
         folder.go_on();
         let metrics = folder.metrics_until(resume.standing.recorded)?;
-        Ok((metrics, resume))
+        return Ok((metrics, folder.last_record()?));
     }
+    folder.begin()?;
+    conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
+    Ok((folder.metrics()?, None))
 }
 
 /// Writes the result of a run with this `seed` to its folder, and scores it. Returns its middle slices too.

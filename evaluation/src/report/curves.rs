@@ -3,25 +3,12 @@
 use crate::report::canvas::{number, write_png};
 use crate::report::pixels::{Pixels, Rgb};
 use conefield_core::{Error, Result};
-use plotters::coord::ranged1d::{AsRangedCoord, ValueFormatter};
+use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 use std::ops::Range;
 use std::path::Path;
 use std::sync::Once;
-
-/// Corner of the legend.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Corner {
-    /// Top left.
-    UpperLeft,
-    /// Top right.
-    UpperRight,
-    /// Bottom left.
-    LowerLeft,
-    /// Bottom right.
-    LowerRight,
-}
 
 /// Options of a plot.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,8 +23,6 @@ pub struct CurveOptions {
     pub x_margin: f64,
     /// Width and height in pixels.
     pub size: [u32; 2],
-    /// The legend's corner; by default the emptiest one.
-    pub legend: Option<Corner>,
 }
 
 /// `(x, [lowest y, highest y])`
@@ -45,7 +30,7 @@ pub type Band = (f64, [f64; 2]);
 
 impl Default for CurveOptions {
     fn default() -> Self {
-        Self { bands: vec![], log_x: false, log_y: false, x_margin: 0.0, size: [1200, 800], legend: None }
+        Self { bands: vec![], log_x: false, log_y: false, x_margin: 0.0, size: [1200, 800] }
     }
 }
 
@@ -65,28 +50,16 @@ pub(crate) const COLOURS: [RGBColor; 10] = [
 
 pub(crate) const FONT: &str = "sans-serif";
 
-/// Draws named series of `(x, y)` points as lines, on linear axes. Non-finite points leave a gap. Series with the same
-/// name share a colour.
+/// Draws named series of `(x, y)` points as lines. Non-finite points leave a gap. Series with the same name share a
+/// colour. The legend is in the emptiest corner.
 pub fn curves_png(
     path: impl AsRef<Path>,
     title: &str,
-    x_label: &str,
-    y_label: &str,
-    series: &[(String, Vec<(f64, f64)>)],
-) -> Result<()> {
-    curves_png_with(path, title, x_label, y_label, series, &CurveOptions::default())
-}
-
-/// As [`curves_png`], with [`CurveOptions`].
-pub fn curves_png_with(
-    path: impl AsRef<Path>,
-    title: &str,
-    x_label: &str,
-    y_label: &str,
+    labels: [&str; 2],
     series: &[(String, Vec<(f64, f64)>)],
     options: &CurveOptions,
 ) -> Result<()> {
-    panels_png(path, &[Panel { title, labels: [x_label, y_label], series, options }])
+    panels_png(path, &[Panel { title, labels, series, options }])
 }
 
 /// One of several plots.
@@ -141,7 +114,7 @@ impl Panel<'_> {
         let edges = options.bands.iter().flat_map(|(_, b)| b).flat_map(|(x, ys)| ys.map(|y| (*x, y)));
         let y = range(all.iter().copied().chain(edges.filter(|p| shown(p))).map(|p| p.1), options.log_y, 0.05);
         let plot = Plot { title, labels, series, options, shown: &shown };
-        let corner = options.legend.unwrap_or_else(|| emptiest(&all, &x, &y, options));
+        let corner = emptiest(&all, &x, &y, options);
         let drawn = match (options.log_x, options.log_y) {
             (false, false) => plot.draw(area, x, y, corner),
             (true, false) => plot.draw(area, x.log_scale(), y, corner),
@@ -160,22 +133,29 @@ struct Plot<'a> {
     shown: &'a dyn Fn(&(f64, f64)) -> bool,
 }
 
+type Area<'a> = BitMapBackend<'a>;
+type Chart<'a, 'b, X, Y> = ChartContext<'a, Area<'b>, Cartesian2d<X, Y>>;
+type Drawn = Result<(), String>;
+
+fn text(e: DrawingAreaErrorKind<<Area<'_> as DrawingBackend>::ErrorType>) -> String {
+    e.to_string()
+}
+
 impl Plot<'_> {
     fn draw<X, Y>(
         &self,
         area: &DrawingArea<BitMapBackend, plotters::coord::Shift>,
         x: X,
         y: Y,
-        corner: Corner,
-    ) -> Result<(), String>
+        corner: SeriesLabelPosition,
+    ) -> Drawn
     where
         X: AsRangedCoord<Value = f64>,
         Y: AsRangedCoord<Value = f64>,
         X::CoordDescType: ValueFormatter<f64>,
         Y::CoordDescType: ValueFormatter<f64>,
     {
-        let text = |e: DrawingAreaErrorKind<_>| e.to_string();
-        let em = (f64::from(self.options.size[0].min(self.options.size[1] * 3 / 2)) / 55.0).clamp(12.0, 60.0);
+        let em = self.em();
         area.fill(&WHITE).map_err(text)?;
         let mut chart = ChartBuilder::on(area)
             .caption(self.title, (FONT, em * 1.3))
@@ -184,6 +164,35 @@ impl Plot<'_> {
             .y_label_area_size(em * 4.6)
             .build_cartesian_2d(x, y)
             .map_err(text)?;
+        self.mesh(&mut chart)?;
+        self.bands(&mut chart)?;
+        self.lines(&mut chart)?;
+        self.legend(&mut chart, corner)?;
+        area.present().map_err(text)
+    }
+
+    /// The font's size in pixels.
+    fn em(&self) -> f64 {
+        (f64::from(self.options.size[0].min(self.options.size[1] * 3 / 2)) / 55.0).clamp(12.0, 60.0)
+    }
+
+    /// The colour of a series: that of the first one with its name.
+    fn colour(&self, name: &str) -> RGBColor {
+        let mut names: Vec<&str> = vec![];
+        for (name, _) in self.series {
+            if !names.contains(&&name[..]) {
+                names.push(name);
+            }
+        }
+        COLOURS[names.iter().position(|n| *n == name).unwrap_or(0) % COLOURS.len()]
+    }
+
+    fn mesh<X, Y>(&self, chart: &mut Chart<'_, '_, X, Y>) -> Drawn
+    where
+        X: Ranged<ValueType = f64> + ValueFormatter<f64>,
+        Y: Ranged<ValueType = f64> + ValueFormatter<f64>,
+    {
+        let em = self.em();
         chart
             .configure_mesh()
             .x_desc(self.labels[0])
@@ -197,25 +206,30 @@ impl Plot<'_> {
             .bold_line_style(BLACK.mix(0.15))
             .light_line_style(BLACK.mix(0.04))
             .draw()
-            .map_err(text)?;
-        let stroke = ((em / 8.0).round() as u32).max(2);
-        let mut names: Vec<&str> = vec![];
-        for (name, _) in self.series {
-            if !names.contains(&&name[..]) {
-                names.push(name);
-            }
-        }
-        let colour = |name: &str| COLOURS[names.iter().position(|n| *n == name).unwrap_or(0) % COLOURS.len()];
+            .map_err(text)
+    }
+
+    fn bands<X: Ranged<ValueType = f64>, Y: Ranged<ValueType = f64>>(&self, chart: &mut Chart<'_, '_, X, Y>) -> Drawn {
         for (name, band) in &self.options.bands {
             for part in band.split(|(x, ys)| !ys.iter().all(|y| (self.shown)(&(*x, *y)))).filter(|b| b.len() > 1) {
                 let above = part.iter().map(|(x, ys)| (*x, ys[1]));
                 let outline: Vec<(f64, f64)> = part.iter().map(|(x, ys)| (*x, ys[0])).chain(above.rev()).collect();
-                chart.draw_series([Polygon::new(outline, colour(name).mix(0.18))]).map_err(text)?;
+                chart.draw_series([Polygon::new(outline, self.colour(name).mix(0.18))]).map_err(text)?;
             }
         }
+        Ok(())
+    }
+
+    fn lines<X, Y>(&self, chart: &mut Chart<'_, '_, X, Y>) -> Drawn
+    where
+        X: Ranged<ValueType = f64>,
+        Y: Ranged<ValueType = f64>,
+    {
+        let em = self.em();
+        let (stroke, length) = (((em / 8.0).round() as u32).max(2), (em * 1.6) as i32);
         let mut seen: Vec<&str> = vec![];
         for (name, points) in self.series {
-            let colour = colour(name);
+            let colour = self.colour(name);
             let style = colour.stroke_width(stroke);
             let mut named = seen.contains(&&name[..]);
             seen.push(name);
@@ -226,29 +240,30 @@ impl Plot<'_> {
                 }
                 let drawn = chart.draw_series(LineSeries::new(part.iter().copied(), style)).map_err(text)?;
                 if !named {
-                    let length = (em * 1.6) as i32;
                     drawn.label(name).legend(move |(x, y)| PathElement::new([(x, y), (x + length, y)], style));
                     named = true;
                 }
             }
         }
-        let position = match corner {
-            Corner::UpperLeft => SeriesLabelPosition::UpperLeft,
-            Corner::UpperRight => SeriesLabelPosition::UpperRight,
-            Corner::LowerLeft => SeriesLabelPosition::LowerLeft,
-            Corner::LowerRight => SeriesLabelPosition::LowerRight,
-        };
+        Ok(())
+    }
+
+    fn legend<'a, X, Y>(&self, chart: &mut Chart<'a, 'a, X, Y>, corner: SeriesLabelPosition) -> Drawn
+    where
+        X: Ranged<ValueType = f64>,
+        Y: Ranged<ValueType = f64>,
+    {
+        let em = self.em();
         chart
             .configure_series_labels()
-            .position(position)
+            .position(corner)
             .margin((em * 0.8) as u32)
             .legend_area_size((em * 2.0) as u32)
             .label_font((FONT, em * 0.9))
             .background_style(WHITE.mix(0.85))
             .border_style(BLACK.mix(0.4))
             .draw()
-            .map_err(text)?;
-        area.present().map_err(text)
+            .map_err(text)
     }
 }
 
@@ -267,21 +282,23 @@ fn range(values: impl Iterator<Item = f64>, log: bool, margin: f64) -> Range<f64
 }
 
 /// The corner of the plot with the fewest points.
-fn emptiest(points: &[(f64, f64)], x: &Range<f64>, y: &Range<f64>, options: &CurveOptions) -> Corner {
+fn emptiest(points: &[(f64, f64)], x: &Range<f64>, y: &Range<f64>, options: &CurveOptions) -> SeriesLabelPosition {
     let part = |v: f64, r: &Range<f64>, log: bool| {
         if log { (v / r.start).ln() / (r.end / r.start).ln() } else { (v - r.start) / (r.end - r.start) }
     };
-    let corners = [Corner::LowerRight, Corner::UpperRight, Corner::UpperLeft, Corner::LowerLeft];
-    let count = |c: &Corner| {
+    let count = |&(right, upper): &(bool, bool)| {
         let inside = |p: &&(f64, f64)| {
             let (u, v) = (part(p.0, x, options.log_x), part(p.1, y, options.log_y));
-            let right = matches!(c, Corner::LowerRight | Corner::UpperRight);
-            let upper = matches!(c, Corner::UpperLeft | Corner::UpperRight);
             (if right { u > 0.6 } else { u < 0.4 }) && (if upper { v > 0.65 } else { v < 0.35 })
         };
         points.iter().filter(inside).count()
     };
-    corners.into_iter().min_by_key(count).unwrap_or(Corner::LowerRight)
+    match [(true, false), (true, true), (false, true), (false, false)].into_iter().min_by_key(count) {
+        Some((true, true)) => SeriesLabelPosition::UpperRight,
+        Some((false, true)) => SeriesLabelPosition::UpperLeft,
+        Some((false, false)) => SeriesLabelPosition::LowerLeft,
+        _ => SeriesLabelPosition::LowerRight,
+    }
 }
 
 /// Registers the font with the plotting crate, so that nothing depends on system fonts.
@@ -320,7 +337,7 @@ mod tests {
     fn curves_are_drawn_on_either_axis() {
         let (_dir, folder) = folder();
         let path = folder.join("curves.png");
-        curves_png(&path, "Engine, 50 views", "time (s)", "PSNR (dB)", &series()).unwrap();
+        curves_png(&path, "Engine, 50 views", ["time (s)", "PSNR (dB)"], &series(), &CurveOptions::default()).unwrap();
         let image = Pixels::open(&path).unwrap();
         assert_eq!((image.width, image.height), (1200, 800));
         for colour in &COLOURS[..4] {
@@ -328,10 +345,10 @@ mod tests {
         }
         let options = CurveOptions { log_x: true, ..Default::default() };
         let path = folder.join("curves_log.png");
-        curves_png_with(&path, "Engine, 50 views", "time (s)", "PSNR (dB)", &series(), &options).unwrap();
+        curves_png(&path, "Engine, 50 views", ["time (s)", "PSNR (dB)"], &series(), &options).unwrap();
         let options = CurveOptions { log_x: true, log_y: true, ..Default::default() };
         let loss = vec![("loss".to_string(), (0..500).map(|i| (i as f64, 3.0 / (1.0 + i as f64))).collect())];
-        curves_png_with(folder.join("loss_log.png"), "", "step", "loss", &loss, &options).unwrap();
+        curves_png(folder.join("loss_log.png"), "", ["step", "loss"], &loss, &options).unwrap();
     }
 
     #[test]
@@ -361,7 +378,7 @@ mod tests {
         let picture = |bands| {
             let path = folder.join("bands.png");
             let options = CurveOptions { bands, log_x: true, ..Default::default() };
-            curves_png_with(&path, "", "", "", &series, &options).unwrap();
+            curves_png(&path, "", ["", ""], &series, &options).unwrap();
             Pixels::open(&path).unwrap()
         };
         // The second colour, lightened.
@@ -380,21 +397,21 @@ mod tests {
         let path = dir.path().join("a.png");
         let one = |p| vec![("one".to_string(), vec![p])];
         for p in [(0.0, 0.0), (5.0, 1e-30), (1e12, -1e12)] {
-            curves_png(&path, "", "", "", &one(p)).unwrap();
+            curves_png(&path, "", ["", ""], &one(p), &CurveOptions::default()).unwrap();
         }
         let close = vec![("close".to_string(), vec![(0.0, 1e12), (1e-30, 1e12 + 2e-4)])];
-        curves_png(&path, "", "", "", &close).unwrap();
+        curves_png(&path, "", ["", ""], &close, &CurveOptions::default()).unwrap();
         let both = CurveOptions { log_x: true, log_y: true, ..Default::default() };
         let far = vec![("far".to_string(), vec![(1e-99, 1e99), (1e99, 1e-99), (1e-300, 1e300)])];
-        curves_png_with(&path, "", "", "", &far, &both).unwrap();
-        curves_png(&path, "", "", "", &far).unwrap();
+        curves_png(&path, "", ["", ""], &far, &both).unwrap();
+        curves_png(&path, "", ["", ""], &far, &CurveOptions::default()).unwrap();
         for p in [(f64::NAN, 0.0), (1.0, f64::INFINITY)] {
-            let e = curves_png(&path, "", "", "", &one(p)).unwrap_err().to_string();
+            let e = curves_png(&path, "", ["", ""], &one(p), &CurveOptions::default()).unwrap_err().to_string();
             assert!(e.contains("a.png") && e.contains("series"), "{e}");
         }
         let log = CurveOptions { log_x: true, ..Default::default() };
-        assert!(curves_png_with(&path, "", "", "", &one((0.0, 1.0)), &log).is_err());
+        assert!(curves_png(&path, "", ["", ""], &one((0.0, 1.0)), &log).is_err());
         let tiny = CurveOptions { size: [0, 0], ..Default::default() };
-        assert!(curves_png_with(&path, "", "", "", &one((0.0, 1.0)), &tiny).is_err());
+        assert!(curves_png(&path, "", ["", ""], &one((0.0, 1.0)), &tiny).is_err());
     }
 }

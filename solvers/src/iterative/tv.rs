@@ -12,8 +12,8 @@ use conefield_core::allowance;
 use conefield_core::error::Result;
 use conefield_core::geometry::{Vec3, VoxelGrid};
 use conefield_core::parallel;
-use conefield_core::place::{ADD, Array, Place, Slab, VariationSlope};
-use conefield_core::regularizer::{Bounds, Dual, Update};
+use conefield_core::place::{ADD, Array, Place, Slab, StatePart, VariationSlope};
+use conefield_core::regularizer::{Bounds, Dual, Kernels, Penalty, Update};
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
 use conefield_core::space::Space;
 use conefield_core::wgsl::Fragment;
@@ -121,7 +121,7 @@ pub struct Limited {
 
 impl Limited {
     /// With m `middle` and f `factor`.
-    pub fn new(middle: Vec3, factor: f64) -> Self {
+    fn new(middle: Vec3, factor: f64) -> Self {
         Self { middle: middle.map(|m| m as f32), factor: factor as f32 }
     }
 
@@ -163,11 +163,16 @@ pub struct TvProx {
     limited: Option<Limited>,
     /// Its part of a volume that several processes share.
     slab: Option<Slab>,
+    /// Dual steps of an update.
+    inner: usize,
+    /// Factor along the middle of a limited arc.
+    arc: f64,
 }
 
 impl TvProx {
-    /// For volumes of `shape`, starting with a dual of 0.
-    pub fn new(shape: [usize; 3], g: [f32; 3], space: &Space) -> Result<Self> {
+    /// For volumes of `shape`, with `inner` dual steps per update, starting with a dual of 0. Slopes along the middle of a
+    /// limited arc count `arc` times.
+    pub fn new(shape: [usize; 3], g: [f32; 3], inner: usize, arc: f64, space: &Space) -> Result<Self> {
         let split = Split::new(shape[0], REACH, rayon::current_num_threads());
         space.briefly(|space| {
             let planes = (split.slabs - 1) * 4 * split.halo() + split.slabs * 2 * split.reach;
@@ -175,7 +180,8 @@ impl TvProx {
         });
         let dual = || space.array(shape);
         let dual = [dual()?, dual()?, dual()?];
-        Ok(Self { shape, g, bounds: Bounds::default(), each: None, dual, edges: None, limited: None, slab: None })
+        let bounds = Bounds::default();
+        Ok(Self { shape, g, bounds, each: None, dual, edges: None, limited: None, slab: None, inner, arc })
     }
 
     /// Reduces the cost of slopes across `edges`, which are initially 0.
@@ -183,74 +189,9 @@ impl TvProx {
         Self { edges: Some(edges), ..self }
     }
 
-    /// Replaces the bounds.
-    pub fn confine(&mut self, bounds: Bounds) {
-        self.bounds = bounds;
-    }
-
-    /// Gives each voxel bounds within those of [`TvProx::confine`].
-    pub fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) {
-        self.each = Some(bounds);
-    }
-
-    /// Reduces the cost of slopes along a direction.
-    pub fn limit(&mut self, limited: Limited) {
-        self.limited = Some(limited);
-    }
-
-    /// Updates the edges from `x`, if they are in use. Returns the total variation of `x` if that changes it.
-    pub fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
-        self.edges.as_mut()?.find(x, self.g, self.slab.as_ref());
-        Some(self.value(x))
-    }
-
-    /// The total variation of `x`, or the part of its own planes.
-    pub fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
-        let planes = variations(x, self.g, self.edges.as_ref(), self.limited);
-        planes[self.slab.as_ref().map_or(0..planes.len(), Slab::inner)].iter().sum()
-    }
-
-    /// Makes it that of a slab.
-    pub fn divide(&mut self, slab: Slab) {
-        self.slab = Some(slab);
-    }
-
-    /// The slab of [`TvProx::divide`].
-    pub fn slab(&self) -> Option<&Slab> {
-        self.slab.as_ref()
-    }
-
-    /// Whether there are edges to update.
-    pub fn adapts(&self) -> bool {
-        self.edges.is_some()
-    }
-
-    /// The penalty and its proximal map for a place with kernels; these have the same bounds for all voxels.
-    pub fn kernels(&mut self, steps: usize) -> Option<Dual<'_>> {
-        if self.each.is_some() {
-            return None;
-        }
-        let fragment = match self.limited {
-            Some(Limited { middle: [x, y, z], factor }) => {
-                let constants =
-                    format!("const stage_MIDDLE = vec3<f32>({x:?}, {y:?}, {z:?});\nconst stage_FACTOR = {factor:?};\n");
-                Fragment::new(&[&constants, LIMITED])
-            }
-            None => Fragment::new(&[if self.edges.is_some() { ALONG_EDGES } else { PLAIN }]),
-        };
-        let guide = self.edges.as_mut().map(Edges::guide);
-        let (p, slab) = (self.dual.each_mut(), self.slab.as_ref());
-        Some(Dual { fragment, weights: self.g, steps, bounds: self.bounds, p, guide, slab })
-    }
-
-    /// The dual along x, y and z, for a checkpoint.
-    pub fn state(&mut self) -> [&mut Array; 3] {
-        self.dual.each_mut()
-    }
-
     /// Overwrites `u` with the proximal map of `v` after `steps` dual steps. With a weight of 0, only clips to
     /// the bounds.
-    pub fn apply(&mut self, v: &[f32], tau: f32, steps: usize, u: &mut [f32]) {
+    fn apply(&mut self, v: &[f32], tau: f32, steps: usize, u: &mut [f32]) {
         if tau < f32::MIN_POSITIVE {
             let bounds = self.bounds;
             return match &self.each {
@@ -269,9 +210,8 @@ impl TvProx {
         }
     }
 
-    /// Makes a whole update in one sweep, see [`conefield_core::regularizer::Penalty::update`]; returns the update if
-    /// `steps` does not fit into one.
-    pub fn update<'a>(&mut self, update: Update<'a>, tau: f32, steps: usize) -> Option<Update<'a>> {
+    /// Makes a whole update in one sweep, see [`Penalty::update`]; returns the update if `steps` does not fit into one.
+    fn sweep<'a>(&mut self, update: Update<'a>, tau: f32, steps: usize) -> Option<Update<'a>> {
         let split = Split::new(self.shape[0], steps, rayon::current_num_threads());
         if tau < f32::MIN_POSITIVE || split.reach < steps {
             return Some(update);
@@ -333,6 +273,81 @@ impl TvProx {
         let limited = self.limited.map(|limited| limited.turned([0, y, z]));
         let scale = Scale { limited, ..Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.bounds) };
         parallel::over(slabs, |_, slab| run(Sweeping(slab, scale)));
+    }
+}
+
+impl Penalty for TvProx {
+    /// The total variation of `x`, or the part of its own planes.
+    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
+        let planes = variations(x, self.g, self.edges.as_ref(), self.limited);
+        planes[self.slab.as_ref().map_or(0..planes.len(), Slab::inner)].iter().sum()
+    }
+
+    fn adapts(&self) -> bool {
+        self.edges.is_some()
+    }
+
+    fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
+        self.edges.as_mut()?.find(x, self.g, self.slab.as_ref());
+        Some(self.value(x))
+    }
+
+    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
+        self.apply(v, tau, self.inner, u);
+    }
+
+    fn confine(&mut self, bounds: Bounds) -> Result<()> {
+        self.bounds = bounds;
+        Ok(())
+    }
+
+    fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
+        self.each = Some(bounds);
+        Ok(())
+    }
+
+    fn divide(&mut self, slab: Slab) {
+        self.slab = Some(slab);
+    }
+
+    fn slab(&self) -> Option<&Slab> {
+        self.slab.as_ref()
+    }
+
+    fn limited(&mut self, middle: Vec3) {
+        if self.arc < 1.0 {
+            self.limited = Some(Limited::new(middle, self.arc));
+        }
+    }
+
+    fn update(&mut self, update: Update<'_>, tau: f32) {
+        if let Some(update) = self.sweep(update, tau, self.inner) {
+            update.around(|v, u| self.apply(v, tau, self.inner, u));
+        }
+    }
+
+    /// Kernels have the same bounds for all voxels.
+    fn kernels(&mut self) -> Option<Kernels<'_>> {
+        if self.each.is_some() {
+            return None;
+        }
+        let fragment = match self.limited {
+            Some(Limited { middle: [x, y, z], factor }) => {
+                let constants =
+                    format!("const stage_MIDDLE = vec3<f32>({x:?}, {y:?}, {z:?});\nconst stage_FACTOR = {factor:?};\n");
+                Fragment::new(&[&constants, LIMITED])
+            }
+            None => Fragment::new(&[if self.edges.is_some() { ALONG_EDGES } else { PLAIN }]),
+        };
+        let guide = self.edges.as_mut().map(Edges::guide);
+        let (p, slab) = (self.dual.each_mut(), self.slab.as_ref());
+        let (weights, steps, bounds) = (self.g, self.inner, self.bounds);
+        Some(Kernels::Dual(Dual { fragment, weights, steps, bounds, p, guide, slab }))
+    }
+
+    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
+        let [x, y, z] = self.dual.each_mut().map(StatePart::Placed);
+        vec![("dual.x", x), ("dual.y", y), ("dual.z", z)]
     }
 }
 
@@ -834,7 +849,7 @@ mod tests {
     }
 
     fn prox(shape: [usize; 3], g: [f32; 3]) -> TvProx {
-        TvProx::new(shape, g, &space(shape)).unwrap()
+        TvProx::new(shape, g, 1, 0.3, &space(shape)).unwrap()
     }
 
     /// The dual of a prior.
@@ -866,7 +881,7 @@ mod tests {
         for (directional, limited) in [(false, false), (true, false), (false, true), (true, true)] {
             let mut prox = if directional { with_edges(shape, g, &v) } else { prox(shape, g) };
             if limited {
-                prox.limit(Limited::new([0.6, 0.8, 0.0], 0.3));
+                prox.limited([0.6, 0.8, 0.0]);
             }
             let mut u = Array3::zeros(shape);
             let gap = |prox: &TvProx, u: &Array3<f32>| {
@@ -984,13 +999,13 @@ mod tests {
                 let made = || {
                     let mut made = if directional { with_edges(shape, g, &v) } else { prox(shape, g) };
                     if limited {
-                        made.limit(Limited::new([0.6, 0.8, 0.0], 0.3));
+                        made.limited([0.6, 0.8, 0.0]);
                     }
-                    made.confine(Bounds { low: 0.02, high: 0.9 });
+                    made.confine(Bounds { low: 0.02, high: 0.9 }).unwrap();
                     if directional != limited {
                         let low: Vec<f32> = (0..v.len()).map(|i| 0.02 + 0.3 * (i % 3) as f32).collect();
                         let high = low.iter().enumerate().map(|(i, low)| low + 0.1 * (i % 2) as f32).collect();
-                        made.confine_each(Arc::new([low, high]));
+                        made.confine_each(Arc::new([low, high])).unwrap();
                     }
                     made
                 };
@@ -1048,7 +1063,7 @@ mod tests {
                                 towards: pulled.then_some((towards.as_slice().unwrap(), 0.2)),
                                 inside: masked.then_some(inside.as_slice().unwrap()),
                             };
-                            let left = if swept { prox.update(update, tau, steps) } else { Some(update) };
+                            let left = if swept { prox.sweep(update, tau, steps) } else { Some(update) };
                             if let Some(update) = left {
                                 update.around(|v, u| prox.apply(v, tau, steps, u));
                             }

@@ -13,7 +13,7 @@ use conefield_core::scene::Scene;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Kernel, Stage, Tile, TileMut};
-use conefield_evaluation::report::{CurveOptions, curves_png_with};
+use conefield_evaluation::report::{CurveOptions, curves_png};
 use conefield_solvers::losses::L2;
 use serde_json::{Value, json};
 use std::ops::Range;
@@ -213,7 +213,7 @@ pub fn check() {
         let options = CurveOptions { log_x: true, log_y: true, ..CurveOptions::default() };
         let title = "Single against double precision";
         let labels = ["samples of a step, cells or turns a side", "error over the largest value"];
-        curves_png_with(page::picture(), title, labels[0], labels[1], &curves, &options).unwrap();
+        curves_png(page::picture(), title, labels, &curves, &options).unwrap();
     }
     page::keep("growth", &text);
 }

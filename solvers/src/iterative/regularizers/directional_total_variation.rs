@@ -4,7 +4,7 @@
 //! the edges come from another image of the object. Here they come from the volume itself and are updated before each
 //! pass.
 
-use super::total_variation::{TvPenalty, are_equal, halo, is_one, lambda, said, validate, weighted};
+use super::total_variation::{are_equal, halo, is_one, lambda, said, validate, weighted};
 use crate::iterative::edges::Edges;
 use crate::iterative::tv::TvProx;
 use conefield_core::error::{Result, ensure};
@@ -63,8 +63,7 @@ impl Regularizer for DirectionalTotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
         let g = weighted(grid, self.weights);
         let edges = Edges::new(grid.shape, self.strength as f32, self.edge, space)?;
-        let prox = TvProx::new(grid.shape, g, space)?.with_edges(edges);
-        Ok(Box::new(TvPenalty { prox, inner: self.inner, arc: self.arc }))
+        Ok(Box::new(TvProx::new(grid.shape, g, self.inner, self.arc, space)?.with_edges(edges)))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {

@@ -1,15 +1,12 @@
 //! Total variation: attenuation is piecewise constant with few edges.
 
-use crate::iterative::tv::{Limited, TvProx, anisotropy};
+use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::{Vec3, VoxelGrid};
-use conefield_core::place::{Slab, StatePart};
-use conefield_core::regularizer::{Bounds, Kernels, Penalty, Regularizer, RegularizerSpec, Update, Weight};
+use conefield_core::geometry::VoxelGrid;
+use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Weight};
 use conefield_core::space::Space;
-use ndarray::ArrayView3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
 
 /// Settings of `total-variation`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -79,8 +76,7 @@ impl RegularizerSpec for TotalVariation {
 
 impl Regularizer for TotalVariation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
-        let prox = TvProx::new(grid.shape, weighted(grid, self.weights), space)?;
-        Ok(Box::new(TvPenalty { prox, inner: self.inner, arc: self.arc }))
+        Ok(Box::new(TvProx::new(grid.shape, weighted(grid, self.weights), self.inner, self.arc, space)?))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
@@ -107,69 +103,4 @@ pub(super) fn halo(inner: usize) -> usize {
 pub(super) fn said(weights: [f64; 3], arc: f64) -> String {
     let axes = if are_equal(&weights) { String::new() } else { format!(" times {weights:?} along x, y, z") };
     if is_one(&arc) { axes } else { format!("{axes} times {arc} along the middle of a limited arc") }
-}
-
-/// Total variation on one grid.
-pub(super) struct TvPenalty {
-    pub(super) prox: TvProx,
-    pub(super) inner: usize,
-    /// Factor along the middle of a limited arc.
-    pub(super) arc: f64,
-}
-
-impl Penalty for TvPenalty {
-    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
-        self.prox.value(x)
-    }
-
-    fn adapts(&self) -> bool {
-        self.prox.adapts()
-    }
-
-    fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
-        self.prox.adapt(x)
-    }
-
-    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
-        self.prox.apply(v, tau, self.inner, u);
-    }
-
-    fn confine(&mut self, bounds: Bounds) -> Result<()> {
-        self.prox.confine(bounds);
-        Ok(())
-    }
-
-    fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
-        self.prox.confine_each(bounds);
-        Ok(())
-    }
-
-    fn divide(&mut self, slab: Slab) {
-        self.prox.divide(slab);
-    }
-
-    fn slab(&self) -> Option<&Slab> {
-        self.prox.slab()
-    }
-
-    fn limited(&mut self, middle: Vec3) {
-        if !is_one(&self.arc) {
-            self.prox.limit(Limited::new(middle, self.arc));
-        }
-    }
-
-    fn update(&mut self, update: Update<'_>, tau: f32) {
-        if let Some(update) = self.prox.update(update, tau, self.inner) {
-            update.around(|v, u| self.prox.apply(v, tau, self.inner, u));
-        }
-    }
-
-    fn kernels(&mut self) -> Option<Kernels<'_>> {
-        self.prox.kernels(self.inner).map(Kernels::Dual)
-    }
-
-    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
-        let [x, y, z] = self.prox.state().map(StatePart::Placed);
-        vec![("dual.x", x), ("dual.y", y), ("dual.z", z)]
-    }
 }
