@@ -302,13 +302,14 @@ fn a_subset_may_miss_the_volume() {
         scan.geometry.views[i] = away;
         scan.projections.index_axis_mut(ndarray::Axis(0), i).fill(0.0);
     }
+    let empty = psnr(&Volume { data: 0.0 * truth().data, ..truth() }, &truth());
     for prior in ["{ fixed = 0.0 }", "{ noise = 0.5 }"] {
         let settings = format!("subsets = \"views\"\nprior.weight = {prior}\n{}", passes(6));
         let [found, expected] =
             [&scan, &without].map(|scan| psnr(&Case::of(scan).volume(&spec("fista-tv", &settings)).0, &truth()));
         // The momentum goes on where a subset has no gradient, which costs some decibels after few passes.
         println!("{prior}: {found:.2} dB, {expected:.2} dB without these views");
-        assert!(found > expected - 5.0 && found > 25.0, "{prior}: {found} and {expected} dB");
+        assert!(found > expected - 5.0 && found > empty + 5.0, "{prior}: {found} and {expected} dB, empty {empty}");
     }
 }
 
