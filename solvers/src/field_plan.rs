@@ -7,6 +7,7 @@ use crate::fit::{Fitted, fit};
 use crate::iterative::known_volume;
 use crate::iterative::noise::{self, Noise};
 use crate::losses::L1;
+use crate::neural_field::NeuralField;
 use crate::optimizer::Optimizer;
 use crate::pretrain::{Pretraining, learn, pretrain};
 use crate::priors::Places;
@@ -26,32 +27,19 @@ use conefield_core::method::{
 };
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::prior::Prior;
+use conefield_core::registry::Registered;
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::{Scene, SceneSettings};
-use conefield_core::settings::{Initializer, InitializerSpec, LossSpec, PriorSpec};
+use conefield_core::settings::{Initializer, InitializerSpec, LossSpec};
 use conefield_core::trained::{FieldVoxels, Placement, TrainedField};
 use conefield_fields::initializers::random::Random;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Settings shared by methods that train a field.
-pub(crate) struct Trained<'a> {
-    /// The name of the method.
-    pub(crate) kind: &'static str,
-    pub(crate) scene: &'a SceneSettings,
-    pub(crate) initializer: &'a dyn InitializerSpec,
-    pub(crate) loss: &'a dyn LossSpec,
-    pub(crate) priors: &'a [Box<dyn PriorSpec>],
-    pub(crate) optimizer: &'a Optimizer,
-    pub(crate) training: &'a Training,
-    pub(crate) pretraining: &'a Pretraining,
-    pub(crate) callbacks: &'a [Box<dyn CallbackSpec>],
-}
-
-impl Trained<'_> {
+impl NeuralField {
     /// Builds the remaining parts and compiles `pipeline`. `stages` describes its stages, `beside` everything else.
-    pub(crate) fn plan(
+    pub(crate) fn train(
         &self,
         pipeline: Pipeline,
         stages: Vec<StageLine>,
@@ -62,7 +50,7 @@ impl Trained<'_> {
         self.optimizer.validate().map_err(|e| e.within("optimizer"))?;
         self.training.validate().map_err(|e| e.within("training"))?;
         self.pretraining.validate().map_err(|e| e.within("pretraining"))?;
-        let callbacks = build_callbacks(self.callbacks)?;
+        let callbacks = build_callbacks(&self.callbacks)?;
         for (i, callback) in callbacks.iter().enumerate() {
             callback.check(&pipeline).map_err(|e| e.within(&format!("callbacks.{i}")))?;
         }
@@ -82,10 +70,10 @@ impl Trained<'_> {
         exe.admits(loss.as_ref(), &priors)?;
         beside.push(Line::new("initializer", self.initializer.type_name(), &initializer.describe()));
         beside.push(Line::new("loss", self.loss.type_name(), &loss.describe()));
-        for (i, (p, spec)) in priors.iter().zip(self.priors).enumerate() {
+        for (i, (p, spec)) in priors.iter().zip(&self.priors).enumerate() {
             beside.push(Line::new(&format!("priors.{i}"), spec.type_name(), &p.describe()));
         }
-        for (i, (c, spec)) in callbacks.iter().zip(self.callbacks).enumerate() {
+        for (i, (c, spec)) in callbacks.iter().zip(&self.callbacks).enumerate() {
             let said = c.describe().unwrap_or_default();
             beside.push(Line::new(&format!("callbacks.{i}"), spec.type_name(), &said));
         }
@@ -93,13 +81,13 @@ impl Trained<'_> {
         let kept = callbacks.iter().map(|c| c.bytes(parameters)).sum();
         let held_out = callbacks.iter().position(|c| c.needs_held_out()).map(|i| format!("callbacks.{i}"));
         let what = format!("{} rays per step, Adam {}", self.training.rays, self.optimizer.lr);
-        let method = Line::new("method", self.kind, &what);
+        let method = Line::new("method", self.type_name(), &what);
         Ok(Box::new(FieldPlan {
             scene: self.scene.clone(),
             optimizer: self.optimizer.clone(),
             training: self.training.clone(),
             pretraining: self.pretraining.clone(),
-            callback_settings: self.callbacks.to_vec(),
+            callback_settings: self.callbacks.clone(),
             pipeline,
             initializer,
             loss: Arc::from(loss),

@@ -1,6 +1,6 @@
 //! A neural attenuation field, trained to match the measured line integrals by the Beer-Lambert law.
 
-use crate::field_plan::{Trained, Training, l1, random, rollback};
+use crate::field_plan::{Training, l1, random, rollback};
 use crate::optimizer::Optimizer;
 use crate::pretrain::Pretraining;
 use crate::training::CallbackSpec;
@@ -8,7 +8,6 @@ use conefield_core::error::Result;
 use conefield_core::method::StartFile;
 use conefield_core::method::{Context, Line, Method, Plan, StageLine};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::registry::Registered;
 use conefield_core::scene::SceneSettings;
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
@@ -77,18 +76,7 @@ impl Method for NeuralField {
         }
         stages.push(StageLine::new("field", self.field.type_name(), pipeline.field.as_ref()));
         let projector = Line::new("projector", self.projector.type_name(), &pipeline.projector.describe());
-        let trained = Trained {
-            kind: self.type_name(),
-            scene: &self.scene,
-            initializer: self.initializer.as_ref(),
-            loss: self.loss.as_ref(),
-            priors: &self.priors,
-            optimizer: &self.optimizer,
-            training: &self.training,
-            pretraining: &self.pretraining,
-            callbacks: &self.callbacks,
-        };
-        trained.plan(pipeline, stages, vec![projector], context)
+        self.train(pipeline, stages, vec![projector], context)
     }
 
     fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {

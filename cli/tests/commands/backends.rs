@@ -1,6 +1,6 @@
 //! The wgpu backend in the command: listed, explained, and used for runs.
 
-use crate::common::{done, refused, text};
+use crate::common::{done, refused, started, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -121,14 +121,7 @@ const TINY: [&str; 5] = [
 /// Starts the command, and kills it once there is a checkpoint in its folder.
 #[cfg(unix)]
 fn killed_at_a_checkpoint(run: &Path, args: &[&str]) {
-    use std::process::{Command, Stdio};
-    let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
-        .arg("--quiet")
-        .args(args)
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
+    let mut child = started(args);
     let checkpoint = run.join("checkpoint.safetensors");
     while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
         std::thread::sleep(std::time::Duration::from_millis(2));

@@ -1,11 +1,11 @@
 //! Inputs are preserved, outputs are replaced only when the new result is complete, a folder has one writer, and text
 //! from files does not reach the terminal unescaped.
 
-use crate::common::{conefield, done, json, refused, text};
+use crate::common::{conefield, done, json, refused, signal, started, text, wait_for, words};
 use std::fs;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Command, Output};
 use std::time::{Duration, Instant};
 
 /// A folder with `scan`, a scan of 8 views.
@@ -19,10 +19,6 @@ fn with_scan() -> (tempfile::TempDir, String) {
 fn fast(scan: &str, output: &str, more: &[&str]) -> Vec<String> {
     let all = ["reconstruct", scan, "--spec", "fast", "--steps", "3", "--set", "training.rays=16", "-o", output];
     all.iter().chain(more).map(|s| (*s).to_owned()).collect()
-}
-
-fn words(all: &[String]) -> Vec<&str> {
-    all.iter().map(String::as_str).collect()
 }
 
 /// Every file below `folder` with its content.
@@ -172,22 +168,7 @@ fn a_log_that_nobody_reads_ends_no_run() {
 /// A run with very many steps.
 fn long(scan: &str, run: &str, more: &[&str]) -> Child {
     let args = ["reconstruct", scan, "--spec", "fast", "--steps", "4000000", "--set", "training.rays=16", "-o", run];
-    let program = assert_cmd::cargo::cargo_bin("conefield");
-    let mut command = Command::new(program);
-    command.arg("--quiet").args(args).args(more).stdout(Stdio::null()).stderr(Stdio::null());
-    command.spawn().unwrap()
-}
-
-fn wait_for(what: &Path) {
-    let start = Instant::now();
-    while !what.exists() {
-        assert!(start.elapsed() < Duration::from_secs(60), "{} does not come", what.display());
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
-
-fn kill(child: &Child, signal: &str) {
-    assert!(Command::new("kill").args([&format!("-{signal}"), &child.id().to_string()]).status().unwrap().success());
+    started(&[&args[..], more].concat())
 }
 
 /// Whether this process and its children ignore a closed terminal, as under `nohup`.
@@ -207,7 +188,7 @@ fn a_closed_terminal_leaves_a_checkpoint() {
     let mut child = long(&scan, &text(&run), &["--checkpoint-every", "1h"]);
     wait_for(&run.join("metrics.jsonl"));
     std::thread::sleep(Duration::from_millis(300));
-    kill(&child, "HUP");
+    signal(&child, "HUP");
     assert_eq!(child.wait().unwrap().code(), Some(129));
     assert!(run.join("checkpoint.safetensors").exists());
 }
@@ -225,7 +206,7 @@ fn a_run_has_its_folder_alone() {
         }
     }
     assert!(child.try_wait().unwrap().is_none(), "the run goes on");
-    kill(&child, "INT");
+    signal(&child, "INT");
     assert_eq!(child.wait().unwrap().code(), Some(130));
     assert!(run.join("checkpoint.safetensors").exists());
 }
@@ -241,7 +222,7 @@ fn a_killed_replacement_gives_back_what_it_replaced() {
     while run.join("record.json").exists() && start.elapsed() < Duration::from_secs(60) {
         std::thread::sleep(Duration::from_millis(2));
     }
-    kill(&child, "KILL");
+    signal(&child, "KILL");
     child.wait().unwrap();
     assert!(!run.join("record.json").exists(), "the new run had begun");
     // The next command, though refused, restores the earlier run.
@@ -257,7 +238,7 @@ fn a_checkpoint_of_which_a_bit_is_changed_is_refused() {
     let run = dir.path().join("run");
     let mut child = long(&scan, &text(&run), &["--checkpoint-every", "0.05s"]);
     wait_for(&run.join("checkpoint.safetensors"));
-    kill(&child, "INT");
+    signal(&child, "INT");
     child.wait().unwrap();
     let path = run.join("checkpoint.safetensors");
     let good = fs::read(&path).unwrap();
@@ -348,7 +329,7 @@ fn a_signal_leaves_no_unfinished_file() {
         all
     };
     let mut caught = 0;
-    for (signal, status) in [("INT", 130), ("TERM", 143), ("INT", 130)] {
+    for (name, status) in [("INT", 130), ("TERM", 143), ("INT", 130)] {
         let mut child = Command::new(&program)
             .args(["--quiet", "convert", &text(&dir.path().join("v.npy")), &text(&dir.path().join("o.nii.gz"))])
             .spawn()
@@ -357,7 +338,7 @@ fn a_signal_leaves_no_unfinished_file() {
         while names().len() < 2 && start.elapsed() < Duration::from_secs(30) {
             std::thread::sleep(Duration::from_millis(1));
         }
-        kill(&child, signal);
+        signal(&child, name);
         let ended = child.wait().unwrap();
         caught += u32::from(ended.code() == Some(status));
         if ended.success() {
@@ -422,14 +403,9 @@ fn what_a_killed_comparison_had_started_is_waited_for() {
     let sets = ["--set", "training.rays=5000", "--set", "projector.samples=800", "--steps", "3"];
     let begin = ["compare", &scan, "--specs", "fast", "-o", &text(&all), "--checkpoint-every", "0.05s"];
     let args = [&begin[..], &sets].concat();
-    let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
-        .args(&args)
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
+    let mut child = started(&args);
     wait_for(&all.join("fast/checkpoint.safetensors"));
-    kill(&child, "KILL");
+    signal(&child, "KILL");
     child.wait().unwrap();
     let folder = fs::File::open(all.join("fast")).unwrap();
     assert!(folder.try_lock().is_err(), "the run is over already: nothing to wait for");

@@ -1,16 +1,13 @@
 //! `reconstruct --budget`: the plan, refusals, and the record.
 
-use crate::common::{done, json, refused, text};
+use crate::common::{json, refused, signal, simulated, started, text, wait_for};
 use serde_json::Value;
 use std::fs;
 use std::path::PathBuf;
-use tempfile::{TempDir, tempdir};
+use tempfile::TempDir;
 
 fn scan() -> (TempDir, PathBuf) {
-    let dir = tempdir().unwrap();
-    let path = dir.path().join("scan");
-    done(&["simulate", "phantom:head:16", "-o", &text(&path), "--views", "12", "--detector", "16x16"]);
-    (dir, path)
+    simulated(16, 12)
 }
 
 #[test]
@@ -110,8 +107,6 @@ fn a_budget_that_is_too_short_is_refused_with_what_would_do() {
 #[cfg(unix)]
 #[test]
 fn an_interrupted_run_goes_on_with_what_it_chose() {
-    use std::process::{Command, Stdio};
-    use std::time::{Duration, Instant};
     let (dir, scan) = scan();
     let (front, out) = (dir.path().join("front.toml"), dir.path().join("run"));
     fs::write(
@@ -123,14 +118,9 @@ fn an_interrupted_run_goes_on_with_what_it_chose() {
     .unwrap();
     let (scan, front, path) = (text(&scan), text(&front), text(&out));
     let line = ["reconstruct", &scan, "-o", &path, "--budget", "6s", "--front", &front];
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
-    let child = command.arg("--quiet").args(line).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    let metrics = out.join("metrics.jsonl");
-    let until = Instant::now() + Duration::from_secs(60);
-    while fs::metadata(&metrics).map_or(0, |m| m.len()) == 0 && Instant::now() < until {
-        std::thread::sleep(Duration::from_millis(2));
-    }
-    assert!(Command::new("sh").arg("-c").arg(format!("kill -INT {}", child.id())).status().unwrap().success());
+    let child = started(&line);
+    wait_for(&out.join("metrics.jsonl"));
+    signal(&child, "INT");
     let output = child.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8(output.stderr).unwrap());
     let said = refused(1, &[&line[..5], &["7s", "--resume"]].concat());

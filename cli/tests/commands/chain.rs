@@ -1,6 +1,6 @@
 //! From a phantom to scores, on a scan that is small enough for every test run.
 
-use crate::common::{done, json, text};
+use crate::common::{done, json, simulated, text};
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,10 +14,7 @@ const SMALL: [&str; 8] = [
 
 /// A small scan in a folder of its own.
 fn scan() -> (TempDir, PathBuf) {
-    let dir = tempdir().unwrap();
-    let path = dir.path().join("scan");
-    done(&["simulate", "phantom:head:16", "-o", &text(&path), "--views", "8", "--detector", "16x16"]);
-    (dir, path)
+    simulated(16, 8)
 }
 
 /// Reconstructs with `spec`; returns the record.

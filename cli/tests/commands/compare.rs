@@ -1,19 +1,15 @@
 //! `compare`: one table in three forms, one picture, and runs that can be used alone.
 
-use crate::common::{conefield, done, json, refused, text};
+use crate::common::{conefield, done, json, read, refused, signal, simulated, started, text, times, wait_for, words};
 use conefield_evaluation::report::Pixels;
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
-use tempfile::{TempDir, tempdir};
+use tempfile::TempDir;
 
 /// A small scan in a folder of its own.
 fn scan() -> (TempDir, PathBuf) {
-    let dir = tempdir().unwrap();
-    let path = dir.path().join("scan");
-    done(&["simulate", "phantom:head:24", "-o", &text(&path), "--views", "12", "--detector", "24x24"]);
-    (dir, path)
+    simulated(24, 12)
 }
 
 fn arguments(scan: &Path, specs: &str, output: &Path, more: &[&str]) -> Vec<String> {
@@ -25,14 +21,6 @@ fn arguments(scan: &Path, specs: &str, output: &Path, more: &[&str]) -> Vec<Stri
         .collect()
 }
 
-fn words(line: &[String]) -> Vec<&str> {
-    line.iter().map(String::as_str).collect()
-}
-
-fn read(path: &Path) -> Value {
-    serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap()
-}
-
 /// Cells of the Markdown table, one row per method.
 fn markdown(folder: &Path) -> Vec<Vec<String>> {
     let text = fs::read_to_string(folder.join("table.md")).unwrap();
@@ -41,17 +29,6 @@ fn markdown(folder: &Path) -> Vec<Vec<String>> {
         .filter(|l| l.starts_with('|'))
         .map(|l| l.trim_matches('|').split('|').map(|c| c.trim().to_owned()).collect::<Vec<_>>());
     rows.filter(|r| !r[0].starts_with("---")).collect()
-}
-
-/// Modification time of every file below `folder`.
-fn times(folder: &Path) -> Vec<(PathBuf, SystemTime)> {
-    let mut all: Vec<_> = fs::read_dir(folder)
-        .unwrap()
-        .map(|e| e.unwrap())
-        .map(|e| (e.path(), e.metadata().unwrap().modified().unwrap()))
-        .collect();
-    all.sort();
-    all
 }
 
 #[test]
@@ -211,8 +188,6 @@ fn bad_input_makes_no_folder() {
 #[cfg(unix)]
 #[test]
 fn a_signal_stops_it_and_resume_goes_on_to_the_same_bits() {
-    use std::process::{Command, Stdio};
-    use std::time::{Duration, Instant};
     let (dir, scan) = scan();
     let line = |out: &Path, more: &[&str]| {
         let line = arguments(&scan, "fdk,sirt", out, more);
@@ -221,18 +196,12 @@ fn a_signal_stops_it_and_resume_goes_on_to_the_same_bits() {
     let whole = dir.path().join("whole");
     done(&words(&line(&whole, &[])));
     let mut out = PathBuf::new();
-    for (signal, code) in [("INT", 130), ("TERM", 143)] {
-        out = dir.path().join(signal);
-        let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
-        command.arg("--quiet").args(line(&out, &[])).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let child = command.spawn().unwrap();
-        let metrics = out.join("sirt/metrics.jsonl");
-        let until = Instant::now() + Duration::from_secs(60);
-        while fs::metadata(&metrics).map_or(0, |m| m.len()) == 0 && Instant::now() < until {
-            std::thread::sleep(Duration::from_millis(2));
-        }
+    for (name, code) in [("INT", 130), ("TERM", 143)] {
+        out = dir.path().join(name);
+        let child = started(&line(&out, &[]));
+        wait_for(&out.join("sirt/metrics.jsonl"));
         // Only to this process: the child notices the end of its input.
-        assert!(Command::new("sh").arg("-c").arg(format!("kill -{signal} {}", child.id())).status().unwrap().success());
+        signal(&child, name);
         let output = child.wait_with_output().unwrap();
         let said = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(code), "{said}");

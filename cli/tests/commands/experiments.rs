@@ -1,6 +1,6 @@
 //! Further analyses: drift, features as colours, label maps, an end by held-out views, live slices.
 
-use crate::common::{done, json, refused, text};
+use crate::common::{done, json, refused, signal, text, wait_for};
 use conefield_evaluation::report::Pixels;
 use ndarray::Array3;
 use serde_json::Value;
@@ -294,7 +294,6 @@ fn a_segmenter_sees_both_volumes_and_leaves_nothing() {
 #[test]
 fn an_interrupted_segmenter_is_ended_and_its_files_go() {
     use std::process::{Command, Stdio};
-    use std::time::{Duration, Instant};
     let dir = tempdir().unwrap();
     let a = labels(&dir.path().join("a.npy"), 2);
     let (temporary, begun) = (dir.path().join("tmp"), dir.path().join("begun"));
@@ -310,12 +309,9 @@ fn an_interrupted_segmenter_is_ended_and_its_files_go() {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    let until = Instant::now() + Duration::from_secs(60);
-    while !begun.exists() && Instant::now() < until {
-        std::thread::sleep(Duration::from_millis(5));
-    }
+    wait_for(&begun);
     let segmenter = fs::read_to_string(&begun).unwrap().trim().to_owned();
-    Command::new("sh").arg("-c").arg(format!("kill -TERM {}", child.id())).status().unwrap();
+    signal(&child, "TERM");
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(143), "{said}");

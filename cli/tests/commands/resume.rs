@@ -1,7 +1,6 @@
 //! A killed or interrupted run resumes to the same bits.
-use crate::common::{done, refused, text};
+use crate::common::{done, refused, signal, started, text, wait_for};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 const SETTINGS: [&str; 4] =
@@ -25,12 +24,6 @@ fn arguments(scan: &Path, run: &Path, steps: u64, more: &[&str]) -> Vec<String> 
     }
     all.extend(more.iter().map(|&m| m.into()));
     all
-}
-
-fn start(arguments: &[String]) -> Child {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
-    command.arg("--quiet").args(arguments).stdout(Stdio::null()).stderr(Stdio::piped());
-    command.spawn().expect("the command starts")
 }
 
 fn finish(arguments: &[String]) {
@@ -60,16 +53,16 @@ fn ten_kills_at_random_moments_change_nothing() {
     let dir = tempfile::tempdir().unwrap();
     let scan = scan(dir.path());
     let (whole, killed) = (dir.path().join("whole"), dir.path().join("killed"));
-    let started = Instant::now();
+    let begin = Instant::now();
     let steps = 600;
     finish(&arguments(&scan, &whole, steps, &[]));
-    let length = started.elapsed();
+    let length = begin.elapsed();
     let mut random = 0x2545_f491_4f6c_dd1du64;
     let (mut kills, mut resumed) = (0, 0);
     while kills < 10 {
         let mode = if killed.join("checkpoint.safetensors").exists() { "--resume" } else { "--force" };
         resumed += usize::from(mode == "--resume");
-        let mut child = start(&arguments(&scan, &killed, steps, &[mode, "--checkpoint-every", "0.02s"]));
+        let mut child = started(&arguments(&scan, &killed, steps, &[mode, "--checkpoint-every", "0.02s"]));
         random ^= random << 13;
         random ^= random >> 7;
         random ^= random << 17;
@@ -97,16 +90,11 @@ fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
     let whole = dir.path().join("whole");
     let steps = 500;
     finish(&arguments(&scan, &whole, steps, &[]));
-    for (signal, code) in [("INT", 130), ("TERM", 143)] {
-        let run = dir.path().join(signal);
-        let child = start(&arguments(&scan, &run, steps, &["--checkpoint-every", "1h"]));
-        let metrics = run.join("metrics.jsonl");
-        let until = Instant::now() + Duration::from_secs(60);
-        while std::fs::metadata(&metrics).map_or(0, |m| m.len()) == 0 && Instant::now() < until {
-            std::thread::sleep(Duration::from_millis(2));
-        }
-        let kill = Command::new("sh").arg("-c").arg(format!("kill -{signal} {}", child.id())).status().unwrap();
-        assert!(kill.success());
+    for (name, code) in [("INT", 130), ("TERM", 143)] {
+        let run = dir.path().join(name);
+        let child = started(&arguments(&scan, &run, steps, &["--checkpoint-every", "1h"]));
+        wait_for(&run.join("metrics.jsonl"));
+        signal(&child, name);
         let output = child.wait_with_output().unwrap();
         let said = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(code), "{said}");
@@ -163,13 +151,12 @@ fn interrupted_passes_lose_no_record() {
         finish(&arguments(&whole, &[]));
         for &after in afters {
             let run = dir.path().join(format!("{name}-{after}"));
-            let mut child = start(&arguments(&run, &["--checkpoint-every", "1h"]));
+            let mut child = started(&arguments(&run, &["--checkpoint-every", "1h"]));
             let lines = || std::fs::read_to_string(run.join("metrics.jsonl")).map_or(0, |text| text.lines().count());
             while lines() < after && child.try_wait().unwrap().is_none() {
                 std::thread::sleep(Duration::from_millis(1));
             }
-            let kill = Command::new("sh").arg("-c").arg(format!("kill -INT {}", child.id())).status().unwrap();
-            assert!(kill.success(), "{name} was over before it could be interrupted");
+            signal(&child, "INT");
             assert_eq!(child.wait().unwrap().code(), Some(130), "{name}");
             let before = lines();
             finish(&arguments(&run, &["--resume"]));
@@ -202,12 +189,9 @@ fn another_run_s_checkpoint_and_none_are_refused_in_words() {
         refused(1, &all.iter().map(String::as_str).collect::<Vec<_>>())
     };
     assert!(resume(9, &[]).contains("no checkpoint"));
-    let mut child = start(&arguments(&scan, &run, 100_000, &["--checkpoint-every", "0.001s"]));
+    let mut child = started(&arguments(&scan, &run, 100_000, &["--checkpoint-every", "0.001s"]));
     let file = run.join("checkpoint.safetensors");
-    let until = Instant::now() + Duration::from_secs(60);
-    while !file.exists() && Instant::now() < until {
-        std::thread::sleep(Duration::from_millis(2));
-    }
+    wait_for(&file);
     child.kill().unwrap();
     child.wait().unwrap();
     let said = resume(100_000, &["--seed", "1"]);

@@ -1,11 +1,11 @@
 //! Arrays beyond the memory limit: the same bits from less memory, clear refusals, and nothing left behind.
 #![cfg(target_os = "linux")]
 
-use crate::common::{done, json, refused, text};
+use crate::common::{done, json, refused, started, text};
 use crate::memory::scan_of;
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::thread::sleep;
 use std::time::Duration;
 
@@ -72,12 +72,8 @@ fn a_killed_run_leaves_no_scratch_files() {
     let scan = text(&scan_of(dir.path(), 6, 48, 272));
     let (run, scratch) = (dir.path().join("run"), dir.path().join("scratch"));
     fs::create_dir(&scratch).unwrap();
-    let mut child = Command::new(assert_cmd::cargo::cargo_bin("conefield"))
-        .args(["--quiet", "reconstruct", &scan, "--spec", "fista-tv", "-o", &text(&run), "--memory", "256MiB"])
-        .args(["--scratch", &text(&scratch)])
-        .stdout(Stdio::null())
-        .spawn()
-        .unwrap();
+    let args = ["reconstruct", &scan, "--spec", "fista-tv", "-o", &text(&run), "--memory", "256MiB"];
+    let mut child = started(&[&args[..], &["--scratch", &text(&scratch)]].concat());
     let maps = format!("/proc/{}/maps", child.id());
     let mut mapped = false;
     for _ in 0..600 {

@@ -1,12 +1,11 @@
 //! `study`: methods on scans with several seeds, interrupted, shared and repeated.
 
-use crate::common::{conefield, done, json, refused, text};
+use crate::common::{conefield, done, json, read, refused, signal, started, text, times, wait_for};
 use conefield_evaluation::report::Pixels;
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant, SystemTime};
+use std::process::{Child, Command};
 use tempfile::{TempDir, tempdir};
 
 const TINY: &str = "
@@ -30,23 +29,6 @@ fn study(text: &str) -> (TempDir, PathBuf) {
     let path = dir.path().join("tiny.toml");
     fs::write(&path, text).unwrap();
     (dir, path)
-}
-
-fn read(path: &Path) -> Value {
-    serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap()
-}
-
-/// Modification time of every file below `folder`.
-fn times(folder: &Path) -> Vec<(PathBuf, SystemTime)> {
-    let mut all = vec![];
-    for entry in fs::read_dir(folder).unwrap().map(|e| e.unwrap()) {
-        match entry.path().is_dir() {
-            true => all.extend(times(&entry.path())),
-            false => all.push((entry.path(), entry.metadata().unwrap().modified().unwrap())),
-        }
-    }
-    all.sort();
-    all
 }
 
 /// The content of a table except times, memory and paths.
@@ -214,18 +196,7 @@ fn bad_studies_make_no_folder() {
 }
 
 fn start(file: &Path, out: &Path, more: &[&str]) -> Child {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
-    command.args(["--quiet", "study", &text(file), "-o", &text(out)]).args(more);
-    command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
-}
-
-/// Waits until `path` has content.
-fn await_file(path: &Path) {
-    let until = Instant::now() + Duration::from_secs(60);
-    while fs::metadata(path).map_or(0, |m| m.len()) == 0 {
-        assert!(Instant::now() < until, "{} never came", path.display());
-        std::thread::sleep(Duration::from_millis(2));
-    }
+    started(&[&["study", &text(file), "-o", &text(out)], more].concat())
 }
 
 #[cfg(unix)]
@@ -238,14 +209,11 @@ fn shards_come_to_the_serial_table_whatever_kills_them() {
         .replace("steps = 3", "steps = 4000");
     let (dir, file) = study(&long);
     let file = &file;
-    let kill = |signal: &str, child: &Child| {
-        assert!(Command::new("sh").arg("-c").arg(format!("kill -{signal} {}", child.id())).status().unwrap().success());
-    };
     // Interrupted by Ctrl-C and resumed.
     let serial = dir.path().join("serial");
     let first = start(file, &serial, &[]);
-    await_file(&serial.join("runs/head-6views-seed0/SIRT/metrics.jsonl"));
-    kill("INT", &first);
+    wait_for(&serial.join("runs/head-6views-seed0/SIRT/metrics.jsonl"));
+    signal(&first, "INT");
     let output = first.wait_with_output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(130), "{said}");
@@ -260,12 +228,12 @@ fn shards_come_to_the_serial_table_whatever_kills_them() {
     // Two processes at a time in one folder; one is killed and restarted.
     let shared = dir.path().join("shared");
     let shares = ["1/2", "2/2"].map(|s| start(file, &shared, &["--shard", s]));
-    await_file(&shared.join("runs/head-6views-seed0/SIRT/metrics.jsonl"));
+    wait_for(&shared.join("runs/head-6views-seed0/SIRT/metrics.jsonl"));
     // An exclusive user is refused while others share.
     let said = refused(1, &["study", &text(file), "-o", &text(&shared), "--resume"]);
     assert!(said.contains("another conefield is writing"), "{said}");
     let [one, two] = shares;
-    kill("KILL", &two);
+    signal(&two, "KILL");
     assert!(!two.wait_with_output().unwrap().status.success());
     let again = start(file, &shared, &["--shard", "2/2"]).wait_with_output().unwrap();
     assert!(again.status.success(), "{}", String::from_utf8_lossy(&again.stderr));

@@ -1,6 +1,6 @@
 //! `tradeoff`: halving, a front without dominated points, specs that run, and `--resume` without repetition.
 
-use crate::common::{conefield, done, json, refused, text};
+use crate::common::{conefield, done, json, read, refused, signal, started, text, words};
 use conefield_evaluation::report::Pixels;
 use serde_json::Value;
 use std::fs;
@@ -38,14 +38,6 @@ fn line(scan: &Path, levers: &Path, out: &Path, more: &[&str]) -> Vec<String> {
     [&all[..], &["--candidates", "5"], more].concat().iter().map(|w| w.to_string()).collect()
 }
 
-fn words(line: &[String]) -> Vec<&str> {
-    line.iter().map(String::as_str).collect()
-}
-
-fn read(path: &Path) -> Value {
-    serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap()
-}
-
 fn names(list: &Value) -> Vec<&str> {
     list.as_array().unwrap().iter().map(|n| n.as_str().unwrap()).collect()
 }
@@ -53,17 +45,15 @@ fn names(list: &Value) -> Vec<&str> {
 /// The trials of a search that is interrupted after two of them.
 #[cfg(unix)]
 fn interrupted(first: &[String], out: &Path) -> Vec<Value> {
-    use std::process::{Command, Stdio};
     use std::time::{Duration, Instant};
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin("conefield"));
-    let child = command.arg("--quiet").args(first).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let child = started(first);
     let state = out.join("tradeoff.json");
     let until = Instant::now() + Duration::from_secs(60);
     let trials = || if state.is_file() { read(&state)["trials"].as_array().unwrap().clone() } else { vec![] };
     while trials().len() < 2 && Instant::now() < until {
         std::thread::sleep(Duration::from_millis(5));
     }
-    assert!(Command::new("sh").arg("-c").arg(format!("kill -INT {}", child.id())).status().unwrap().success());
+    signal(&child, "INT");
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(130), "{said}");

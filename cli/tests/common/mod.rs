@@ -2,7 +2,10 @@
 
 use assert_cmd::Command;
 use serde_json::Value;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Stdio};
+use std::time::{Duration, Instant, SystemTime};
+use tempfile::TempDir;
 
 /// The command with `args`, quiet, without the plugins of the user who runs the tests.
 pub fn conefield(args: &[&str]) -> Command {
@@ -39,4 +42,64 @@ pub fn refused(code: i32, args: &[&str]) -> String {
 #[allow(dead_code)]
 pub fn text(path: &Path) -> String {
     path.display().to_string()
+}
+
+/// A new folder, and in it a scan of `views` views of `size`² pixels of a head of `size`³ voxels.
+#[allow(dead_code)]
+pub fn simulated(size: usize, views: usize) -> (TempDir, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scan");
+    let (phantom, views, detector) = (format!("phantom:head:{size}"), views.to_string(), format!("{size}x{size}"));
+    done(&["simulate", &phantom, "-o", &text(&path), "--views", &views, "--detector", &detector]);
+    (dir, path)
+}
+
+/// A file of JSON.
+#[allow(dead_code)]
+pub fn read(path: &Path) -> Value {
+    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
+
+/// The words of a command line.
+#[allow(dead_code)]
+pub fn words(line: &[String]) -> Vec<&str> {
+    line.iter().map(String::as_str).collect()
+}
+
+/// Modification time of every file below `folder`.
+#[allow(dead_code)]
+pub fn times(folder: &Path) -> Vec<(PathBuf, SystemTime)> {
+    let mut all = vec![];
+    for entry in std::fs::read_dir(folder).unwrap().map(|e| e.unwrap()) {
+        match entry.path().is_dir() {
+            true => all.extend(times(&entry.path())),
+            false => all.push((entry.path(), entry.metadata().unwrap().modified().unwrap())),
+        }
+    }
+    all.sort();
+    all
+}
+
+/// The command with `args`, running; its output can be read at its end.
+#[allow(dead_code)]
+pub fn started<A: AsRef<std::ffi::OsStr>>(args: &[A]) -> Child {
+    let mut command = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"));
+    command.arg("--quiet").args(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+}
+
+/// Waits until the file has content.
+#[allow(dead_code)]
+pub fn wait_for(file: &Path) {
+    let until = Instant::now() + Duration::from_secs(60);
+    while std::fs::metadata(file).map_or(0, |m| m.len()) == 0 {
+        assert!(Instant::now() < until, "{} never came", file.display());
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// Sends a signal, such as INT, to a process that is still running.
+#[allow(dead_code)]
+pub fn signal(child: &Child, name: &str) {
+    let (name, id) = (format!("-{name}"), child.id().to_string());
+    assert!(std::process::Command::new("kill").args([name, id]).status().unwrap().success());
 }

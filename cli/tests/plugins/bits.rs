@@ -2,7 +2,7 @@
 //! a kill.
 
 use crate::build::example;
-use crate::common::{conefield, done, json, refused, text};
+use crate::common::{conefield, done, json, refused, started, text};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::{Backend, BlockWork, Work};
 use conefield_core::method::{Context, Job, Limits, Silent};
@@ -88,8 +88,7 @@ impl Place {
 
 /// Runs the command with `args`, and kills it after its first checkpoint.
 fn kill_after(checkpoint: &Path, args: &[&str]) {
-    let mut command = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"));
-    let mut child = command.arg("--quiet").args(args).spawn().unwrap();
+    let mut child = started(args);
     while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
         std::thread::sleep(std::time::Duration::from_millis(1));
     }
