@@ -76,8 +76,10 @@ impl RunFolder {
         let mut strange = vec![];
         for entry in entries {
             let path = entry.map_err(|e| Error::io(path, e))?.path();
-            strange
-                .extend((!known(&path)).then(|| path.file_name().unwrap_or_default().to_string_lossy().into_owned()));
+            // A spec without a record beside it is the user's.
+            let own = path.ends_with("spec.toml") && !self.0.path().join("metrics.jsonl").exists();
+            let is_strange = !known(&path) || own;
+            strange.extend(is_strange.then(|| path.file_name().unwrap_or_default().to_string_lossy().into_owned()));
         }
         if let Some(other) = strange.iter().min() {
             let found = format!("a folder with {other} in it");

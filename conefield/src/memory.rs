@@ -243,8 +243,8 @@ impl Run {
             buffers: needs.backend + needs.working / ranks::count() as u64 + checkpoint,
             ..Memory::default()
         };
-        // A result is held whole for scoring.
-        let volume = if self.reference { voxels } else { iterate };
+        // A result is held whole for scoring, beside the method's own volume.
+        let volume = iterate + if self.reference { voxels } else { 0 };
         let buffers = needs.evaluating + SLAB_BYTES + checkpoint;
         let exporting = Memory { scan: projections, volume, buffers, ..solving };
         Memory::most(&[reading, comparing, splitting, surrounding, solving, exporting])

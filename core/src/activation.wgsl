@@ -1,11 +1,11 @@
-// Activations as in activation.rs: value and derivative.
+// Activations as in activation.rs: value and derivative. Comparisons keep NaN, which `min` and `max` may drop.
 
 fn stage_none(x: f32) -> vec2<f32> {
     return vec2<f32>(x, 1.0);
 }
 
 fn stage_relu(x: f32) -> vec2<f32> {
-    return vec2<f32>(max(x, 0.0), select(0.0, 1.0, x > 0.0));
+    return vec2<f32>(select(x, 0.0, x <= 0.0), select(0.0, 1.0, x > 0.0));
 }
 
 fn stage_leaky_relu(x: f32) -> vec2<f32> {
@@ -31,15 +31,15 @@ fn stage_squareplus(x: f32) -> vec2<f32> {
 }
 
 fn stage_logistic(x: f32) -> f32 {
-    let e = exp(-min(abs(x), 87.0));
+    let e = exp(-select(abs(x), 87.0, abs(x) > 87.0));
     return select(e, 1.0, x >= 0.0) / (1.0 + e);
 }
 
 fn stage_softplus(x: f32) -> vec2<f32> {
     // ln(1 + e) by its series if 1 + e would lose digits of e.
-    let e = exp(-min(abs(x), 87.0));
+    let e = exp(-select(abs(x), 87.0, abs(x) > 87.0));
     let log = select(log(1.0 + e), e * (1.0 - e * (0.5 - e * (1.0 / 3.0 - e * 0.25))), e < 0.03);
-    return vec2<f32>(max(x, 0.0) + log, stage_logistic(x));
+    return vec2<f32>(select(x, 0.0, x <= 0.0) + log, stage_logistic(x));
 }
 
 fn stage_sigmoid(x: f32) -> vec2<f32> {

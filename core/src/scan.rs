@@ -7,6 +7,19 @@ use crate::parallel;
 use ndarray::{Array3, ArrayView2, s};
 use serde::{Deserialize, Serialize};
 
+/// A step through `len` pixels of views with this many columns that visits at least `some` of them, in all columns: a step
+/// with a factor of the columns would leave out some of them in every row.
+pub fn stride(len: usize, some: usize, columns: usize) -> usize {
+    let divisor = |mut a: usize, mut b: usize| {
+        while b > 0 {
+            (a, b) = (b, a % b);
+        }
+        a
+    };
+    let least = (len / some.max(1)).max(1);
+    (least..).find(|step| divisor(*step, columns) <= 1).unwrap_or(1)
+}
+
 /// The length unit of the scan's data set. The program uses mm and 1/mm; volumes are written in `1/unit`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -51,9 +51,9 @@ fn compare(scores: &Scores, golden: &Value) {
     close("ssim_3d", scores.ssim_3d.unwrap(), &golden["ssim_3d"]);
     close("ssim_skimage", scores.ssim_skimage.unwrap(), &golden["ssim_skimage"]);
     let json = serde_json::to_value(scores).unwrap();
-    for (found, expected) in
-        json["worst_slices"].as_array().unwrap().iter().zip(golden["worst_slices"].as_array().unwrap())
-    {
+    let [found, expected] = [&json, golden].map(|scores| scores["worst_slices"].as_array().unwrap());
+    assert_eq!(found.len(), expected.len());
+    for (found, expected) in found.iter().zip(expected) {
         assert_eq!((&found["axis"], &found["index"]), (&expected["axis"], &expected["index"]));
         close("worst slice", found["psnr"].as_f64().unwrap(), &expected["psnr"]);
     }

@@ -6,6 +6,7 @@
 
 use crate::atomic::{exchange, parent, sweep, sync_folder};
 use crate::lock::{self, Held};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, TryLockError};
@@ -45,6 +46,8 @@ pub struct Lease {
     path: PathBuf,
     contents: Contents,
     locks: Vec<File>,
+    /// Whether there was no folder when it was taken.
+    missing: bool,
     /// Whether this process has begun to write.
     writing: bool,
     /// Whether this process created the folder.
@@ -96,7 +99,8 @@ impl Lease {
         let path = path.as_path();
         let locks = own(path)?;
         await_parts(path, contents)?;
-        let mut lease = Self { path: path.to_path_buf(), contents, locks, writing: false, made: false };
+        let missing = !path.is_dir();
+        let mut lease = Self { path: path.to_path_buf(), contents, locks, missing, writing: false, made: false };
         lease.settle()?;
         // A folder that was put back has its own lock.
         let more = own_again(&lease)?;
@@ -119,6 +123,18 @@ impl Lease {
     pub fn replace(&mut self) -> Result<()> {
         let at = |e| Error::io(&self.path, e);
         fs::create_dir_all(parent(&self.path)).map_err(at)?;
+        if self.missing && self.path.is_dir() {
+            // Another process has made it since, and may still write.
+            self.locks = own(&self.path)?;
+            let place = self.path.display().to_string();
+            ensure(
+                self.progressed() == Progressed::Nothing,
+                &place,
+                "output",
+                "what another command wrote",
+                "a new folder",
+            )?;
+        }
         if !self.path.is_dir() {
             fs::create_dir(&self.path).map_err(at)?;
             self.locks = own(&self.path)?;
@@ -262,7 +278,7 @@ impl SharedLease {
                 Err(TryLockError::Error(e)) => return Err(at(e)),
             }
         }
-        Ok(Some(Lease { path, contents, locks, writing: false, made: false }))
+        Ok(Some(Lease { path, contents, locks, missing: false, writing: false, made: false }))
     }
 }
 

@@ -113,7 +113,7 @@ for name in ['Int8', 'UInt8', 'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UI
 ";
     run(&python, dir.path(), script);
     for packed in 0..2 {
-        for end in ["mha", "mhd", "nii", "nii.gz"] {
+        for end in ["mha", "mhd", "nii", "nii.gz", "nrrd", "nhdr"] {
             let name = format!("{packed}.{end}");
             assert_same(&read_volume(dir.path().join(&name)).unwrap(), &v, 1e-5, &name);
         }

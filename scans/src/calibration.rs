@@ -219,22 +219,18 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     for (parameter, pixels, steps, most) in ranges.into_iter().filter(|r| asked.contains(&r.0)) {
         at = coarse.scan(parameter, at, pixels, steps, most)?;
     }
-    // The geometry is now accurate enough to choose the voxels. The coarsest level gets new ones too.
-    let mut levels = vec![];
-    for &width in &widths {
-        let level = Level::new(scan, width, FOLDS, &at)?;
-        if width != finest {
-            at = Search { level: &level, ..coarse }.refine(&asked, at, 4)?.correction;
-        }
-        levels.push(level);
-    }
+    let (levels, at) = descend(scan, &widths, &coarse, &asked, at)?;
     let last = Search { level: &levels[levels.len() - 1], ..coarse };
     let (mut found, mut fit) = settled(&last, last.refine(&asked, at, 4)?, scan, opposite.as_ref())?;
+    // Pairs of views in a corrected geometry, and what they say.
+    let by_pairs_at = |at: Correction| -> Result<_> {
+        let made = Consistency::new(scan, FINER * finest, &at)?;
+        let (results, corrected) = compare_pairs(&Newton { pairs: &made, meter: &meter }, &paired, at, scan)?;
+        Ok((made, results, corrected))
+    };
     let mut by_pairs = vec![];
     if pairs.is_some() {
-        let made = Consistency::new(scan, FINER * finest, &fit.correction)?;
-        let (results, corrected) =
-            compare_pairs(&Newton { pairs: &made, meter: &meter }, &paired, fit.correction, scan)?;
+        let (made, results, corrected) = by_pairs_at(fit.correction)?;
         if results.iter().any(|f| f.verdict == Verdict::Corrected) {
             // The results of the first search belong to another geometry.
             fit = last.refine(&asked, corrected, 4)?;
@@ -252,8 +248,8 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     found.extend(again);
     let (mut correction, mut after) = (fit.correction, fit.prediction.error);
     if by_pairs.iter().any(|f| f.verdict == Verdict::Corrected) {
-        let made = Consistency::new(scan, FINER * finest, &correction)?;
-        (by_pairs, correction) = compare_pairs(&Newton { pairs: &made, meter: &meter }, &paired, correction, scan)?;
+        let made;
+        (made, by_pairs, correction) = by_pairs_at(correction)?;
         after = fine.predict(&correction)?.error;
         pairs = Some(made);
     }
@@ -262,17 +258,48 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     found.sort_by_key(|f| f.parameter);
     if settings.curves {
         let middle = Search { level: &levels[levels.len().saturating_sub(2)], ..coarse };
-        for f in &mut found {
-            f.curve = match &pairs {
-                Some(pairs) if f.parameter.by_pairs() => {
-                    let newton = Newton { pairs, meter: &meter };
-                    curve(f, &pairs.geometry, |values| newton.along(f.parameter, correction, values))?
-                }
-                _ => curve(f, &middle.level.geometry, |values| middle.along(f.parameter, correction, values))?,
-            };
-        }
+        put_curves(&mut found, &middle, pairs.as_ref(), correction)?;
     }
     Ok(Calibration { correction, held_out: [before, after], found, bin: level.bin, views: fit.prediction.views.len() })
+}
+
+/// The levels from the coarsest to the finest, and the correction that all but the finest lead to. The geometry is accurate
+/// enough to choose their voxels.
+fn descend(
+    scan: &Scan,
+    widths: &[usize],
+    coarse: &Search<'_>,
+    asked: &[Parameter],
+    mut at: Correction,
+) -> Result<(Vec<Level>, Correction)> {
+    let mut levels = vec![];
+    for (i, &width) in widths.iter().enumerate() {
+        let level = Level::new(scan, width, FOLDS, &at)?;
+        if i + 1 < widths.len() {
+            at = Search { level: &level, ..*coarse }.refine(asked, at, 4)?.correction;
+        }
+        levels.push(level);
+    }
+    Ok((levels, at))
+}
+
+/// Adds the criterion along each parameter, on the pixels of `middle` or on pairs of views.
+fn put_curves(
+    found: &mut [Found],
+    middle: &Search<'_>,
+    pairs: Option<&Consistency>,
+    correction: Correction,
+) -> Result<()> {
+    for f in found {
+        f.curve = match pairs {
+            Some(pairs) if f.parameter.by_pairs() => {
+                let newton = Newton { pairs, meter: middle.meter };
+                curve(f, &pairs.geometry, |values| newton.along(f.parameter, correction, values))?
+            }
+            _ => curve(f, &middle.level.geometry, |values| middle.along(f.parameter, correction, values))?,
+        };
+    }
+    Ok(())
 }
 
 /// A change is worth a warning above this many pixels, and if it lowers the held-out error below this share.

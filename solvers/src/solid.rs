@@ -151,7 +151,10 @@ impl<'a> Rows<'a> {
         let all = g.views.len() * rows;
         // Whole rows, so that edges are found; other rows in each view.
         let row = |i: usize| (i / rows, (i + i / rows) % rows);
-        let rows: Vec<_> = (0..all).step_by((all * columns).div_ceil(RAYS).max(1)).map(row).collect();
+        let step = (all * columns).div_ceil(RAYS).max(1);
+        // A step that ends in the same row of every view is one row longer.
+        let step = if rows > 2 && step % rows == rows - 1 { step + 1 } else { step };
+        let rows: Vec<_> = (0..all).step_by(step).map(row).collect();
         let object = Blocks::of(scan).object();
         let values = rows.iter().flat_map(|&(view, row)| scan.view(view).row(row).to_vec());
         let mut high: Vec<f32> = values.filter(|p| *p > object).collect();

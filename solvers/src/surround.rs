@@ -118,7 +118,9 @@ impl Around {
     fn of(scan: &Scan, settings: CoarseSurround) -> Result<(Option<Self>, String)> {
         let (g, blocks) = (&scan.geometry, Blocks::of(scan));
         let n = g.views.len();
-        let cut: Vec<[bool; 2]> = (0..n).map(|v| [blocks.cut(v, 0), blocks.cut(v, 1)]).collect();
+        // A detector of one row says nothing about what is above and below.
+        let tall = g.detector[0] > 1;
+        let cut: Vec<[bool; 2]> = (0..n).map(|v| [tall && blocks.cut(v, 0), blocks.cut(v, 1)]).collect();
         let some = cut.iter().filter(|c| c.contains(&true)).count();
         let outside = Outside::of(scan, blocks.object());
         if some == 0 && !outside.is_seen() {

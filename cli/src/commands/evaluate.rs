@@ -19,7 +19,7 @@ use std::path::PathBuf;
 /// A volume gets PSNR, RMSE and three SSIMs, material the Matthews correlation coefficient, label maps Dice.
 ///
 /// ssim_2d: 11x11 Gaussian window on slices of three axes (R2-Gaussian). ssim_3d: 11x11x11 Gaussian window (NI-NeRF).
-/// ssim_skimage: 7x7 uniform window on slices of three axes (scikit-image, NAF).
+/// ssim_skimage: 7x7 uniform window on slices of three axes (scikit-image).
 ///
 /// Dice is 2|A∩B|/(|A|+|B|) over the voxels of a label. Label 0 is background. A label in only one of the maps scores 0
 /// and counts in the mean.

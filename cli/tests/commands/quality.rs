@@ -61,3 +61,34 @@ fn every_shipped_field_makes_a_volume() {
     }
     assert!(faults.is_empty(), "{}", faults.join("\n"));
 }
+
+/// Every other shipped spec, with its own settings, on a scan that takes seconds.
+#[test]
+fn every_shipped_method_on_voxels_makes_a_volume() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| text(&dir.path().join(name));
+    done(&["simulate", "phantom:head:32", "-o", &at("scan"), "--views", "24", "--detector", "48x48"]);
+    let truth = conefield_io::read_volume(dir.path().join("scan/truth.nii.gz")).unwrap().data;
+    let square = truth.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / truth.len() as f64;
+    let mut tried = 0;
+    for name in SHIPPED.iter().map(|s| s.name).filter(|name| RUNS.iter().all(|(run, ..)| run != name)) {
+        let fewer = match name {
+            "smooth-gaussians" => {
+                &["methods.3.start.count=300", "methods.3.most=400", "methods.3.training.steps=60"][..]
+            }
+            "field-tv" | "accurate-tv" => &["methods.0.training.steps=100", "methods.0.encoder.log2_table_size=12"],
+            "nerf" => continue,
+            _ => &[],
+        };
+        let (scan, run) = (at("scan"), at(name));
+        let mut args = vec!["reconstruct", &scan, "--spec", name, "-o", &run, "--reference", "truth", "--json"];
+        args.extend(fewer.iter().flat_map(|set| ["--set", *set]));
+        let record = json(&args);
+        let number = |key: &str| record["scores"][key].as_f64().unwrap();
+        let empty = 10.0 * (number("peak").powi(2) / square).log10();
+        println!("{name}: {:.2} dB, empty {empty:.2}, {:.1} s", number("psnr"), record["total_s"].as_f64().unwrap());
+        assert!(number("psnr") > empty + 5.0, "{name}: {:.2} dB, empty {empty:.2}", number("psnr"));
+        tried += 1;
+    }
+    assert!(tried >= 8, "{tried} specs");
+}

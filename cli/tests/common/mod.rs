@@ -84,6 +84,7 @@ pub fn times(folder: &Path) -> Vec<(PathBuf, SystemTime)> {
 #[allow(dead_code)]
 pub fn started<A: AsRef<std::ffi::OsStr>>(args: &[A]) -> Child {
     let mut command = std::process::Command::new(assert_cmd::cargo::cargo_bin("conefield"));
+    command.env_remove("CONEFIELD_PLUGIN_PATH").env("XDG_DATA_HOME", env!("CARGO_TARGET_TMPDIR"));
     command.arg("--quiet").args(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
 }
 

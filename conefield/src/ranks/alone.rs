@@ -17,11 +17,14 @@ impl Joined {
 /// # Errors
 /// `mpirun` has started several.
 pub fn start() -> Result<Option<Joined>> {
-    match std::env::var("OMPI_COMM_WORLD_SIZE") {
-        Ok(count) if count != "1" => {
+    // Slurm sets the number of tasks also for a script; a rank tells that `srun --mpi` has started this process.
+    let ranked = ["PMI_RANK", "PMIX_RANK"].iter().any(|name| std::env::var_os(name).is_some());
+    let counts = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"].into_iter().chain(ranked.then_some("SLURM_NTASKS"));
+    match counts.filter_map(|name| std::env::var(name).ok()).find(|count| count != "1") {
+        Some(count) => {
             let what = format!("{count} processes: this program is built without conefield's feature `mpi`");
             Err(Error::unsupported("mpirun", what))
         }
-        _ => Ok(None),
+        None => Ok(None),
     }
 }

@@ -11,12 +11,21 @@ use mpi::traits::{Communicator, CommunicatorCollectives};
 use std::sync::Arc;
 
 /// The connection to the other processes. Dropped, it waits for them.
-pub struct Joined(#[expect(dead_code, reason = "ends MPI when dropped")] Universe);
+pub struct Joined(Option<Universe>);
 
 impl Joined {
     /// Ends the other processes with this one: the launcher does, when one ends without leave.
     pub fn abandon(self) {
         std::mem::forget(self);
+    }
+}
+
+impl Drop for Joined {
+    /// After a panic the others wait in vain: they are ended.
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            std::mem::forget(self.0.take());
+        }
     }
 }
 
@@ -38,7 +47,7 @@ pub fn start() -> Result<Option<Joined>> {
     let world = universe.world();
     let [rank, count] = [world.rank(), world.size()].map(|n| usize::try_from(n).unwrap_or(0));
     super::join(Arc::new(World { rank, count }));
-    Ok(Some(Joined(universe)))
+    Ok(Some(Joined(Some(universe))))
 }
 
 /// All processes.

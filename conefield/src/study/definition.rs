@@ -307,6 +307,8 @@ impl Reading<'_> {
         let free = cases.iter().all(|c| c.name.to_lowercase() != case.name.to_lowercase());
         let found = format!("{:?}, the name of another one", case.name);
         ensure(free, &self.at(entry), "name", found, "a unique name, for table and folders")?;
+        let other = case.name.to_lowercase() != "all";
+        ensure(other, &self.at(entry), "name", &case.name, "another name: the table calls the mean of all cases so")?;
         cases.push(case);
         Ok(())
     }

@@ -80,11 +80,12 @@ impl Costs {
 
 /// Measures the costs of a plan in about `seconds`.
 pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs> {
-    // Passes get all of it: a single coarse scan cannot separate proportional from constant costs, and passes would
-    // seem three times as expensive.
+    // Passes get all of it, divided among the methods of a chain: a single coarse scan cannot separate proportional from
+    // constant costs, and passes would seem three times as expensive.
+    let passes = seconds / plan.links().len().max(1) as f64;
     let measured = |plan: &mut dyn Plan, share: f64, later: bool| match plan.pipeline() {
         Some(_) => field(bench, plan, share * seconds, later),
-        None => voxels(bench, plan, seconds),
+        None => voxels(bench, plan, passes),
     };
     let solved = match plan.links() {
         [] => measured(plan, 0.5, false)?,

@@ -71,11 +71,15 @@ impl Draft {
     fn layered(layer: Layer, sets: &[String], shipped: &[Shipped]) -> Result<Self> {
         let source = layer.label();
         let mut written = layer.resolve(shipped, &[], &mut Work::new(MOST_LAYERS))?;
-        let mut sets = sets.iter().map(|s| Set::parse(s)).collect::<Result<Vec<_>>>()?;
-        // A new type clears the keys of the old one, so it is applied before the keys beside it, whatever the order on
-        // the line.
-        sets.sort_by_key(|s| (s.path.len(), s.path.last().is_some_and(|k| k != "type")));
+        // The last one wins. Only a new type, which clears the keys of the old one, comes before the keys of that stage,
+        // whatever the order on the line.
+        let mut ordered: Vec<Set> = vec![];
         for set in sets {
+            let set = Set::parse(set)?;
+            let before = set.stage().and_then(|stage| ordered.iter().position(|s| s.path.starts_with(stage)));
+            ordered.insert(before.unwrap_or(ordered.len()), set);
+        }
+        for set in ordered {
             set.apply(&mut written)?;
         }
         Ok(Self { written, source })
@@ -343,6 +347,14 @@ impl Set {
         };
         let value = at_everywhere(Node { at: at.clone(), kind }, &at);
         Ok(Self { path: path.split('.').map(str::to_owned).collect(), value, at })
+    }
+
+    /// The stage whose type it may set: by the key `type`, or by a name.
+    fn stage(&self) -> Option<&[String]> {
+        match self.path.split_last() {
+            Some((last, stage)) if last == "type" => Some(stage),
+            _ => matches!(self.value.kind, Is::String(_)).then_some(&self.path[..]),
+        }
     }
 
     /// Sets the value in `tree`.

@@ -29,6 +29,12 @@ fn setting(node: &mut Node, schema: &Value, cx: &Context<'_>) {
         Is::Table(entries) => entries,
         _ => return,
     };
+    // A table over a setting that is a word: the word was spelled out like the name of a stage.
+    let typed = alternatives(schema, cx).iter().any(|s| s["properties"].get("type").is_some());
+    let named = |e: &Entry| groups(schema, cx).iter().any(|group| group.contains(&&*e.key));
+    if !typed && entries.iter().any(|e| e.key != "type" && named(e)) {
+        entries.retain(|e| e.key != "type");
+    }
     for group in groups(schema, cx) {
         let said = |key: &str, value: &Node| group.contains(&key) && value.kind != Is::Null;
         let upper = entries.iter().filter(|e| said(&e.key, &e.value)).map(|e| e.at.depth()).min();

@@ -28,8 +28,9 @@ pub fn ssim_3d(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -
     gaussian_volume(result, reference, peak)
 }
 
-/// SSIM as reported by NAF: scikit-image's default per slice (7×7 uniform, sample covariance, without the border of 3
-/// pixels), mean over slices, then over the three axes. Refuses volumes smaller than the window.
+/// SSIM by scikit-image's default per slice (7×7 uniform, sample covariance, without the border of 3 pixels), mean over
+/// slices, then over the three axes. NAF's published code passes whole volumes to the same function: a window of 7×7×7,
+/// and a data range of 2. Refuses volumes smaller than the window.
 pub fn ssim_skimage(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::pair(result, reference, peak)?;
     uniform_slices(result, reference, peak)

@@ -10,11 +10,13 @@ fn stage_attention(x: ptr<function, array<f32, stage_WIDTH>>) -> array<f32, stag
         for (var c = 0u; c < stage_WIDTH; c++) {
             a[l] += stage_param(l * stage_WIDTH + c) * (*x)[c];
         }
-        top = select(max(top, a[l]), a[l], l == 0u);
+        top = select(top, a[l], l == 0u || !(a[l] <= top));
     }
     var sum = 0.0;
     for (var l = 0u; l < stage_LEVELS; l++) {
-        a[l] = exp(max(a[l] - top, -87.0));
+        // NaN stays.
+        let less = a[l] - top;
+        a[l] = exp(select(less, -87.0, less < -87.0));
         sum += a[l];
     }
     for (var l = 0u; l < stage_LEVELS; l++) {

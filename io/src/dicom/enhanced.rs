@@ -82,84 +82,44 @@ fn put_group(object: &mut InMemDicomObject, tag: Tag, elements: &[(Tag, VR, &str
     sequence(object, tag, vec![item(elements)]);
 }
 
+/// Attributes of a series that functional groups of all frames hold, by group.
+const OF_ALL_FRAMES: [(Tag, &[(Tag, VR)]); 4] = [
+    (MEASURES, &[(Tag(0x18, 0x50), VR::DS), (Tag(0x18, 0x88), VR::DS), (Tag(0x28, 0x30), VR::DS)]),
+    (ORIENTATION, &[(Tag(0x20, 0x37), VR::DS)]),
+    (Tag(0x28, 0x9132), &[(Tag(0x28, 0x1050), VR::DS), (Tag(0x28, 0x1051), VR::DS), (Tag(0x28, 0x1056), VR::CS)]),
+    (TRANSFORMATION, &[(Tag(0x28, 0x1052), VR::DS), (Tag(0x28, 0x1053), VR::DS), (Tag(0x28, 0x1054), VR::LO)]),
+];
+
+/// Attributes of a series that belong to single slices, or to a scanner.
+const OF_NO_FRAME: [Tag; 2] = [Tag(0x18, 0x60), Tag(0x20, 0x12)];
+
+/// The kind of the images.
+const KIND: &str = "DERIVED\\PRIMARY\\VOLUME\\NONE";
+
+/// How the images are to be seen.
+const LOOK: [(Tag, VR, &str); 3] = [
+    (Tag(0x8, 0x9205), VR::CS, "MONOCHROME"),
+    (Tag(0x8, 0x9206), VR::CS, "VOLUME"),
+    (Tag(0x8, 0x9207), VR::CS, "NONE"),
+];
+
+/// The anatomy, which is required and not known.
+const BODY: [(Tag, VR, &str); 3] =
+    [(Tag(0x8, 0x100), VR::SH, "38266002"), (Tag(0x8, 0x102), VR::SH, "SCT"), (Tag(0x8, 0x104), VR::LO, "Entire body")];
+
 /// Moves the attributes of a series into functional groups, and adds those that only this kind of image has.
 fn whole(series: &Series, frames: usize) -> InMemDicomObject {
     let mut o = series.shared.clone();
-    let mut taken = |group, element| {
-        let tag = Tag(group, element);
-        let value = o.get(tag).and_then(|e| e.to_str().ok()).unwrap_or_default().into_owned();
-        o.remove_element(tag);
-        value
-    };
-    let mut shared = InMemDicomObject::new_empty();
-    let (spacing, thickness) = (taken(0x28, 0x30), taken(0x18, 0x50));
-    let measures = [
-        (Tag(0x18, 0x50), VR::DS, &thickness[..]),
-        (Tag(0x18, 0x88), VR::DS, &taken(0x18, 0x88)),
-        (Tag(0x28, 0x30), VR::DS, &spacing),
-    ];
-    put_group(&mut shared, MEASURES, &measures);
-    put_group(&mut shared, ORIENTATION, &[(Tag(0x20, 0x37), VR::DS, &taken(0x20, 0x37))]);
-    let window = [
-        (Tag(0x28, 0x1050), VR::DS, &taken(0x28, 0x1050)[..]),
-        (Tag(0x28, 0x1051), VR::DS, &taken(0x28, 0x1051)),
-        (Tag(0x28, 0x1056), VR::CS, &taken(0x28, 0x1056)),
-    ];
-    put_group(&mut shared, Tag(0x28, 0x9132), &window);
-    let rescale = [
-        (Tag(0x28, 0x1052), VR::DS, &taken(0x28, 0x1052)[..]),
-        (Tag(0x28, 0x1053), VR::DS, &taken(0x28, 0x1053)),
-        (Tag(0x28, 0x1054), VR::LO, &taken(0x28, 0x1054)),
-    ];
-    put_group(&mut shared, TRANSFORMATION, &rescale);
-    // Belong to single slices, or to a scanner.
-    for (group, element) in [(0x18, 0x60), (0x20, 0x12)] {
-        taken(group, element);
-    }
-    let kind = "DERIVED\\PRIMARY\\VOLUME\\NONE";
-    let look = [
-        (Tag(0x8, 0x9205), VR::CS, "MONOCHROME"),
-        (Tag(0x8, 0x9206), VR::CS, "VOLUME"),
-        (Tag(0x8, 0x9207), VR::CS, "NONE"),
-    ];
-    put_group(&mut shared, Tag(0x18, 0x9329), &[&[(Tag(0x8, 0x9007), VR::CS, kind)][..], &look].concat());
-    // The anatomy is required and not known.
-    let body = [
-        (Tag(0x8, 0x100), VR::SH, "38266002"),
-        (Tag(0x8, 0x102), VR::SH, "SCT"),
-        (Tag(0x8, 0x104), VR::LO, "Entire body"),
-    ];
-    let mut anatomy = item(&[(Tag(0x20, 0x9072), VR::CS, "U")]);
-    put_group(&mut anatomy, Tag(0x8, 0x2218), &body);
-    sequence(&mut shared, Tag(0x20, 0x9071), vec![anatomy]);
-
-    let frame = |k: usize| {
-        let index = PrimitiveValue::from(k as u32 + 1);
-        let mut content = item(&[(Tag(0x20, 0x9056), VR::SH, "1")]);
-        content.put(DataElement::new(IN_STACK, VR::UL, index.clone()));
-        content.put(DataElement::new(Tag(0x20, 0x9157), VR::UL, index));
-        let mut frame = InMemDicomObject::new_empty();
-        sequence(&mut frame, CONTENT, vec![content]);
-        put_group(&mut frame, POSITION, &[(Tag(0x20, 0x32), VR::DS, &numbers(series.position(k)))]);
-        frame
-    };
+    let shared = groups_of_all_frames(&mut o);
     sequence(&mut o, SHARED, vec![shared]);
-    sequence(&mut o, PER_FRAME, (0..frames).map(frame).collect());
-
-    let organization = series.digest.uid("dimensions");
-    let organization = (Tag(0x20, 0x9164), VR::UI, &organization[..]);
-    put_group(&mut o, Tag(0x20, 0x9221), &[organization]);
-    let mut index = item(&[organization]);
-    for (tag, pointed) in [(Tag(0x20, 0x9165), IN_STACK), (Tag(0x20, 0x9167), CONTENT)] {
-        index.put(DataElement::new(tag, VR::AT, PrimitiveValue::from(pointed)));
-    }
-    sequence(&mut o, Tag(0x20, 0x9222), vec![index]);
+    sequence(&mut o, PER_FRAME, (0..frames).map(|k| groups_of_frame(series, k)).collect());
+    put_dimensions(&mut o, &series.digest.uid("dimensions"));
     sequence(&mut o, Tag(0x40, 0x555), vec![]);
     // The date of the content is required: that of the study, or one that is clearly none.
     let date = o.get(Tag(0x8, 0x20)).and_then(|e| e.to_str().ok()).filter(|d| !d.is_empty());
     let date = date.map_or("19700101".to_owned(), |d| d.into_owned());
     for (tag, vr, value) in [
-        (Tag(0x8, 0x8), VR::CS, kind),
+        (Tag(0x8, 0x8), VR::CS, KIND),
         (Tag(0x8, 0x23), VR::DA, &date),
         (Tag(0x8, 0x33), VR::TM, "000000"),
         (Tag(0x8, 0x1090), VR::LO, "conefield"),
@@ -173,8 +133,53 @@ fn whole(series: &Series, frames: usize) -> InMemDicomObject {
     ] {
         text(&mut o, tag, vr, value);
     }
-    look.iter().for_each(|(tag, vr, value)| text(&mut o, *tag, *vr, value));
+    LOOK.iter().for_each(|(tag, vr, value)| text(&mut o, *tag, *vr, value));
     o
+}
+
+/// The functional groups of all frames, with the attributes that are taken out of `series`.
+fn groups_of_all_frames(series: &mut InMemDicomObject) -> InMemDicomObject {
+    let mut shared = InMemDicomObject::new_empty();
+    for (group, attributes) in OF_ALL_FRAMES {
+        let mut item = InMemDicomObject::new_empty();
+        for (tag, vr) in attributes {
+            let value = series.get(*tag).and_then(|e| e.to_str().ok()).unwrap_or_default().into_owned();
+            series.remove_element(*tag);
+            text(&mut item, *tag, *vr, &value);
+        }
+        sequence(&mut shared, group, vec![item]);
+    }
+    for tag in OF_NO_FRAME {
+        series.remove_element(tag);
+    }
+    put_group(&mut shared, Tag(0x18, 0x9329), &[&[(Tag(0x8, 0x9007), VR::CS, KIND)][..], &LOOK].concat());
+    let mut anatomy = item(&[(Tag(0x20, 0x9072), VR::CS, "U")]);
+    put_group(&mut anatomy, Tag(0x8, 0x2218), &BODY);
+    sequence(&mut shared, Tag(0x20, 0x9071), vec![anatomy]);
+    shared
+}
+
+/// The functional groups of frame `k`: its place in the stack.
+fn groups_of_frame(series: &Series, k: usize) -> InMemDicomObject {
+    let index = PrimitiveValue::from(k as u32 + 1);
+    let mut content = item(&[(Tag(0x20, 0x9056), VR::SH, "1")]);
+    content.put(DataElement::new(IN_STACK, VR::UL, index.clone()));
+    content.put(DataElement::new(Tag(0x20, 0x9157), VR::UL, index));
+    let mut frame = InMemDicomObject::new_empty();
+    sequence(&mut frame, CONTENT, vec![content]);
+    put_group(&mut frame, POSITION, &[(Tag(0x20, 0x32), VR::DS, &numbers(series.position(k)))]);
+    frame
+}
+
+/// Says by which attribute frames are ordered.
+fn put_dimensions(o: &mut InMemDicomObject, organization: &str) {
+    let organization = (Tag(0x20, 0x9164), VR::UI, organization);
+    put_group(o, Tag(0x20, 0x9221), &[organization]);
+    let mut index = item(&[organization]);
+    for (tag, pointed) in [(Tag(0x20, 0x9165), IN_STACK), (Tag(0x20, 0x9167), CONTENT)] {
+        index.put(DataElement::new(tag, VR::AT, PrimitiveValue::from(pointed)));
+    }
+    sequence(o, Tag(0x20, 0x9222), vec![index]);
 }
 
 /// An enhanced file without its values.

@@ -12,8 +12,9 @@ fn stage_walk(ray: VoxelRay) {
     let count = max(ceil((inside.y - inside.x) * ray.length * stage_SAMPLES / side), 1.0);
     let step = (inside.y - inside.x) / count;
     let top = vec3<f32>(shape - 1u);
-    for (var i = 0.0; i < count; i += 1.0) {
-        let p = clamp(ray.source + (inside.x + (i + 0.5) * step) * ray.ahead, vec3<f32>(0.0), top);
+    // A counter in f32 would stand still at 2^24.
+    for (var i = 0u; i < u32(count); i++) {
+        let p = clamp(ray.source + (inside.x + (f32(i) + 0.5) * step) * ray.ahead, vec3<f32>(0.0), top);
         let cell = min(floor(p), max(top - 1.0, vec3<f32>(0.0)));
         let f = p - cell;
         for (var c = 0u; c < 8u; c++) {

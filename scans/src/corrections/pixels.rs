@@ -6,7 +6,7 @@ use crate::diagnosis::bad_pixels::outliers;
 use crate::diagnosis::quantiles::{median, quantile};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::parallel;
-use conefield_core::scan::Scan;
+use conefield_core::scan::{Scan, stride};
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 
@@ -119,7 +119,8 @@ fn few(bad: usize, all: usize, what: &str) -> Result<()> {
 
 /// The range of the line integrals, without one percent at either end.
 fn range(values: ArrayView3<'_, f32>) -> f32 {
-    let mut sample: Vec<f32> = values.iter().copied().step_by((values.len() / 1_000_000) | 1).collect();
+    let mut sample: Vec<f32> =
+        values.iter().copied().step_by(stride(values.len(), 1_000_000, values.dim().2)).collect();
     sample.sort_unstable_by(f32::total_cmp);
     let at = |share| quantile(&sample, share).unwrap_or(0.0);
     at(0.99) - at(0.01)

@@ -6,8 +6,8 @@ use ndarray::{Array2, ArrayView2, Axis};
 const PASSES: usize = 3;
 
 /// `image` blurred by a Gaussian with a standard deviation of `sigma` pixels, as three moving averages along each axis.
-/// Values beyond the image are 0. Sums are in double precision, so that adding and subtracting values in a wide average
-/// leaves no error.
+/// The image is mirrored at its borders, so that its sum stays. Sums are in double precision, so that adding and
+/// subtracting values in a wide average leaves no error.
 pub(crate) fn blurred(image: ArrayView2<'_, f32>, sigma: f64) -> Array2<f32> {
     // Three boxes of 2r + 1 pixels have a variance of ((2r + 1)² − 1)/4.
     let reach = ((((4.0 * sigma * sigma + 1.0).sqrt()) - 1.0) / 2.0).round() as usize;
@@ -17,9 +17,15 @@ pub(crate) fn blurred(image: ArrayView2<'_, f32>, sigma: f64) -> Array2<f32> {
     }
     for axis in [Axis(0), Axis(1)] {
         for mut lane in out.lanes_mut(axis) {
-            let mut line = lane.to_vec();
+            let (n, wide) = (lane.len(), PASSES * reach);
+            let mirrored = |i: usize| {
+                // Position among the values forwards and backwards.
+                let i = (i + 2 * n * wide.div_ceil(2 * n) - wide) % (2 * n);
+                lane[if i < n { i } else { 2 * n - 1 - i }]
+            };
+            let mut line: Vec<f32> = (0..n + 2 * wide).map(mirrored).collect();
             (0..PASSES).for_each(|_| line = averaged(&line, reach));
-            lane.iter_mut().zip(&line).for_each(|(x, y)| *x = *y);
+            lane.iter_mut().zip(&line[wide..]).for_each(|(x, y)| *x = *y);
         }
     }
     out
@@ -72,6 +78,17 @@ impl Sums {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_sum_stays_also_at_borders_and_on_one_row() {
+        for shape in [(61, 61), (7, 90), (1, 200), (3, 2)] {
+            let image = Array2::from_shape_fn(shape, |(i, j)| ((3 * i + 5 * j) % 7) as f32);
+            let b = blurred(image.view(), 9.0);
+            assert!((b.sum() / image.sum() - 1.0).abs() < 1e-4, "{shape:?}: {} and {}", b.sum(), image.sum());
+            let even = blurred(Array2::from_elem(shape, 2.0).view(), 9.0);
+            assert!(even.iter().all(|x| (x - 2.0).abs() < 1e-5), "{shape:?}");
+        }
+    }
 
     #[test]
     fn a_point_becomes_a_gaussian() {

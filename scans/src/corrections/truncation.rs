@@ -1,9 +1,10 @@
 //! Extends the views of objects that are wider than the detector.
 
 use crate::corrections::Correct;
+use crate::diagnosis::line_integrals::check_line_integrals;
+use crate::diagnosis::setup::setup;
 use conefield_core::Result;
 use conefield_core::error::ensure;
-use conefield_core::finite::range;
 use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use ndarray::{Array3, ArrayView2, Axis, s};
@@ -17,7 +18,8 @@ const SIDE: usize = 64;
 const AIR: f32 = 0.05;
 
 /// Extends rows that end in the object beyond the detector's sides, by point reflection about the last value, faded to
-/// 0 (Ohnesorge et al., Med. Phys. 27(1), 2000). The detector becomes wider. Without the step at the side, the ramp
+/// 0 (Ohnesorge et al., Med. Phys. 27(1), 2000). The detector becomes wider; one that is shifted on purpose, on a full
+/// circle, only on the far side: what the near side lacks is measured from the opposite direction. Without the step at the side, the ramp
 /// filter of `fdk` makes no bright rim. The new values are not measured: for methods that fit them, use
 /// `scene.surround.coarse` of the spec instead.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -42,7 +44,12 @@ impl Correct for Truncation {
     fn correct(&self, scan: &mut Scan) -> Result<String> {
         let (views, rows, columns) = scan.projections.dim();
         let side = columns.div_ceil(SIDE);
-        let most = range(&scan.projections)[1].max(0.0);
+        let most = check_line_integrals(scan.projections.view()).typical_range[1].max(0.0);
+        let setup = setup(&scan.geometry);
+        let [left, right] = match setup.half_is_enough() {
+            true => [setup.offset_mm[1] < 0.0, setup.offset_mm[1] > 0.0],
+            false => [true; 2],
+        };
         // Averaging some pixels reduces their noise.
         let tall = rows.div_ceil(SIDE);
         let reaches = |view: ArrayView2<'_, f32>, columns: Range<usize>| {
@@ -50,26 +57,37 @@ impl Correct for Truncation {
             strip.axis_chunks_iter(Axis(0), tall).filter_map(|block| block.mean()).fold(0.0, f32::max) > AIR * most
         };
         let cut = scan.projections.outer_iter();
-        let cut = cut.filter(|v| reaches(*v, 0..side) || reaches(*v, columns - side..columns));
+        let cut = cut.filter(|v| left && reaches(*v, 0..side) || right && reaches(*v, columns - side..columns));
         let cut = cut.count();
         if cut == 0 {
             return Ok("the object reaches the sides of no view: nothing is added".into());
         }
         let more = ((self.share * columns as f64).ceil() as usize).min(columns.saturating_sub(1));
-        let mut wide = Array3::zeros((views, rows, columns + 2 * more));
+        let [before, after] = [left, right].map(|side| if side { more } else { 0 });
+        let mut wide = Array3::zeros((views, rows, before + columns + after));
         parallel::over(wide.axis_iter_mut(Axis(0)).zip(scan.projections.axis_iter(Axis(0))), |_, (mut to, from)| {
             for (mut to, from) in to.rows_mut().into_iter().zip(from.rows()) {
-                to.slice_mut(s![more..more + columns]).assign(&from);
+                to.slice_mut(s![before..before + columns]).assign(&from);
                 for k in 1..=more {
                     let fade = (FRAC_PI_2 * k as f64 / (more + 1) as f64).cos() as f32;
                     let goes_on = |last: usize, inner: usize| (2.0 * from[last] - from[inner]).max(0.0) * fade;
-                    to[more - k] = goes_on(0, k);
-                    to[more + columns - 1 + k] = goes_on(columns - 1, columns - 1 - k);
+                    if left {
+                        to[before - k] = goes_on(0, k);
+                    }
+                    if right {
+                        to[before + columns - 1 + k] = goes_on(columns - 1, columns - 1 - k);
+                    }
                 }
             }
         });
         scan.projections = wide;
-        scan.geometry.detector[1] = columns + 2 * more;
-        Ok(format!("the object reaches the sides of {cut} of {views} views: {more} columns are added on either side"))
+        scan.geometry.detector[1] = before + columns + after;
+        // The measured columns stay where they are.
+        let aside = (after as f64 - before as f64) / 2.0;
+        for view in &mut scan.geometry.views {
+            (0..3).for_each(|k| view.detector[k] += aside * view.u[k]);
+        }
+        let sides = if left && right { "on either side" } else { "on the far side" };
+        Ok(format!("the object reaches the sides of {cut} of {views} views: {more} columns are added {sides}"))
     }
 }

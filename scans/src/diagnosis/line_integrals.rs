@@ -2,6 +2,7 @@
 
 use crate::diagnosis::border::border_medians;
 use crate::diagnosis::quantiles::{median, quantile};
+use conefield_core::scan::stride;
 use ndarray::{ArrayView3, Axis, s};
 use serde::Serialize;
 
@@ -36,8 +37,8 @@ pub fn check_line_integrals(projections: ArrayView3<'_, f32>) -> LineIntegralChe
     for &x in projections {
         (min, max) = (min.min(x), max.max(x));
     }
-    // An odd stride does not stay on one column of a detector with an even number of columns.
-    let mut sample: Vec<f32> = projections.iter().copied().step_by((n / SAMPLE) | 1).collect();
+    let step = stride(n, SAMPLE, projections.len_of(Axis(2)));
+    let mut sample: Vec<f32> = projections.iter().copied().step_by(step).collect();
     sample.sort_unstable_by(f32::total_cmp);
     let at = |share| quantile(&sample, share).unwrap_or(0.0);
     let (low, high) = (at(0.001), at(0.999));

@@ -51,8 +51,8 @@ pub(crate) fn truncation(projections: ArrayView3<'_, f32>, setup: &Setup, check:
                 blocks += 1;
             }
         }
-        // A single segment may be noise or a bad pixel.
-        if cut > all / 50 + 1 {
+        // A single segment may be noise or a bad pixel, unless it is all there is.
+        if cut > (all / 50 + 1).min(all - 1) {
             cut_views += 1;
             cut_rows += cut as f64 / all as f64;
         }

@@ -74,7 +74,8 @@ fn a_file_marks_the_support() {
 fn a_start_is_cut_to_the_support() {
     let full = Volume { data: ndarray::Array3::from_elem([24; 3], 0.01), ..ellipsoids(&[], &geometry(1).volume) };
     let support = carve(&noisy()).support.unwrap();
-    let [_, with] = solved("cgls", Some(&full));
+    let ([_, with], [_, without]) = (solved("cgls", Some(&full)), solved("cgls", None));
+    assert!(with.data != without.data && with.data.iter().any(|v| *v > 0.0));
     let outside = with.data.indexed_iter().filter(|((x, y, z), _)| !support.holds(with.grid.voxel([*x, *y, *z])));
     assert!(outside.map(|(_, v)| *v).all(|v| v == 0.0));
 }

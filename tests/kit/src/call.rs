@@ -179,8 +179,11 @@ pub fn differing(what: &str, a: &[f32], b: &[f32]) -> Option<String> {
     Some(format!("{what} {i}: {:e} against {:e}", a[i], b[i]))
 }
 
-/// Largest difference relative to the largest magnitude of `b`; infinite if one side is not finite.
+/// Largest difference relative to the largest magnitude of `b`; infinite if one side is not finite or has other lengths.
 pub fn error<A: Real, B: Real>(a: &[A], b: &[B]) -> f64 {
+    if a.len() != b.len() {
+        return f64::INFINITY;
+    }
     let scale = b.iter().map(|v| v.f64().abs()).fold(1e-30, f64::max);
     let of = |(a, b): (&A, &B)| {
         let d = (a.f64() - b.f64()).abs() / scale;

@@ -7,7 +7,7 @@ use crate::device::Atomics;
 use crate::source::validate;
 use conefield_core::device::{Access, Source, fragment_of};
 use conefield_core::error::Result;
-use conefield_core::geometry::{Geometry, norm, sub};
+use conefield_core::geometry::{Geometry, cross, dot, norm, sub};
 use conefield_core::voxel::VoxelProjector;
 use conefield_core::wgsl::Fragment;
 
@@ -27,7 +27,8 @@ struct Projection {
     pad: [u32; 3],
 }
 
-/// `ProjectedView` in `kernels/project.wgsl`.
+/// `ProjectedView` in `kernels/project.wgsl`. Rays begin shortly before the volume instead of at the source where that is
+/// possible: positions in single precision are then counted from a point nearby.
 fn projected(geometry: &Geometry, view: usize) -> [[f32; 4]; 4] {
     let (w, grid) = (&geometry.views[view], &geometry.volume);
     let lower = grid.voxel([0; 3]);
@@ -37,12 +38,17 @@ fn projected(geometry: &Geometry, view: usize) -> [[f32; 4]; 4] {
     };
     let first = w.pixel(geometry.detector, 0.0, 0.0);
     let corner = sub(first, w.source);
-    let (mut start, mut near) = (w.source, 1.0);
-    if grid.is_far(w.source) {
-        (start, near) = (first, (norm(sub(first, grid.center)) + 2.0 * norm(grid.size())) / norm(corner));
-    }
+    // The share of a ray, counted from its pixel, that reaches beyond the volume for every pixel.
+    let [rows, columns] = geometry.detector.map(|n| n as f64 - 1.0);
+    let corners = [[0.0, 0.0], [rows, 0.0], [0.0, columns], [rows, columns]];
+    let pixels = corners.map(|[row, column]| w.pixel(geometry.detector, row, column));
+    let most = pixels.iter().map(|p| norm(sub(*p, grid.center))).fold(0.0, f64::max);
+    let normal = cross(w.u, w.v);
+    let least = dot(normal, corner).abs() / norm(normal);
+    let near = ((most + 2.0 * norm(grid.size())) / least).min(1.0) as f32;
+    let start = if near < 1.0 { first } else { w.source };
     let [x, y, z, _] = voxels(sub(start, lower));
-    [[x, y, z, near as f32], voxels(corner), voxels(w.u), voxels(w.v)]
+    [[x, y, z, near], voxels(corner), voxels(w.u), voxels(w.v)]
 }
 
 fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> Source {

@@ -11,6 +11,11 @@ struct Rule {
     pad: vec2<f32>,
 }
 
+// Clamps, but keeps NaN, so that a run with a fault is found.
+fn within(x: f32, low: f32, high: f32) -> f32 {
+    return select(select(x, high, x > high), low, x < low);
+}
+
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
     for (var i = id.x; i < arrayLength(&params) / 11u; i += groups.x * 64u) {
@@ -29,9 +34,9 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
             let v = second[p + k] * rule.beta2 + g * g * (1.0 - rule.beta2);
             var x = params[p + k] - m * rate / (sqrt(v) * rule.root + rule.eps);
             if k < 3u {
-                x = clamp(x, 0.0, 1.0);
+                x = within(x, 0.0, 1.0);
             } else if k < 6u {
-                x = clamp(x, rule.widths.x, rule.widths.y);
+                x = within(x, rule.widths.x, rule.widths.y);
             }
             params[p + k] = x;
             // Decaying moments end at zero, not at denormal numbers.

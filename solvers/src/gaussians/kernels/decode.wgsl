@@ -11,7 +11,8 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
         let p = i * 11u;
         var out = Shape();
         let raw = params[p + 10u];
-        if raw > FREE {
+        // NaN is no free place.
+        if !(raw <= FREE) {
             let s = exp(vec3<f32>(params[p + 3u], params[p + 4u], params[p + 5u]));
             let q = unit(vec4<f32>(params[p + 6u], params[p + 7u], params[p + 8u], params[p + 9u])).turn;
             let w = q.x;
