@@ -150,7 +150,8 @@ impl General {
 /// Limits of training; the first one reached ends it.
 #[derive(Debug, Clone, Args, Serialize, Deserialize)]
 pub struct EndOptions {
-    /// Stop training after this time, such as 600s or 10m, without the time before and after training.
+    /// Stop training after this time, such as 600s or 10m, without the time before and after training. In a chain, that of
+    /// its first method.
     #[arg(long, value_name = "TIME", value_parser = conefield::parse::seconds)]
     pub seconds: Option<f64>,
     /// Stop training after this many steps.

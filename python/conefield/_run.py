@@ -195,7 +195,7 @@ def reconstruct(
         The volume to score against: a volume, an array or a file, or ``"truth"`` for the one in the scan. It does not
         influence the result.
     peak
-        The data range for PSNR and SSIM: 1 for a reference in [0, 1], else the range of its values.
+        The data range for PSNR and SSIM: 1 for a reference in [0, 1] that exceeds 0.5, else its range.
     hold_out
         Views to hold out and predict: their indices, or a string such as ``"every:10"``.
     steps, seconds, at_most

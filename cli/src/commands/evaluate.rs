@@ -29,7 +29,7 @@ pub struct EvaluateArgs {
     volume: PathBuf,
     /// The reference.
     reference: PathBuf,
-    /// The data range [default: 1 for a reference in [0, 1], else the range of its values].
+    /// The data range [default: 1 for a reference in [0, 1] that exceeds 0.5, else its range].
     #[arg(long, value_parser = parse::above_zero)]
     peak: Option<f64>,
     /// Also draw the middle slices of reference, volume and difference.

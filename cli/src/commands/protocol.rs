@@ -29,7 +29,7 @@ pub struct RunProtocol {
     /// The reference volume to score against: a file, or "truth" for the one in the scan.
     #[arg(long, value_name = "VOLUME")]
     pub reference: Option<PathBuf>,
-    /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].
+    /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1] that exceeds 0.5, else its range].
     #[arg(long, value_parser = parse::above_zero)]
     pub peak: Option<f64>,
     /// Views to hold out and predict, such as 3,17 or every:10.

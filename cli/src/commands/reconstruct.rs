@@ -68,7 +68,7 @@ pub struct ReconstructArgs {
     #[command(flatten)]
     units: HounsfieldOption,
     /// Draw the middle slices of the current volume to live.png in RUN at this interval, such as 5s.
-    #[arg(long, value_name = "SECONDS", value_parser = parse::seconds)]
+    #[arg(long, value_name = "TIME", value_parser = parse::seconds)]
     live: Option<f64>,
     /// Write events.out.tfevents.conefield in RUN, in which TensorBoard shows curves and pictures during the run.
     #[arg(long)]

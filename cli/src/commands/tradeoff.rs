@@ -55,7 +55,7 @@ pub struct TradeoffArgs {
     /// in the scans.
     #[arg(long, value_name = "VOLUME")]
     reference: Vec<PathBuf>,
-    /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].
+    /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1] that exceeds 0.5, else its range].
     #[arg(long, value_parser = parse::above_zero)]
     peak: Option<f64>,
     /// Views to hold out and predict, such as 3,17 or every:10; the value none needs --reference.

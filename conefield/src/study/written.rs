@@ -48,6 +48,7 @@ pub struct Written {
     #[schemars(with = "Option<[f32; 2]>")]
     pub window: Option<Spanned<[f32; 2]>>,
     /// How scans are simulated, as in "conefield simulate".
+    #[serde(default)]
     #[schemars(with = "WrittenSimulation")]
     pub simulate: Option<Spanned<WrittenSimulation>>,
     /// Options of every run, as in "conefield compare".
@@ -153,7 +154,7 @@ pub struct Protocol {
     /// their truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reference: Option<String>,
-    /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1], else the range of its values].
+    /// The data range for PSNR and SSIM [default: 1 for a reference in [0, 1] that exceeds 0.5, else its range].
     #[serde(deserialize_with = "above_zero", skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<f64>")]
     pub peak: Option<f64>,

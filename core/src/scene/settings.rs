@@ -61,7 +61,8 @@ pub enum SurroundRule {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoarseSurround {
-    /// Extent of the cells beyond the volume on every side, as a share of its longest side; less if a source is closer.
+    /// Extent of the cells beyond the volume, as a share of its longest side, along the axes where the object leaves it or
+    /// the detector; less if a source is closer.
     pub margin: f64,
     /// Cells along the volume's longest side.
     pub cells: usize,
