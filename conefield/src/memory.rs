@@ -122,9 +122,10 @@ impl Memory {
     }
 }
 
-/// The limit of `--memory`, else the available memory, in bytes.
+/// The limit of `--memory`, else the available memory, in bytes. What this process holds already, such as the scan, is
+/// part of what a run needs: it counts as available.
 pub fn limit() -> u64 {
-    BUDGET.get().copied().unwrap_or_else(available)
+    BUDGET.get().copied().unwrap_or_else(|| available().saturating_add(scratch::allocated()))
 }
 
 /// Bytes available to this process: the machine's available memory, less if a control group limits it; no limit if the

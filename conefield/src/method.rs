@@ -34,14 +34,15 @@ pub fn plan_without_files(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<
 /// Reads a spec with overriding settings.
 pub type Read<'a> = &'a dyn Fn(&[String]) -> Result<Loaded>;
 
-/// Reads and builds a spec, and refuses one that does not fit into memory. `run` gives the other memory of the run;
-/// `start` is the start file, weights or a volume.
+/// Reads and builds a spec, and refuses one that does not fit into memory, or moves its arrays to the `disk`, which cannot
+/// be undone. `run` gives the other memory of the run; `start` is the start file, weights or a volume.
 pub fn planned(
     read: Read<'_>,
     sets: &[String],
     start: Option<&Path>,
     backend: &dyn Backend,
     run: &memory::Run,
+    disk: bool,
 ) -> Result<Planned> {
     let mut sets = sets.to_vec();
     if let Some(path) = start {
@@ -53,6 +54,9 @@ pub fn planned(
     let loaded = read(&sets)?;
     let plan = plan(&loaded, backend)?;
     let memory = run.memory(plan.as_ref());
+    if !disk && memory.total > memory::limit() {
+        return Err(Error::unsupported("memory", format!("needs {}: only the disk holds it", memory.line())));
+    }
     memory.check(|available| {
         let smaller = smaller_tables(&loaded).into_iter().filter_map(|(bits, set)| {
             let loaded = read(&[&sets[..], &[set]].concat()).ok()?;

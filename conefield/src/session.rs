@@ -74,7 +74,7 @@ impl<'a> Session<'a> {
         }
         let wish = match (request.spec, request.budget) {
             (Some(read), _) => {
-                Wish::Method(method::planned(read, &request.sets, request.init.as_deref(), backend, &run)?)
+                Wish::Method(method::planned(read, &request.sets, request.init.as_deref(), backend, &run, true)?)
             }
             (None, Some(seconds)) => Wish::OneOf(request.front.take().map_or_else(Front::shipped, Ok)?, seconds),
             (None, None) => {
@@ -109,10 +109,14 @@ impl<'a> Session<'a> {
                 (method, schedule)
             }
             Wish::OneOf(front, seconds) => {
-                let (method, schedule) = budget(seconds).choose(&bench, &front, |spec, own| {
-                    let sets = [own, &request.sets].concat();
-                    method::planned(&|s| specs::read(spec, s), &sets, request.init.as_deref(), backend, &run)
-                })?;
+                let choose = |disk: bool| {
+                    budget(seconds).choose(&bench, &front, |spec, own| {
+                        let sets = [own, &request.sets].concat();
+                        method::planned(&|s| specs::read(spec, s), &sets, request.init.as_deref(), backend, &run, disk)
+                    })
+                };
+                // The disk only if memory holds no method: one that needs it would make all others slow.
+                let (method, schedule) = choose(false).or_else(|_| choose(true))?;
                 specs::check_held_out(&method.loaded, method.plan.as_ref(), &input.held)?;
                 (method, Some(schedule))
             }
