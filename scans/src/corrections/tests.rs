@@ -198,6 +198,33 @@ fn hardening_is_corrected_in_thick_paths() {
     assert!(said.contains("hardening.polynomial") && said.contains("falls"), "{said}");
 }
 
+/// A detector that is shifted on purpose is extended on its far side only, and measured columns stay where they are.
+#[test]
+fn an_offset_detector_is_extended_on_its_far_side() {
+    let whole = exact(1.0);
+    for left in [false, true] {
+        let mut cut = whole.clone();
+        // 36 of 72 columns from near the middle on, of which the outer ones still show the object.
+        let kept = if left { 14..50 } else { 22..58 };
+        cut.projections = cut.projections.slice(s![.., .., kept.clone()]).to_owned();
+        cut.geometry.detector[1] = kept.len();
+        let aside = (kept.start + kept.end) as f64 / 2.0 - 36.0;
+        for view in &mut cut.geometry.views {
+            (0..3).for_each(|k| view.detector[k] += aside * view.u[k]);
+        }
+        let (wide, found) = corrected(&cut, &["truncation"]);
+        assert!(found.contains("far side"), "{left}: {found}");
+        let [_, columns] = wide.geometry.detector;
+        let more = columns - kept.len();
+        let before = if left { more } else { 0 };
+        assert_eq!(wide.projections.slice(s![.., .., before..before + kept.len()]), cut.projections, "{left}");
+        let place =
+            |scan: &Scan, column: usize| scan.geometry.views[3].pixel(scan.geometry.detector, 5.0, column as f64);
+        let [a, b] = [place(&wide, before), place(&cut, 0)];
+        assert!((0..3).all(|k| (a[k] - b[k]).abs() < 1e-9), "{left}: {a:?} {b:?}");
+    }
+}
+
 #[test]
 fn rows_are_extended_where_the_detector_cuts_the_object() {
     let exact = exact(1.0);
