@@ -147,7 +147,8 @@ mod tests {
     fn a_front_of_a_faster_machine_promises_less_here() {
         let (truth, backend) = (phantom_of(PhantomKind::Head, 24), Cpu::new());
         let scan = scan_of(&truth);
-        let here = pass_s(&backend, &|| false).unwrap();
+        // The fastest of three: other tests run beside it.
+        let here = (0..3).map(|_| pass_s(&backend, &|| false).unwrap()).fold(f64::INFINITY, f64::min);
         let dir = tempfile::tempdir().unwrap();
         for (faster, wanted) in [(0.05, "long"), (4.0, "short")] {
             let point = |name: &str, spec: &str, steps: u32, train_s: f64, psnr: u32| {
