@@ -34,6 +34,10 @@ impl Backend for Member {
         self.device.name()
     }
 
+    fn describe(&self) -> String {
+        self.device.describe()
+    }
+
     fn compile(&self, _: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
         Err(Error::unsupported("method", "several processes or devices: a field is trained by one"))
     }
