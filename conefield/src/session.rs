@@ -22,6 +22,7 @@ use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
 use conefield_evaluation::metrics::Scores;
 use conefield_evaluation::report::text::bytes;
+use std::cell::Cell;
 use std::path::PathBuf;
 use std::time::Instant;
 use tracing::info;
@@ -109,14 +110,18 @@ impl<'a> Session<'a> {
                 (method, schedule)
             }
             Wish::OneOf(front, seconds) => {
+                let refused = Cell::new(false);
                 let choose = |disk: bool| {
                     budget(seconds).choose(&bench, &front, |spec, own| {
                         let sets = [own, &request.sets].concat();
-                        method::planned(&|s| specs::read(spec, s), &sets, request.init.as_deref(), backend, &run, disk)
+                        let start = request.init.as_deref();
+                        method::planned(&|s| specs::read(spec, s), &sets, start, backend, &run, disk)
+                            .inspect_err(|_| refused.set(true))
                     })
                 };
                 // The disk only if memory holds no method: one that needs it would make all others slow.
-                let (method, schedule) = choose(false).or_else(|_| choose(true))?;
+                let (method, schedule) =
+                    choose(false).or_else(|e| if refused.get() { choose(true) } else { Err(e) })?;
                 specs::check_held_out(&method.loaded, method.plan.as_ref(), &input.held)?;
                 (method, Some(schedule))
             }

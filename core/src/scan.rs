@@ -4,7 +4,7 @@ use crate::error::{Result, ensure};
 use crate::finite::{first_not, stray};
 use crate::geometry::{Geometry, Vec3, View, VoxelGrid};
 use crate::parallel;
-use ndarray::{Array3, ArrayView2, s};
+use ndarray::{Array3, ArrayView2, ArrayView3, s};
 use serde::{Deserialize, Serialize};
 
 /// A step through `len` pixels of views with this many columns that visits at least `some` of them, in all columns: a step
@@ -18,6 +18,19 @@ pub fn stride(len: usize, some: usize, columns: usize) -> usize {
     };
     let least = (len / some.max(1)).max(1);
     (least..).find(|step| divisor(*step, columns) <= 1).unwrap_or(1)
+}
+
+/// The 99.5th percentile of about a million line integrals, hardly moved by single hot pixels.
+pub fn high(projections: ArrayView3<'_, f32>) -> f32 {
+    let step = stride(projections.len(), 1_000_000, projections.dim().2);
+    highest(&mut projections.iter().copied().step_by(step).collect::<Vec<f32>>())
+}
+
+/// The 99.5th percentile of `all`, which it reorders; 0 for none.
+pub(crate) fn highest(all: &mut [f32]) -> f32 {
+    let Some(last) = all.len().checked_sub(1) else { return 0.0 };
+    let k = ((all.len() as f64 * 0.995) as usize).min(last);
+    *all.select_nth_unstable_by(k, f32::total_cmp).1
 }
 
 /// The length unit of the scan's data set. The program uses mm and 1/mm; volumes are written in `1/unit`.

@@ -2,7 +2,7 @@
 
 use crate::error::{Result, ensure};
 use crate::geometry::{Geometry, Ray, Vec3, View, VoxelGrid, dot, norm, sub};
-use crate::scan::{Scan, stride};
+use crate::scan::{Scan, high, highest};
 use crate::stage::UnitRay;
 use crate::support::Support;
 use std::sync::Arc;
@@ -163,21 +163,11 @@ impl Scene {
 
 /// The 99.5th percentile of the projections: the scan's own scale, hardly moved by single hot pixels.
 fn top_projection(scan: &Scan) -> f64 {
-    let step = stride(scan.projections.len(), 1_000_000, scan.projections.dim().2);
-    let mut all: Vec<f32> = scan.projections.iter().copied().step_by(step).collect();
-    let top = percentile(&mut all);
+    let top = high(scan.projections.view());
     if top > 0.0 {
-        return top;
+        return f64::from(top);
     }
     // An object on fewer pixels.
     let mut all: Vec<f32> = scan.projections.iter().copied().filter(|p| *p > 0.0).collect();
-    percentile(&mut all)
-}
-
-/// The 99.5th percentile; 0 for no values.
-fn percentile(all: &mut [f32]) -> f64 {
-    let Some(last) = all.len().checked_sub(1) else { return 0.0 };
-    let k = ((all.len() as f64 * 0.995) as usize).min(last);
-    let (_, x, _) = all.select_nth_unstable_by(k, f32::total_cmp);
-    f64::from(*x)
+    f64::from(highest(&mut all))
 }

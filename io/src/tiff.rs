@@ -614,15 +614,26 @@ mod tests {
         assert_eq!(read(&path).unwrap().values.as_slice().unwrap(), [0.25, -3.0]);
     }
 
-    /// A set of one image per file, each of which describes the whole set.
+    /// A set of one image per file, each of which describes the whole set; and a file alone, which names itself.
     #[test]
     fn a_file_of_an_ome_set_has_its_own_pages() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a_Z000.ome.tif");
-        let whole = "<OME><Image><Pixels SizeX=\"3\" SizeY=\"2\" SizeZ=\"100\"><TiffData FirstZ=\"0\">\
-                     <UUID FileName=\"a_Z000.ome.tif\"/></TiffData></Pixels></Image></OME>";
-        std::fs::write(&path, &three(false, 1, whole)[..1024 + 12]).unwrap();
+        let named = |count: u32, channels: u32, names: [&str; 2]| {
+            let [a, b] = names.map(|name| format!("<TiffData><UUID FileName=\"{name}\"/></TiffData>"));
+            let sizes = format!("SizeX=\"3\" SizeY=\"2\" SizeZ=\"{count}\" SizeC=\"{channels}\"");
+            format!("<OME><Image><Pixels {sizes}>{a}{b}</Pixels></Image></OME>")
+        };
+        let set = named(100, 1, ["a_Z000.ome.tif", "a_Z001.ome.tif"]);
+        std::fs::write(&path, &three(false, 1, &set)[..1024 + 12]).unwrap();
         assert_eq!(read(&path).unwrap().values.dim(), (1, 2, 3));
+        let alone = named(3, 1, ["a_Z000.ome.tif"; 2]);
+        std::fs::write(&path, three(false, 1, &alone)).unwrap();
+        assert_eq!(read(&path).unwrap().values.dim(), (3, 2, 3));
+        // Two channels are no volume.
+        std::fs::write(&path, three(false, 1, &alone.replace("SizeZ=\"3\" SizeC=\"1\"", "SizeZ=\"1\" SizeC=\"3\"")))
+            .unwrap();
+        assert!(volume::read_volume(&path).unwrap_err().to_string().contains("3 channels"));
     }
 
     fn refused(bytes: &[u8], words: &[&str]) {

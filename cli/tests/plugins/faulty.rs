@@ -217,34 +217,30 @@ const RAY_FAULTS: &[Fault] = faults! {
 /// Where a projector gets more functions.
 const RAY_FUNCTIONS: &str = "static const struct ConefieldProjector FUNCTIONS = {";
 
+/// Line integrals with an adjoint of its own.
+macro_rules! adjoint {
+    ($body:literal) => {
+        concat!(
+            "static double integrate(const void *stage, const float *weights, const double *mu, size_t count) {
+    double sum = 0;
+    for (size_t i = 0; i < count; i++) sum += weights[i] * mu[i];
+    return sum;
+}
+
+static void adjoint(const void *stage, const float *weights, double dline, double *dmu, size_t count) {",
+            $body,
+            "}
+
+static const struct ConefieldProjector FUNCTIONS = {
+    .integrate = integrate,
+    .adjoint = adjoint,"
+        )
+    };
+}
+
 /// As after a panic.
-const NO_ADJOINT: &str =
-    "static double integrate(const void *stage, const float *weights, const double *mu, size_t count) {
-    double sum = 0;
-    for (size_t i = 0; i < count; i++) sum += weights[i] * mu[i];
-    return sum;
-}
-
-static void adjoint(const void *stage, const float *weights, double dline, double *dmu, size_t count) {}
-
-static const struct ConefieldProjector FUNCTIONS = {
-    .integrate = integrate,
-    .adjoint = adjoint,";
-
-const LONG_ADJOINT: &str =
-    "static double integrate(const void *stage, const float *weights, const double *mu, size_t count) {
-    double sum = 0;
-    for (size_t i = 0; i < count; i++) sum += weights[i] * mu[i];
-    return sum;
-}
-
-static void adjoint(const void *stage, const float *weights, double dline, double *dmu, size_t count) {
-    for (size_t i = 0; i <= count; i++) dmu[i] = dline;
-}
-
-static const struct ConefieldProjector FUNCTIONS = {
-    .integrate = integrate,
-    .adjoint = adjoint,";
+const NO_ADJOINT: &str = adjoint!("");
+const LONG_ADJOINT: &str = adjoint!("for (size_t i = 0; i <= count; i++) dmu[i] = dline;");
 
 /// Learns nothing from a scan.
 const FITTED_LOSS: Edit = instead(

@@ -352,7 +352,8 @@ impl Place for Ranks {
     }
 
     fn holds(&self, bytes: u64) -> bool {
-        // A prior works on two more slabs, with planes of the neighbours: a fifth of the arrays of a method with a prior.
+        // A prior works on two more slabs, with planes of the neighbours: less than a quarter of the arrays
+        // of a method with a prior.
         let part = bytes.div_ceil(self.count() as u64);
         !self.agree(!self.here.holds(part.saturating_add(part / 4)))
     }

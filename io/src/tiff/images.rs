@@ -50,8 +50,9 @@ pub(super) fn claimed(text: &str, [rows, columns]: [u64; 2]) -> Option<Claim> {
     if text.starts_with('{') {
         return shaped(&serde_json::from_str(text.trim_end_matches('\0')).ok()?, [rows, columns]);
     }
-    // A set of several files: the text counts the images of all.
-    if text.contains("FileName=") {
+    // A set of several files: the text counts the images of all. A file alone may name itself.
+    let mut names = text.split("FileName=").skip(1).filter_map(|rest| rest.split(['"', '\'']).nth(1));
+    if names.next().is_some_and(|first| names.any(|name| name != first)) {
         return None;
     }
     let (mut images, mut volumes) = (0u64, 0u64);

@@ -45,11 +45,7 @@ impl Correct for Truncation {
         let (views, rows, columns) = scan.projections.dim();
         let side = columns.div_ceil(SIDE);
         let most = check_line_integrals(scan.projections.view()).typical_range[1].max(0.0);
-        let setup = setup(&scan.geometry);
-        let [left, right] = match setup.half_is_enough() {
-            true => [setup.offset_mm[1] < 0.0, setup.offset_mm[1] > 0.0],
-            false => [true; 2],
-        };
+        let [left, right] = setup(&scan.geometry).open_sides();
         // Averaging some pixels reduces their noise.
         let tall = rows.div_ceil(SIDE);
         let reaches = |view: ArrayView2<'_, f32>, columns: Range<usize>| {

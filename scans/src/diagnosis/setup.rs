@@ -132,6 +132,15 @@ impl Setup {
         self.angles.full_circle && self.offset_mm[1].abs() > 0.01 * self.detector_mm[1]
     }
 
+    /// Whether the left and the right side must show air: a detector that is shifted on purpose cuts through the object on
+    /// its near side.
+    pub fn open_sides(&self) -> [bool; 2] {
+        match self.half_is_enough() {
+            true => [self.offset_mm[1] < 0.0, self.offset_mm[1] > 0.0],
+            false => [true; 2],
+        }
+    }
+
     /// How far the detector extends beyond the axis on the shorter side, in mm on the detector; negative if the axis
     /// does not project onto it.
     pub fn overlap_mm(&self) -> f64 {

@@ -31,10 +31,7 @@ pub(crate) fn truncation(projections: ArrayView3<'_, f32>, setup: &Setup, check:
     let threshold = LEVEL * high + check.air.clamp(0.0, LEVEL * high);
     // Averaging some pixels reduces their noise.
     let (tall, wide) = (rows.div_ceil(64).max(1), columns.div_ceil(64).max(1));
-    let [left, right] = match setup.half_is_enough() {
-        true => [setup.offset_mm[1] < 0.0, setup.offset_mm[1] > 0.0],
-        false => [true; 2],
-    };
+    let [left, right] = setup.open_sides();
     let (mut cut_views, mut cut_rows, mut sum, mut blocks) = (0usize, 0.0, 0.0f64, 0usize);
     for view in projections.axis_iter(Axis(0)) {
         let mut cut = 0usize;

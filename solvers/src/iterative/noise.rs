@@ -2,7 +2,7 @@
 
 use conefield_core::data_term::Misfit;
 use conefield_core::parallel;
-use conefield_core::scan::{ScanHeader, stride};
+use conefield_core::scan::{ScanHeader, high};
 use conefield_core::wgsl::Fragment;
 use ndarray::ArrayView3;
 use rayon::slice::ParallelSliceMut;
@@ -113,7 +113,8 @@ pub fn scratch(header: &ScanHeader) -> u64 {
 fn differences(measured: ArrayView3<'_, f32>) -> Vec<(f32, f32)> {
     let top = measured.iter().fold(0.0f32, |m, &x| m.max(x));
     // Outside the object negative noise is often clipped. A bad pixel or metal does not count as the object.
-    let least = 0.1 * top.min(2.0 * typical(measured));
+    let typical = high(measured);
+    let least = 0.1 * if typical > 0.0 { top.min(2.0 * typical) } else { top };
     let every = measured.len().div_ceil(LOOKED_AT).max(1);
     let view = |n: usize, view: ndarray::ArrayView2<'_, f32>| {
         let mut found = vec![];
@@ -128,15 +129,6 @@ fn differences(measured: ArrayView3<'_, f32>) -> Vec<(f32, f32)> {
         found
     };
     parallel::map(measured.outer_iter(), view).concat()
-}
-
-/// The 99.5th percentile of the line integrals; infinite if it is not above 0.
-fn typical(measured: ArrayView3<'_, f32>) -> f32 {
-    let step = stride(measured.len(), LOOKED_AT, measured.dim().2);
-    let mut some: Vec<f32> = measured.iter().copied().step_by(step).collect();
-    let Some(last) = some.len().checked_sub(1) else { return f32::INFINITY };
-    let high = *some.select_nth_unstable_by(last * 199 / 200, f32::total_cmp).1;
-    if high > 0.0 { high } else { f32::INFINITY }
 }
 
 /// The least-squares line through `ln σ²` over the line integral; constant if it would fall.
