@@ -44,6 +44,7 @@ pub mod projection;
 pub mod ranks;
 pub mod reconstruct;
 pub mod record;
+mod rehearsal;
 pub mod score;
 pub mod session;
 pub mod shipped;

@@ -11,7 +11,7 @@ use crate::method::{self, Planned, Read};
 use crate::record::{Ends, RunRecord, Written};
 use crate::tradeoff::front::Front;
 use crate::tradeoff::schedule::{Budget, Schedule};
-use crate::{plugins, ranks, score, specs};
+use crate::{plugins, ranks, rehearsal, score, specs};
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Silent, Solution};
@@ -91,6 +91,14 @@ impl<'a> Session<'a> {
         match &self.wish {
             Wish::Method(method) => Some(&method.loaded),
             Wish::OneOf(..) => None,
+        }
+    }
+
+    /// Reads the inputs by `read`. A device meanwhile compiles the kernels of the requested method.
+    pub fn reading<T>(&self, read: impl FnOnce() -> Result<T>) -> Result<T> {
+        match self.requested() {
+            Some(loaded) => rehearsal::meanwhile(loaded, self.backend, read),
+            None => read(),
         }
     }
 

@@ -34,6 +34,14 @@ impl Cache {
         known().insert(source.text().into(), kernel.clone());
         Ok(kernel)
     }
+
+    /// Labels of all kernels, in alphabetical order.
+    pub fn labels(&self) -> Vec<String> {
+        let known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut labels: Vec<_> = known.values().map(|kernel| kernel.label.clone()).collect();
+        labels.sort();
+        labels
+    }
 }
 
 /// Refuses a kernel that uses more buffers than the device binds.

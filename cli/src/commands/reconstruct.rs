@@ -307,7 +307,7 @@ impl ReconstructArgs {
 
     /// Reads all inputs, and the checkpoint that a resumed run continues from.
     fn input(&self, session: &Session<'_>) -> Result<(Input, ScanRecord, Option<Resume>)> {
-        let (whole, reference) = input::read(&self.scan, self.protocol.reference.as_deref())?;
+        let (whole, reference) = session.reading(|| input::read(&self.scan, self.protocol.reference.as_deref()))?;
         let held = self.protocol.held_out(whole.geometry.views.len())?;
         let record = ScanRecord::of(&self.scan, &whole)?;
         let input = Input::new(Arc::new(whole), held, reference, self.protocol.peak)?;

@@ -67,7 +67,7 @@ fn run(name: &str, page: &str, dir: &Path) -> usize {
         match (block.language, file) {
             ("toml", Some(file)) => fs::write(dir.join(file), block.text).unwrap(),
             ("sh", _) if !block.above.starts_with("<!-- not run: ") => {
-                let script = block.text.replace("--budget 60s", "--budget 4s");
+                let script = block.text.replace("--budget 60s", "--budget 12s");
                 let output = Command::new("bash")
                     .args(["-euo", "pipefail", "-c", &script])
                     .current_dir(dir)

@@ -32,26 +32,27 @@ pub fn pass_s(backend: &dyn Backend, cancelled: &dyn Fn() -> bool) -> Result<f64
     ];
     let loaded = Draft::find("fista-tv", &sets.map(String::from), SHIPPED)?.finish()?;
     let mut plan = loaded.spec.method.plan(&Context::new(backend))?;
-    let scan = scan();
+    let scan = scan(VIEWS, PIXELS, VOXELS);
     let mut laps = Laps::new(cancelled);
     let limits = Limits { steps: Some(PASSES), ..Limits::default() };
     let solution = plan.run(&Job { limits, ..Job::new(&scan, backend) }, &mut laps)?;
     Ok(laps.typical().unwrap_or(solution.train_s / PASSES as f64))
 }
 
-/// The shadow of a ball, with noise.
-fn scan() -> Scan {
-    let angles = (0..VIEWS).map(|i| TAU * i as f64 / VIEWS as f64).collect();
-    let orbit = CircularOrbit { dso: 500.0, dsd: 700.0, pixel: [2.2; 2], offset: [0.0; 2], angles };
-    let volume = VoxelGrid { shape: [VOXELS; 3], spacing: [2.0; 3], center: [0.0; 3] };
+/// The shadow of a ball, with noise: views, detector pixels and voxels along a side.
+pub fn scan(views: usize, pixels: usize, voxels: usize) -> Scan {
+    let angles = (0..views).map(|i| TAU * i as f64 / views as f64).collect();
+    let pixel = 246.4 / pixels as f64;
+    let orbit = CircularOrbit { dso: 500.0, dsd: 700.0, pixel: [pixel; 2], offset: [0.0; 2], angles };
+    let volume = VoxelGrid { shape: [voxels; 3], spacing: [160.0 / voxels as f64; 3], center: [0.0; 3] };
     let value = |(view, row, column): (usize, usize, usize)| {
-        let [y, x] = [row, column].map(|i| (i as f64 + 0.5) / PIXELS as f64 * 2.5 - 1.25);
+        let [y, x] = [row, column].map(|i| (i as f64 + 0.5) / pixels as f64 * 2.5 - 1.25);
         let chord = (1.0 - x * x - y * y).max(0.0).sqrt();
-        (chord + 0.02 * f64::from(unit(mix(view as u64, (row * PIXELS + column) as u64)))) as f32
+        (chord + 0.02 * f64::from(unit(mix(view as u64, (row * pixels + column) as u64)))) as f32
     };
     Scan {
-        geometry: Geometry { views: orbit.views(), detector: [PIXELS; 2], volume },
-        projections: Array3::from_shape_fn((VIEWS, PIXELS, PIXELS), value),
+        geometry: Geometry { views: orbit.views(), detector: [pixels; 2], volume },
+        projections: Array3::from_shape_fn((views, pixels, pixels), value),
         unit: Unit::default(),
         provenance: serde_json::Value::Null,
     }
@@ -63,7 +64,7 @@ mod tests {
 
     #[test]
     fn the_scan_is_one_that_methods_take() {
-        let scan = scan();
+        let scan = scan(VIEWS, PIXELS, VOXELS);
         scan.validate("speed").unwrap();
         let [middle, corner] = [[0, 56, 56], [0, 0, 0]].map(|at| scan.projections[at]);
         assert!(middle > 0.95 && corner < 0.03, "{middle} {corner}");

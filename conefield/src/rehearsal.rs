@@ -1,0 +1,90 @@
+//! A device's kernels, compiled while a scan is read.
+
+use crate::method;
+use crate::tradeoff::speed;
+use conefield_core::Result;
+use conefield_core::backend::Backend;
+use conefield_core::method::{Job, Limits, Observer, Record};
+use conefield_core::spec::load::Loaded;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+use tracing::debug;
+use tracing::subscriber::{NoSubscriber, with_default};
+
+/// Ends a rehearsal when the inputs are read.
+struct Curtain<'a>(&'a AtomicBool);
+
+impl Observer for Curtain<'_> {
+    fn progress(&mut self, _: u64, _: f64, _: f64) {}
+
+    fn record(&mut self, _: &Record) {}
+
+    fn note(&mut self, _: &str) {}
+
+    fn cancelled(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// Runs `read`. Meanwhile a backend with a device runs a step of the method of `loaded` on a tiny scan, which compiles the
+/// kernels that the run needs: their text does not depend on sizes. If this fails, the run says why.
+pub fn meanwhile<T>(loaded: &Loaded, backend: &dyn Backend, read: impl FnOnce() -> Result<T>) -> Result<T> {
+    if backend.device().is_none() {
+        return read();
+    }
+    let done = AtomicBool::new(false);
+    std::thread::scope(|threads| {
+        let begin = Instant::now();
+        let rehearsal = threads.spawn(|| with_default(NoSubscriber::default(), || rehearse(loaded, backend, &done)));
+        let found = read();
+        done.store(true, Ordering::Relaxed);
+        let read_s = begin.elapsed().as_secs_f64();
+        let compiled = matches!(rehearsal.join(), Ok(Ok(())));
+        let (all, s) = (if compiled { "all" } else { "some" }, begin.elapsed().as_secs_f64());
+        debug!("inputs read after {read_s:.2} s, {all} kernels compiled after {s:.2} s");
+        found
+    })
+}
+
+/// One step of the method, unless `done`.
+fn rehearse(loaded: &Loaded, backend: &dyn Backend, done: &AtomicBool) -> Result<()> {
+    let mut plan = method::plan_without_files(loaded, backend)?;
+    let scan = speed::scan(4, 16, 16);
+    let limits = Limits { steps: Some(1), ..Limits::default() };
+    plan.run(&Job { limits, ..Job::new(&scan, backend) }, &mut Curtain(done)).map(drop)
+}
+
+#[cfg(all(test, feature = "wgpu"))]
+mod tests {
+    use super::*;
+    use crate::shipped::SHIPPED;
+    use conefield_backend_wgpu::Wgpu;
+    use conefield_core::method::Silent;
+    use conefield_core::spec::load::Draft;
+
+    #[test]
+    fn a_run_finds_its_kernels_compiled() {
+        let all: [(&str, &[&str]); 7] = [
+            ("fdk", &[]),
+            ("fista-tv", &[]),
+            ("sart", &[]),
+            ("cgls", &[]),
+            ("asd-pocs", &[]),
+            ("gaussians", &["start.count=500"]),
+            ("naf", &["training.rays=32"]),
+        ];
+        for (spec, sets) in all {
+            let Ok(backend) = Wgpu::open(None) else { return eprintln!("SKIPPED: no adapter for rehearsals") };
+            let sets: Vec<_> = sets.iter().map(|set| set.to_string()).collect();
+            let loaded = Draft::find(spec, &sets, SHIPPED).unwrap().finish().unwrap();
+            rehearse(&loaded, &backend, &AtomicBool::new(false)).unwrap();
+            let rehearsed = backend.shared().kernels.labels();
+            assert!(rehearsed.len() > 2, "{spec}: {rehearsed:?}");
+            let scan = speed::scan(6, 24, 20);
+            let limits = Limits { steps: Some(2), ..Limits::default() };
+            let mut plan = method::plan(&loaded, &backend).unwrap();
+            plan.run(&Job { limits, ..Job::new(&scan, &backend) }, &mut Silent).unwrap();
+            assert_eq!(backend.shared().kernels.labels(), rehearsed, "{spec}");
+        }
+    }
+}
