@@ -399,21 +399,9 @@ fn total(angles: &[f64]) -> f64 {
 mod tests {
     use super::*;
     use crate::read_truth;
-    use crate::testing::{data, says, scan};
+    use crate::testing::{data, is_geometry, says, scan};
     use std::fs;
     use std::path::PathBuf;
-
-    /// The largest distance in mm between two geometries.
-    fn apart(a: &Geometry, b: &Geometry) -> f64 {
-        assert_eq!((a.detector, a.volume.shape, a.views.len()), (b.detector, b.volume.shape, b.views.len()));
-        let far = |x: [f64; 3], y: [f64; 3]| (0..3).map(|k| (x[k] - y[k]).abs()).fold(0.0, f64::max);
-        let views =
-            a.views.iter().zip(&b.views).flat_map(|(v, w)| {
-                [far(v.source, w.source), far(v.detector, w.detector), far(v.u, w.u), far(v.v, w.v)]
-            });
-        let grid = [far(a.volume.spacing, b.volume.spacing), far(a.volume.center, b.volume.center)];
-        views.chain(grid).fold(0.0, f64::max)
-    }
 
     /// A scan that matches its volume, with a larger offset than that of `scan`.
     fn consistent(unit: Unit) -> (Scan, Volume) {
@@ -471,11 +459,11 @@ mod tests {
         let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
         write_naf(&path, &train, Some(&test), Some(&volume)).unwrap();
         let back = read_naf(&path).unwrap();
-        assert!(apart(&back.train.geometry, &train.geometry) < 1e-9);
+        is_geometry(&back.train.geometry, &train.geometry);
         assert_eq!((&back.train.unit, &back.train.projections), (&train.unit, &train.projections));
         assert_eq!(back.train.provenance["unit_from"], "the file");
         let back_test = back.test.unwrap();
-        assert!(apart(&back_test.geometry, &test.geometry) < 1e-9);
+        is_geometry(&back_test.geometry, &test.geometry);
         assert_eq!(back_test.projections, test.projections);
         assert_eq!(back.volume.unwrap().data, volume.data);
         write_naf(&path, &train, None, None).unwrap();
@@ -498,7 +486,7 @@ mod tests {
             write_without_unit(&path, &s, Some(&volume));
             let back = read_naf(&path).unwrap();
             assert_eq!(back.train.unit, s.unit);
-            assert!(apart(&back.train.geometry, &s.geometry) < 1e-9);
+            is_geometry(&back.train.geometry, &s.geometry);
             assert_eq!(back.volume.unwrap().data, volume.data);
             write_without_unit(&path, &s, None);
             let back = read_naf(&path).unwrap();
@@ -522,11 +510,11 @@ mod tests {
         swapped.geometry.views = orbit.views();
         write_without_unit(&path, &swapped, Some(&volume));
         let back = read_naf(&path).unwrap();
-        assert!(apart(&back.train.geometry, &s.geometry) < 1e-9);
+        is_geometry(&back.train.geometry, &s.geometry);
         assert!(back.train.provenance["offset_from"].as_str().unwrap().contains("[u, v]"));
         // conefield's own files skip this comparison.
         write_naf(&path, &swapped, None, Some(&volume)).unwrap();
-        assert!(apart(&read_naf(&path).unwrap().train.geometry, &swapped.geometry) < 1e-9);
+        is_geometry(&read_naf(&path).unwrap().train.geometry, &swapped.geometry);
     }
 
     type Entries = Vec<(&'static str, Out<'static>)>;

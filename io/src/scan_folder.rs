@@ -267,7 +267,7 @@ fn plain_dates(value: serde_json::Value) -> serde_json::Value {
 mod tests {
     use super::*;
     use crate::read_truth;
-    use crate::testing::{read_scan, says, scan};
+    use crate::testing::{is_geometry, read_scan, says, scan};
     use ndarray::Array3;
     use std::fs;
     use std::path::PathBuf;
@@ -275,11 +275,8 @@ mod tests {
     fn close(a: &Scan, b: &Scan) {
         assert_eq!(a.projections, b.projections);
         assert_eq!((&a.unit, &a.provenance), (&b.unit, &b.provenance));
-        assert_eq!((a.geometry.detector, a.geometry.volume), (b.geometry.detector, b.geometry.volume));
-        for (v, w) in a.geometry.views.iter().zip(&b.geometry.views) {
-            let pair = [(v.source, w.source), (v.detector, w.detector), (v.u, w.u), (v.v, w.v)];
-            assert!(pair.iter().all(|(x, y)| (0..3).all(|k| (x[k] - y[k]).abs() < 1e-9)), "{v:?} {w:?}");
-        }
+        assert_eq!(a.geometry.volume, b.geometry.volume);
+        is_geometry(&a.geometry, &b.geometry);
     }
 
     /// A written scan with an editable description.
@@ -355,28 +352,8 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_key_gets_its_line_and_the_nearest_name() {
-        let (_dir, _, text) = written();
-        let line = 1 + text[..text.find("spacing").unwrap()].matches('\n').count();
-        refused(
-            |t| t.replace("spacing", "spacng"),
-            &["scan.toml", &format!(":{line}:"), "spacng", "\"spacing\"", "shape"],
-        );
-        refused(|t| format!("protections = 1\n{t}"), &[":1:1:", "protections", "\"projections\""]);
-        refused(|t| t.replace("rows = 4", "rows = -4"), &["scan.toml:", "rows", "-4"]);
-        refused(|t| t.replace("rows = 4", "rows = \"four\""), &["scan.toml:", "rows", "four"]);
-        refused(|t| t.replace("rows = 4\n", ""), &["scan.toml:", "rows", "nothing"]);
-        refused(|t| t.replace("rows = 4", "rows = = 4"), &["scan.toml:", "syntax"]);
-    }
-
-    #[test]
     fn lying_descriptions_are_refused_in_words() {
-        refused(|t| t.replace("version = 1", "version = 2\nnew = 0"), &["version", "found 2"]);
-        refused(|t| t.replace("conefield-scan", "other"), &["format", "other"]);
-        refused(|t| t.replace("rows = 4", "rows = 4611686018427387904"), &["detector"]);
-        refused(|t| t.replace("\"projections.npy\"", "\"none.npy\""), &["projections", "none.npy"]);
         refused(|t| t.replace("dso = 5", "dso = -5"), &["orbit.dso", "-5"]);
-        refused(|t| t.replace("dso = 5", "dso = nan # 5"), &["orbit.dso: found nan", "finite"]);
         refused(|t| t.replace("offset = [", "count = 9\noffset = ["), &["orbit.angles", "one way"]);
         refused(|t| t.replace("dsd =", "views = []\ndsd ="), &["views"]);
         refused(|t| t.replace("angles = [", "angles = [] # ["), &["views", "at least one"]);

@@ -354,16 +354,12 @@ mod tests {
         );
         std::fs::write(at("odd.npy"), npy_bytes("|u1", false, "(2, 2)", &[0; 4])).unwrap();
         std::fs::write(at("wide.npy"), npy_bytes("<u2", false, "(1, 2)", &[0; 4])).unwrap();
-        std::fs::write(at("text.tif"), "no image").unwrap();
         std::fs::create_dir(at("empty")).unwrap();
         for (found, words) in [
             (many(&["views/p1.npy", "odd.npy"]), ["odd.npy", "2 x 2", "1 x 2"]),
             (many(&["views/p1.npy", "wide.npy"]), ["wide.npy: numbers", "found 16-bit", "expected 8-bit"]),
             (many(&[]), ["s.toml", "files.projections", "empty list"]),
-            (one("../x.npy"), ["s.toml", "files.projections", "without \"..\""]),
             (many(&["odd.npy", "/etc/passwd"]), ["s.toml", "files.projections[1]", "inside the folder"]),
-            (one("none.npy"), ["s.toml", "files.projections", "none.npy"]),
-            (one("text.tif"), ["text.tif", "format", "TIFF"]),
             (one("odd.npy.npz:a"), ["s.toml", "files.projections", "odd.npy.npz"]),
             (one("empty"), ["s.toml", "files.projections", ".tif"]),
         ] {

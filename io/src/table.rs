@@ -189,7 +189,5 @@ mod tests {
         let numbers = [0.0f64; 3].map(f64::to_le_bytes).concat();
         refused("a.npy", &npy_bytes("<f8", false, "(3,)", &numbers), 12, &["shape", "[3]", "[views, 12]"]);
         refused("a.npy:x", &npy_bytes("<f8", false, "(3,)", &numbers), 1, &["array", "\"x\"", ".npz"]);
-        let above = read(Path::new("."), "s.toml", "circle.angles_deg", "../a.csv", 1);
-        says(above, &["s.toml: circle.angles_deg", "without \"..\""]);
     }
 }

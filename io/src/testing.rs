@@ -29,6 +29,21 @@ pub(crate) fn is_view(found: &View, want: [[f64; 3]; 4]) {
     }
 }
 
+/// Fails unless there are as many views, and each is that of `want`, to a billionth.
+pub(crate) fn are_views(found: &[View], want: &[View]) {
+    assert_eq!(found.len(), want.len());
+    found.iter().zip(want).for_each(|(found, w)| is_view(found, [w.source, w.detector, w.u, w.v]));
+}
+
+/// Fails unless detector and grid are those of `want`, and the views are, to a billionth.
+pub(crate) fn is_geometry(found: &Geometry, want: &Geometry) {
+    assert_eq!((found.detector, found.volume.shape), (want.detector, want.volume.shape));
+    are_views(&found.views, &want.views);
+    let (a, b) = (&found.volume, &want.volume);
+    let mut pairs = a.spacing.iter().chain(&a.center).zip(b.spacing.iter().chain(&b.center));
+    assert!(pairs.all(|(a, b)| (a - b).abs() < 1e-12), "{a:?} is not {b:?}");
+}
+
 /// Writes a 16-bit TIFF with the pixels that `f` gives for row and column.
 pub(crate) fn tiff16(path: &Path, [rows, columns]: [usize; 2], f: impl Fn(usize, usize) -> u16) {
     use tiff::encoder::{TiffEncoder, colortype::Gray16};
