@@ -22,6 +22,24 @@ pub(crate) fn says_just<T>(result: Result<T>, dir: &Path, words: &str) {
     assert_eq!(e.to_string().replace(&format!("{}/", dir.display()), ""), words);
 }
 
+/// Fails unless the scan that `description` describes is refused with just `words` about the `file` beside or below it,
+/// once `change` has damaged that. The file is as it was afterwards.
+pub(crate) fn damage_is_refused(description: &Path, file: &str, change: &dyn Fn(&mut Vec<u8>), words: &str) {
+    let dir = description.parent().unwrap();
+    let whole = std::fs::read(dir.join(file)).unwrap();
+    let mut bytes = whole.clone();
+    change(&mut bytes);
+    assert_ne!(bytes, whole, "{words}");
+    std::fs::write(dir.join(file), bytes).unwrap();
+    says_just(read_scanner(description, None), dir, &format!("{file}: {words}"));
+    std::fs::write(dir.join(file), whole).unwrap();
+}
+
+/// A change that puts `to` in place of `from`.
+pub(crate) fn replaced<'a>(from: &'a str, to: &'a str) -> impl Fn(&mut Vec<u8>) + 'a {
+    move |bytes| *bytes = std::str::from_utf8(bytes).unwrap().replace(from, to).into_bytes()
+}
+
 /// Fails unless source, detector, u and v are `want`, to a billionth.
 pub(crate) fn is_view(found: &View, want: [[f64; 3]; 4]) {
     for (found, want) in [found.source, found.detector, found.u, found.v].into_iter().zip(want) {

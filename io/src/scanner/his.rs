@@ -111,7 +111,7 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
 
 #[cfg(test)]
 mod tests {
-    use crate::testing::{is_view, read_scan, read_scanner, says_just};
+    use crate::testing::{damage_is_refused, is_view, read_scan, read_scanner, replaced, says_just};
     use std::fmt::Write;
     use std::fs;
     use std::path::PathBuf;
@@ -178,14 +178,9 @@ mod tests {
 
     #[test]
     fn hostile_files_are_refused_in_words() {
-        let refused = |change: &dyn Fn(&mut Vec<u8>), words: &str| {
-            let (dir, path) = written(&FRAMES);
-            let file = dir.path().join("00001.1.3.46.his");
-            let mut bytes = fs::read(&file).unwrap();
-            change(&mut bytes);
-            fs::write(&file, bytes).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), &format!("00001.1.3.46.his: {words}"));
-        };
+        let (dir, path) = written(&FRAMES);
+        let refused =
+            |change: &dyn Fn(&mut Vec<u8>), words: &str| damage_is_refused(&path, "00001.1.3.46.his", change, words);
         let set = |at: usize, x: u16| move |b: &mut Vec<u8>| b[at..at + 2].copy_from_slice(&x.to_le_bytes());
         refused(&|b| b.truncate(60), "header: found the end of the file after 60 bytes, expected 68 bytes");
         refused(&set(0, 0x7100), "format: found [00, 71, 44, 00] at the start, expected 00 70 44 00");
@@ -210,30 +205,20 @@ mod tests {
             "header of the image: found the end of the file after 160 bytes, expected 60000 bytes",
         );
         for (from, to, words) in [
-            ("<UCentre>114</UCentre>", "", "_Frames.xml: frame 2: UCentre: found nothing, expected a number"),
-            (
-                "<GantryAngle>90<",
-                "<GantryAngle>NaN<",
-                "_Frames.xml: frame 2: GantryAngle: found \"NaN\", expected a number",
-            ),
+            ("<UCentre>114</UCentre>", "", "frame 2: UCentre: found nothing, expected a number"),
+            ("<GantryAngle>90<", "<GantryAngle>NaN<", "frame 2: GantryAngle: found \"NaN\", expected a number"),
             (
                 "</Frames>",
                 "<Frame><GantryAngle>1</GantryAngle><UCentre>0</UCentre><VCentre>0</VCentre></Frame></Frames>",
-                "_Frames.xml: frames: found 4, expected 3, one for each image (are frames or images missing?)",
+                "frames: found 4, expected 3, one for each image (are frames or images missing?)",
             ),
         ] {
-            let (dir, path) = written(&FRAMES);
-            let text = fs::read_to_string(&path).unwrap();
-            assert!(text.contains(from), "{from}");
-            fs::write(&path, text.replace(from, to)).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), words);
+            damage_is_refused(&path, "_Frames.xml", &replaced(from, to), words);
         }
-        let (dir, path) = written(&[(0.0, 0.0, 0.0)]);
-        fs::remove_file(dir.path().join("00001.1.3.46.his")).unwrap();
-        says_just(
-            read_scanner(&path, None),
-            dir.path(),
-            "_Frames.xml: images: found none, expected *.his beside the file",
-        );
+        for i in 1..=3 {
+            fs::remove_file(dir.path().join(format!("{i:05}.1.3.46.his"))).unwrap();
+        }
+        let words = "_Frames.xml: images: found none, expected *.his beside the file";
+        says_just(read_scanner(&path, None), dir.path(), words);
     }
 }

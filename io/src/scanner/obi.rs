@@ -157,7 +157,7 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
 mod tests {
     use super::differences::tests::pack;
     use super::*;
-    use crate::testing::{is_view, read_scan, read_scanner, says_just};
+    use crate::testing::{damage_is_refused, is_view, read_scan, read_scanner, replaced, says_just};
     use std::fs;
     use std::path::PathBuf;
 
@@ -234,13 +234,10 @@ mod tests {
 
     #[test]
     fn hostile_files_are_refused_in_words() {
+        let [(dir, hnd), (_dir, hnc)] = [true, false].map(written);
         let refused = |compressed: bool, change: &dyn Fn(&mut Vec<u8>), words: &str| {
-            let (dir, path) = written(compressed);
-            let name = if compressed { "Scan0/Proj_00001.hnd" } else { "Scan0/Proj_00001.hnc" };
-            let mut bytes = fs::read(dir.path().join(name)).unwrap();
-            change(&mut bytes);
-            fs::write(dir.path().join(name), bytes).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), &format!("{name}: {words}"));
+            let (path, end) = if compressed { (&hnd, "hnd") } else { (&hnc, "hnc") };
+            damage_is_refused(path, &format!("Scan0/Proj_00001.{end}"), change, words);
         };
         let set = |at: usize, x: u32| move |b: &mut Vec<u8>| b[at..at + 4].copy_from_slice(&x.to_le_bytes());
         for compressed in [true, false] {
@@ -291,15 +288,11 @@ mod tests {
                 "XML: found the root node was opened but never closed, expected Varian's ProjectionInfo.xml",
             ),
         ] {
-            assert!(INFO.contains(from), "{from}");
-            let (dir, path) = written(true);
-            fs::write(&path, INFO.replace(from, to)).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), &format!("ProjectionInfo.xml: {words}"));
+            damage_is_refused(&hnd, "ProjectionInfo.xml", &replaced(from, to), words);
         }
-        let (dir, path) = written(true);
         fs::remove_dir_all(dir.path().join("Scan0")).unwrap();
         let words =
             "ProjectionInfo.xml: images: found none, expected *.hnd or *.hnc beside the file or in a folder there";
-        says_just(read_scanner(&path, None), dir.path(), words);
+        says_just(read_scanner(&hnd, None), dir.path(), words);
     }
 }

@@ -131,7 +131,7 @@ fn projections(keys: &Keys, path: &Path, step: f64, remarks: &mut Vec<String>) -
 
 #[cfg(test)]
 mod tests {
-    use crate::testing::{is_view, read_scan, read_scanner, says_just, tiff16};
+    use crate::testing::{damage_is_refused, is_view, read_scan, read_scanner, replaced, says_just, tiff16};
     use conefield_core::orbit::CircularOrbit;
     use std::fs;
     use std::path::PathBuf;
@@ -198,53 +198,48 @@ mod tests {
 
     #[test]
     fn what_is_missing_or_wrong_is_named() {
+        let (dir, path) = written(TEXT);
         for (from, to, words) in [
-            (
-                "Camera to Source (mm)=200.0",
-                "",
-                "bone_~00.log: Camera to Source (mm): found nothing, expected a number",
-            ),
+            ("Camera to Source (mm)=200.0", "", "Camera to Source (mm): found nothing, expected a number"),
             (
                 "Camera to Source (mm)=200.0",
                 "Camera to Source (mm)=20",
-                "bone_~00.log: Camera to Source (mm): found 20, expected more than the 50 of Object to Source (mm)",
+                "Camera to Source (mm): found 20, expected more than the 50 of Object to Source (mm)",
             ),
-            ("(um)=10.0", "(um)=NaN", "bone_~00.log: Image Pixel Size (um): found \"NaN\", expected a number"),
-            ("(deg)=90.0", "(deg)=-1", "bone_~00.log: Rotation Step (deg): found -1, expected a number above 0"),
-            ("=CC", "=left", "bone_~00.log: Rotation Direction: found \"left\", expected CC or CW"),
-            ("=ROUND", "=HELICAL", "bone_~00.log: Scanning Trajectory \"HELICAL\": only circles are read (ROUND)"),
+            ("(um)=10.0", "(um)=NaN", "Image Pixel Size (um): found \"NaN\", expected a number"),
+            ("(deg)=90.0", "(deg)=-1", "Rotation Step (deg): found -1, expected a number above 0"),
+            ("=CC", "=left", "Rotation Direction: found \"left\", expected CC or CW"),
+            ("=ROUND", "=HELICAL", "Scanning Trajectory \"HELICAL\": only circles are read (ROUND)"),
             (
                 "=ROUND",
                 "=ROUND\r\nNumber Of Horizontal Offset Positions=2",
-                "bone_~00.log: Number Of Horizontal Offset Positions above 1: join the images of the camera's positions \
+                "Number Of Horizontal Offset Positions above 1: join the images of the camera's positions \
                  to one scan first",
             ),
             (
                 "Files=  5",
                 "Files=  1e15",
-                "bone_~00.log: Number of Files: found 1000000000000000, expected a whole number from 1 to 1000000",
+                "Number of Files: found 1000000000000000, expected a whole number from 1 to 1000000",
             ),
             (
                 "Rows= 4",
                 "Rows= 3",
-                "bone_~00.log: files.projections: found 4 x 6, expected 3 x 6 (rows x columns), as the detector has",
+                "files.projections: found 4 x 6, expected 3 x 6 (rows x columns), as the detector has",
             ),
             (
                 "(mm)=50.000",
                 "(mm)=50\r\nObject to Source (mm)=60",
-                "bone_~00.log: line 11: Object to Source (mm): found a second value, 60, expected one value",
+                "line 11: Object to Source (mm): found a second value, 60, expected one value",
             ),
         ] {
-            assert!(TEXT.contains(from), "{from}");
-            let (dir, path) = written(&TEXT.replace(from, to));
-            says_just(read_scanner(&path, None), dir.path(), words);
+            damage_is_refused(&path, "bone_~00.log", &replaced(from, to), words);
         }
         let text = TEXT.replace("=ROUND", "=ROUND\r\nImage crop origin X=0\r\nImage Rotation=-0.0380");
-        let (_dir, path) = written(&text);
+        fs::write(&path, text).unwrap();
         let found = super::scan(&path).unwrap().remarks;
         assert_eq!(found[0], "not read, though they may change the geometry: Image Rotation = -0.0380");
         assert_eq!(found[1], "images that repeat a full turn are not read: 1");
-        let (dir, path) = written(TEXT);
+        fs::write(&path, TEXT).unwrap();
         fs::remove_file(dir.path().join("bone_~0000000002.tif")).unwrap();
         let words = "bone_~00.log: images: found none, expected image 2 of the 4, such as bone_~0000000002.tif";
         says_just(read_scanner(&path, None), dir.path(), words);

@@ -248,9 +248,9 @@ fn name_of(path: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::differences::tests::pack;
-    use crate::testing::{is_view, read_scan, read_scanner, says_just};
+    use crate::testing::{damage_is_refused, is_view, read_scan, read_scanner, replaced, says_just};
     use std::fs;
-    use std::path::{Path, PathBuf};
+    use std::path::PathBuf;
 
     const SIZE: [usize; 2] = [4, 6];
 
@@ -384,15 +384,9 @@ mod tests {
 
     #[test]
     fn hostile_files_are_refused_in_words() {
+        let (_dir, path) = written();
         let first = "Acquisitions/733061622/Proj_00001.xim";
-        let refused = |change: &dyn Fn(&mut Vec<u8>), words: &str| {
-            let (dir, path) = written();
-            let file = dir.path().join(first);
-            let mut bytes = fs::read(&file).unwrap();
-            change(&mut bytes);
-            fs::write(&file, bytes).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), &format!("{first}: {words}"));
-        };
+        let refused = |change: &dyn Fn(&mut Vec<u8>), words: &str| damage_is_refused(&path, first, change, words);
         let set = |at: usize, x: i32| move |b: &mut Vec<u8>| b[at..at + 4].copy_from_slice(&int(x));
         refused(&|b| b.truncate(20), "bits per pixel: found the end of the file after 0 bytes, expected 4 bytes");
         refused(&|b| b.truncate(5), "format: found [56, 4d, 53, 2e, 58] at the start, expected VMS.XI");
@@ -410,57 +404,33 @@ mod tests {
         refused(&|b| b[36] = 0xff, "lookup table: found the code 3, expected 0, 1 or 2 for one, two or four bytes");
         refused(&|b| b[36..40].fill(0xaa), "pixels: found the end after 14 of 24, expected a difference for each");
         refused(&|b| b.truncate(150), "List: found the end of the file after 1 bytes, expected 4 bytes");
-        let name = |b: &[u8], name: &[u8]| b.windows(name.len()).position(|w| w == name).unwrap();
-        refused(
-            &|b| {
-                let at = name(b, b"KVSourceRtn");
-                b[at] = b'X';
-            },
-            "KVSourceRtn: found nothing, expected a number among the properties",
-        );
-        refused(
-            &|b| {
-                let at = name(b, b"KVSourceRtn") + 15;
-                b[at..at + 8].copy_from_slice(&f64::NAN.to_le_bytes());
-            },
-            "KVSourceRtn: found NaN, expected a number among the properties",
-        );
-        refused(
-            &|b| {
-                let at = name(b, b"PixelWidth") + 14;
-                b[at..at + 8].copy_from_slice(&0f64.to_le_bytes());
-            },
-            "PixelWidth: found 0, expected a length above 0",
-        );
-        refused(
-            &|b| {
-                let at = name(b, b"Name") + 4;
-                b[at] = 3;
-            },
-            "type of Name: found 3, expected 0, 1, 2, 4 or 5",
-        );
-        // The third image is not compressed.
-        let (dir, path) = written();
-        let third = dir.path().join(first.replace("00001", "00003"));
-        let mut bytes = fs::read(&third).unwrap();
-        bytes[24..28].copy_from_slice(&int(3));
-        fs::write(&third, bytes).unwrap();
-        let words = format!("{}: bytes per pixel: found 3, expected 1, 2 or 4", first.replace("00001", "00003"));
-        says_just(read_scanner(&path, None), dir.path(), &words);
+        // Other bytes behind the name of a property and `skip` more.
+        let behind = |name: &'static str, skip: usize, bytes: &'static [u8]| {
+            move |b: &mut Vec<u8>| {
+                let at = b.windows(name.len()).position(|w| w == name.as_bytes()).unwrap() + name.len() + skip;
+                b[at..at + bytes.len()].copy_from_slice(bytes);
+            }
+        };
+        let expected = "expected a number among the properties";
+        refused(&behind("KVSourceRt", 0, b"X"), &format!("KVSourceRtn: found nothing, {expected}"));
+        refused(&behind("KVSourceRtn", 4, &[0xff; 8]), &format!("KVSourceRtn: found NaN, {expected}"));
+        refused(&behind("PixelWidth", 4, &[0; 8]), "PixelWidth: found 0, expected a length above 0");
+        refused(&behind("Name", 0, &[3]), "type of Name: found 3, expected 0, 1, 2, 4 or 5");
+        let third = &first.replace("00001", "00003");
+        // It is not compressed.
+        damage_is_refused(&path, third, &set(24, 3), "bytes per pixel: found 3, expected 1, 2 or 4");
     }
 
     #[test]
     fn a_text_without_distances_or_images_is_refused() {
-        for (from, to, words) in [
-            ("<SAD>1000</SAD>", "", "Scan.xml: SAD: found nothing, expected a number"),
-            ("1500", "-1500", "Scan.xml: SID: found -1500, expected a number above 0"),
-            ("1500", "far", "Scan.xml: SID: found \"far\", expected a number"),
-        ] {
-            let (dir, path) = written();
-            fs::write(&path, SCAN.replace(from, to)).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), words);
-        }
         let (dir, path) = written();
+        for (from, to, words) in [
+            ("<SAD>1000</SAD>", "", "SAD: found nothing, expected a number"),
+            ("1500", "-1500", "SID: found -1500, expected a number above 0"),
+            ("1500", "far", "SID: found \"far\", expected a number"),
+        ] {
+            damage_is_refused(&path, "Scan.xml", &replaced(from, to), words);
+        }
         fs::remove_dir_all(dir.path().join("Acquisitions")).unwrap();
         let words =
             "Scan.xml: images: found none, expected Proj_*.xim with pixels beside Scan.xml or below Acquisitions";
@@ -471,6 +441,5 @@ mod tests {
             "Calibrations/AIR-Half-Bowtie-125KV/Current/Filter.xim: Varian's XIM, an image of a scan: not read alone: name \
              the Scan.xml of its scan, or describe the images in a scanner.toml (docs/guide/formats.md)",
         );
-        assert!(Path::new(&path).is_file());
     }
 }
