@@ -103,10 +103,9 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
         if scanner::Vendor::of(path).is_some() {
             return Ok(ScanFile::Scanner(path.to_path_buf()));
         }
-        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         return match (path.file_name().and_then(|n| n.to_str()), path.extension().and_then(|e| e.to_str())) {
             (Some("scan.toml" | "scan.json"), _) => Ok(ScanFile::Own(path.to_path_buf())),
-            (Some(r2::META), _) => Ok(ScanFile::R2(folder.to_path_buf())),
+            (Some(r2::META), _) => Ok(ScanFile::R2(scan_folder::folder_of(path).to_path_buf())),
             (_, Some("toml" | "json")) => match format_of(path).as_deref() {
                 Some(scan_folder::FORMAT) => Ok(ScanFile::Own(path.to_path_buf())),
                 // The description's reader reports what is missing.

@@ -23,6 +23,7 @@
 //! ```
 
 use crate::folder;
+use crate::scanner::MOST_VIEWS;
 use crate::text::described;
 use crate::{ScanSize, npy, read_volume, write_atomic, write_folder_atomic, write_text_atomic, write_volume};
 use conefield_core::error::ensure;
@@ -38,9 +39,6 @@ pub(crate) const FORMAT: &str = "conefield-scan";
 const VERSION: u32 = 1;
 const PROJECTIONS: &str = "projections.npy";
 const TRUTH: &str = "truth.nii.gz";
-
-/// More views than any scanner takes; a larger `count` is a typo and would only fill memory.
-const MOST_VIEWS: usize = 1_000_000;
 
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

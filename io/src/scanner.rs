@@ -59,7 +59,7 @@ mod xim;
 mod xtekct;
 
 pub(crate) use pixels::Pixels;
-pub(crate) use vendor::Vendor;
+pub(crate) use vendor::{MOST_VIEWS, Vendor};
 
 use crate::hdf5::ScanPart;
 use crate::rtk::read_rtk_geometry;

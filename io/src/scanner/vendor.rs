@@ -10,8 +10,9 @@ use conefield_core::geometry::{View, VoxelGrid};
 use ndarray::{Array3, Axis};
 use std::path::Path;
 
-/// Most views of a description: a circle in steps of about one second of arc.
-pub(super) const MOST_VIEWS: usize = 1_000_000;
+/// Most views of a description: a circle in steps of about one second of arc. A larger number is a typing error and
+/// would only fill memory.
+pub(crate) const MOST_VIEWS: usize = 1_000_000;
 
 /// Most rows or columns of a detector.
 pub(super) const MOST_PIXELS: usize = 1_000_000;
