@@ -8,14 +8,13 @@
 //! Distances and the detector's size are fixed: 1000 and 1536 mm, 409.6 mm. The counts of XVI are 65536 less the number
 //! stored, and the open beam is 65536; 0 and 65535 are pixels without a count, which RTK takes for air.
 
+use super::Description;
 use super::keys::Keys;
-use super::vendor::{Open, Response, VendorScan, field_of_view};
+use super::vendor::{Open, Response};
 use crate::folder;
 use crate::input::{Input, LONGEST_TEXT};
 use crate::number::{ByteOrder, Number};
-use crate::rtk::Projection;
 use crate::scan_folder::folder_of;
-use crate::stack::Names;
 use crate::text::{self, read_foreign};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
@@ -77,7 +76,7 @@ pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
 }
 
 /// The scan that `_Frames.xml` at `path` describes.
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
+pub(super) fn scan(path: &Path) -> Result<Description> {
     let text = read_foreign(path, LONGEST_TEXT)?;
     let place = path.display().to_string();
     let document = text::xml(&place, &text, "Elekta's _Frames.xml")?;
@@ -86,27 +85,17 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
     let first = images.first().ok_or_else(|| Error::invalid(&place, "images", "none", "*.his beside the file"))?;
     let [_, rows, columns] = shape(&folder::inside(folder, &place, "images", first)?)?;
     let pixel = [SIDE / rows as f64, SIDE / columns as f64];
-    let (mut views, mut aside) = (Vec::new(), 0.0f64);
+    let mut stands = Vec::new();
     for frame in document.descendants().filter(|n| n.tag_name().name() == "Frame") {
-        let keys = Keys::xml(format!("{place}: frame {}", views.len() + 1), frame);
+        let keys = Keys::xml(format!("{place}: frame {}", stands.len() + 1), frame);
         let detector = [-keys.number("UCentre")?, -keys.number("VCentre")?];
-        aside = aside.max(detector[0].abs());
-        let gantry = keys.number("GantryAngle")?;
-        views.push(Projection { sid: SID, sdd: SDD, gantry, detector, ..Projection::default() }.view(pixel, [0.0; 2]));
+        stands.push((keys.number("GantryAngle")?, detector));
     }
     let expected = format!("{}, one for each image (are frames or images missing?)", images.len());
-    ensure(views.len() == images.len(), &place, "frames", views.len(), expected)?;
-    let mut remarks = Vec::new();
-    let at_axis = pixel.map(|x| x * SID / SDD);
-    Ok(VendorScan {
-        volume: field_of_view(&place, [rows, columns], at_axis, aside * SID / SDD, &mut remarks)?,
-        views,
-        detector: [rows, columns],
-        projections: Names::Many(images),
-        open: Open::Number(I0.into()),
-        response: Response::Inverted,
-        remarks,
-    })
+    ensure(stands.len() == images.len(), &place, "frames", stands.len(), expected)?;
+    let (size, open) = ([rows, columns], Open::Number(I0.into()));
+    let scan = Description::on_gantry(&place, images, open, [SID, SDD], size, pixel, &stands, vec![])?;
+    Ok(Description { response: Response::Inverted, ..scan })
 }
 
 #[cfg(test)]

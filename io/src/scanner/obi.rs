@@ -9,15 +9,13 @@
 //! the shifts are RTK's own: columns run along its x, rows up. The image says nothing of the open beam; RTK's number for
 //! this detector is taken.
 
-use super::differences;
 use super::keys::Keys;
-use super::vendor::{Open, Response, VendorScan, field_of_view};
+use super::vendor::Open;
+use super::{Description, differences};
 use crate::folder;
 use crate::input::{Input, LONGEST_TEXT};
 use crate::number::{ByteOrder, Number};
-use crate::rtk::Projection;
 use crate::scan_folder::folder_of;
-use crate::stack::Names;
 use crate::text::{self, read_foreign};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
@@ -115,7 +113,7 @@ pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
 }
 
 /// The scan that the text `path` describes.
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
+pub(super) fn scan(path: &Path) -> Result<Description> {
     let text = read_foreign(path, LONGEST_TEXT)?;
     let place = path.display().to_string();
     let document = text::xml(&place, &text, "Varian's ProjectionInfo.xml")?;
@@ -136,21 +134,10 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
     for (field, x) in [("pixel height", first.pixel[0]), ("pixel width", first.pixel[1])] {
         ensure(x > 0.0, &images[0], field, x, "a length above 0")?;
     }
-    let view = |h: &Head| {
-        Projection { sid, sdd, gantry: h.angle, detector, ..Projection::default() }.view(first.pixel, [0.0; 2])
-    };
-    let at_axis = first.pixel.map(|x| x * sid / sdd);
-    let mut remarks =
-        vec![format!("the files do not state the open beam; {I0} counts are taken, as RTK does (--i0 sets others)")];
-    Ok(VendorScan {
-        views: heads.iter().map(view).collect(),
-        detector: first.size,
-        open: Open::Number(I0),
-        response: Response::Counts,
-        volume: field_of_view(&place, first.size, at_axis, detector[0] * sid / sdd, &mut remarks)?,
-        projections: Names::Many(images),
-        remarks,
-    })
+    let stands: Vec<_> = heads.iter().map(|h| (h.angle, detector)).collect();
+    let remark = format!("the files do not state the open beam; {I0} counts are taken, as RTK does (--i0 sets others)");
+    let (open, size, pixel) = (Open::Number(I0), first.size, first.pixel);
+    Description::on_gantry(&place, images, open, [sid, sdd], size, pixel, &stands, vec![remark])
 }
 
 #[cfg(test)]

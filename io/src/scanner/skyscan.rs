@@ -13,8 +13,9 @@
 //!
 //! `Reference Intensity` is the count to which the scanner scales its open beam (`Flat Field Correction=ON`).
 
+use super::Description;
 use super::keys::Keys;
-use super::vendor::{MOST_PIXELS, MOST_VIEWS, Open, Response, VendorScan, field_of_view};
+use super::vendor::{MOST_PIXELS, MOST_VIEWS, Open, field_of_view};
 use crate::folder;
 use crate::input::LONGEST_TEXT;
 use crate::scan_folder::folder_of;
@@ -50,7 +51,7 @@ const KNOWN: &[&str] = &[
     FILES, ROWS, COLUMNS, PIXEL, OBJECT, CAMERA, STEP, DIRECTION, AXIS, POSTALIGNMENT, REFERENCE, TRAJECTORY, POSITIONS,
 ];
 
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
+pub(super) fn scan(path: &Path) -> Result<Description> {
     let text = read_foreign(path, LONGEST_TEXT)?;
     let keys = Keys::ini(path.display().to_string(), &text, KNOWN)?;
     if let Some(found) = keys.text(TRAJECTORY).filter(|t| !t.eq_ignore_ascii_case("round")) {
@@ -89,15 +90,10 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
         Some(_) => Open::Number(keys.length(REFERENCE)?),
         None => Open::Air,
     };
-    Ok(VendorScan {
-        views: CircularOrbit { dso, dsd, pixel: [pixel; 2], offset, angles }.views(),
-        detector: [rows, columns],
-        projections,
-        open,
-        response: Response::Counts,
-        volume: field_of_view(keys.place(), [rows, columns], [at_axis; 2], offset[1] * dso / dsd, &mut remarks)?,
-        remarks,
-    })
+    let views = CircularOrbit { dso, dsd, pixel: [pixel; 2], offset, angles }.views();
+    let aside = offset[1] * dso / dsd;
+    let volume = field_of_view(keys.place(), [rows, columns], [at_axis; 2], aside, &mut remarks)?;
+    Ok(Description::of_vendor(projections, open, views, [rows, columns], volume, remarks))
 }
 
 /// The images, numbered from 0, before the first that completes a turn, and their number. They begin with the prefix in

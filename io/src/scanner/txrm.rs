@@ -9,8 +9,9 @@
 //! CIL reads it. `Alignment/X-Shifts` and `Y-Shifts` are, for each view, the pixels by which its image belongs further
 //! along columns and rows.
 
+use super::Description;
 use super::turning::TurningObject;
-use super::vendor::{MOST_VIEWS, Open, Response, VendorScan, field_of_view};
+use super::vendor::{MOST_VIEWS, Open, field_of_view};
 use crate::hdf5::ScanPart;
 use crate::memory;
 use crate::number::{ByteOrder, Number};
@@ -171,7 +172,7 @@ pub(super) fn read(path: &Path, part: ScanPart) -> Result<Array3<f32>> {
 }
 
 /// The scan in `path`.
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
+pub(super) fn scan(path: &Path) -> Result<Description> {
     let mut txrm = Txrm::open(path)?;
     for (name, wanted, what) in [
         ("ImageInfo/AcquisitionMode", 0, "projections (0); a reconstructed volume is not read"),
@@ -215,15 +216,8 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
         Open::Air
     };
     let aside = x.iter().sum::<f64>() / count as f64 * at_axis;
-    Ok(VendorScan {
-        views,
-        detector: [rows, columns],
-        projections: own,
-        open,
-        response: Response::Counts,
-        volume: field_of_view(&txrm.place, [rows, columns], [at_axis; 2], aside, &mut remarks)?,
-        remarks,
-    })
+    let volume = field_of_view(&txrm.place, [rows, columns], [at_axis; 2], aside, &mut remarks)?;
+    Ok(Description::of_vendor(own, open, views, [rows, columns], volume, remarks))
 }
 
 #[cfg(test)]

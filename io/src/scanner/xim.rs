@@ -13,13 +13,12 @@
 //! The chamber before the patient, `KVNormChamber`, measures the beam of each image: counts are brought to that of the
 //! open beam.
 
-use super::differences;
 use super::keys::Keys;
-use super::vendor::{Open, Response, VendorScan, field_of_view};
+use super::vendor::{Open, Response};
+use super::{Description, differences};
 use crate::folder;
 use crate::input::{Input, LONGEST_TEXT};
 use crate::number::{ByteOrder, Number};
-use crate::rtk::Projection;
 use crate::scan_folder::folder_of;
 use crate::stack::Names;
 use crate::text::{self, read_foreign};
@@ -180,7 +179,7 @@ pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
 }
 
 /// The scan that the `Scan.xml` at `path` describes.
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
+pub(super) fn scan(path: &Path) -> Result<Description> {
     let text = read_foreign(path, LONGEST_TEXT)?;
     let place = path.display().to_string();
     let document = text::xml(&place, &text, "Varian's Scan.xml")?;
@@ -212,14 +211,11 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
         Error::invalid(&place, "images", "none", "Proj_*.xim with pixels beside Scan.xml or below Acquisitions")
     })?;
     let pixel = [first.length("PixelHeight")?, first.length("PixelWidth")?];
-    let mut aside = 0.0f64;
-    let mut view = |h: &Head| -> Result<_> {
+    let stand = |h: &Head| -> Result<_> {
         let detector = [10.0 * h.number("KVDetectorLat")?, 10.0 * h.number("KVDetectorLng")?];
-        aside = aside.max(detector[0].abs());
-        let gantry = 180.0 - h.number("KVSourceRtn")?;
-        Ok(Projection { sid, sdd, gantry, detector, ..Projection::default() }.view(pixel, [0.0; 2]))
+        Ok((180.0 - h.number("KVSourceRtn")?, detector))
     };
-    let views = found.iter().map(&mut view).collect::<Result<Vec<_>>>()?;
+    let stands = found.iter().map(stand).collect::<Result<Vec<_>>>()?;
     let (open, response) = if open.is_empty() {
         remarks.push("no open beam in Calibrations/Air-*: it is estimated from the border of each view".to_owned());
         (Open::Air, Response::Counts)
@@ -228,16 +224,8 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
         let factor = |h: &Head| h.length(CHAMBER).map(|c| (beam / c) as f32);
         (Open::Flat(Names::Many(flats)), Response::Factors(found.iter().map(factor).collect::<Result<_>>()?))
     };
-    let at_axis = pixel.map(|x| x * sid / sdd);
-    Ok(VendorScan {
-        volume: field_of_view(&place, first.size, at_axis, aside * sid / sdd, &mut remarks)?,
-        views,
-        detector: first.size,
-        projections: Names::Many(images),
-        open,
-        response,
-        remarks,
-    })
+    let scan = Description::on_gantry(&place, images, open, [sid, sdd], first.size, pixel, &stands, remarks)?;
+    Ok(Description { response, ..scan })
 }
 
 /// The name of the file at a relative path, in small letters.

@@ -10,9 +10,10 @@
 //! The angles are those of the stage in `_ctdata.txt` or `Name.ang` (rows of a projection's number and its angle, as
 //! TIGRE reads them), unless `AngleFile_Use` is `False`; without such a file, even steps.
 
+use super::Description;
 use super::keys::Keys;
 use super::turning::TurningObject;
-use super::vendor::{MOST_PIXELS, MOST_VIEWS, Open, Response, VendorScan, field_of_view};
+use super::vendor::{MOST_PIXELS, MOST_VIEWS, Open, field_of_view};
 use crate::folder;
 use crate::input::LONGEST_TEXT;
 use crate::scan_folder::folder_of;
@@ -25,7 +26,7 @@ use std::path::Path;
 /// Share of a step by which measured angles may differ from even steps before a warning.
 const UNEVEN: f64 = 0.1;
 
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
+pub(super) fn scan(path: &Path) -> Result<Description> {
     let text = read_foreign(path, LONGEST_TEXT)?;
     let keys = Keys::ini(path.display().to_string(), &text, KNOWN)?;
     if let Some(unit) = keys.text("Units").filter(|u| !u.eq_ignore_ascii_case("mm")) {
@@ -58,15 +59,9 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
     let projections = projections(&keys, path, count, &mut remarks);
     remarks.extend(unread(&keys.others(MOVING, KNOWN)));
     let at_axis = [row, column].map(|x| x * object / detector);
-    Ok(VendorScan {
-        views: rest.views(angles.into_iter().map(|a| a - 180.0)),
-        detector: [rows, columns],
-        projections,
-        open: Open::Number(white),
-        response: Response::Counts,
-        volume: volume(&keys, [rows, columns], at_axis, aside - aside_detector * object / detector, &mut remarks)?,
-        remarks,
-    })
+    let volume = volume(&keys, [rows, columns], at_axis, aside - aside_detector * object / detector, &mut remarks)?;
+    let views = rest.views(angles.into_iter().map(|a| a - 180.0));
+    Ok(Description::of_vendor(projections, Open::Number(white), views, [rows, columns], volume, remarks))
 }
 
 /// The angles of `count` views, in degrees: measured ones, else even steps.
