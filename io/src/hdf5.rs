@@ -248,10 +248,10 @@ impl Container {
     /// The values of the `kept` frames along the first axis, or of all.
     fn values(&self, data: &Dataset, kept: Option<&[bool]>) -> Result<ArrayD<f32>> {
         let mut shape = self.shape(data)?;
-        if !(2..=3).contains(&shape.len()) {
-            let found = format!("{shape:?}");
-            return Err(self.invalid(data.name(), found, "two axes (row, column) or three (view, row, column)"));
-        }
+        let Some([_, rows, columns]) = three(data.shape(), 1) else {
+            let expected = "two axes (row, column) or three (view, row, column)";
+            return Err(self.invalid(data.name(), format!("{shape:?}"), expected));
+        };
         // The place of each frame in the result.
         let mut count = 0;
         let places: Vec<Option<usize>> = (0..shape[0])
@@ -261,10 +261,9 @@ impl Container {
                 place
             })
             .collect();
-        let frame: usize = shape[1..].iter().product();
         let values = match data.chunks() {
-            Some(_) => self.chunked(data, &shape, &places, count * frame)?,
-            None => self.contiguous(data, &shape, &places, count * frame)?,
+            Some(_) => self.chunked(data, &places, [rows, columns], count * rows * columns)?,
+            None => self.contiguous(data, &places, rows * columns, count * rows * columns)?,
         };
         shape[0] = count;
         let array = ArrayD::from_shape_vec(IxDyn(&shape), values)
@@ -275,12 +274,17 @@ impl Container {
         }
     }
 
-    /// Reads chunk by chunk, in the order of the file; memory grows with the frames read.
-    fn chunked(&self, data: &Dataset, shape: &[usize], places: &[Option<usize>], total: usize) -> Result<Vec<f32>> {
+    /// Reads frames of `rows` and `columns` chunk by chunk, in the order of the file, each to its place; memory grows with
+    /// the `total` values read.
+    fn chunked(
+        &self,
+        data: &Dataset,
+        places: &[Option<usize>],
+        [rows, columns]: [usize; 2],
+        total: usize,
+    ) -> Result<Vec<f32>> {
         let (number, order) = self.number(data)?;
-        let frame: usize = shape[1..].iter().product();
-        // With two axes each row is a frame of one row.
-        let [rows, columns] = [if shape.len() == 3 { shape[1] } else { 1 }, shape[shape.len() - 1]];
+        let shape = [places.len(), rows, columns];
         // The stored and the decompressed chunk.
         let chunk =
             data.chunks().into_iter().flatten().fold(number.bytes() as u64, |n, k| n.saturating_mul(u64::from(k)));
@@ -290,37 +294,27 @@ impl Container {
         let (mut seen, mut wanted) = (0u64, 1u64);
         for chunk in data.iter_chunks().map_err(|e| self.broken(data, &e))? {
             let chunk = chunk.map_err(|e| self.broken(data, &e))?;
-            let at: Vec<usize> = chunk.offsets().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
-            let size: Vec<usize> = chunk.shape().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
-            let inside = at.iter().zip(shape).all(|(a, s)| a < s) && size.iter().all(|n| *n > 0);
-            if at.len() != shape.len() || size.len() != shape.len() || !inside {
-                return Err(self.invalid(
-                    data.name(),
-                    format!("a chunk at {at:?}"),
-                    format!("chunks within {shape:?}"),
-                ));
-            }
+            let found = three(chunk.offsets(), 0).zip(three(chunk.shape(), 1));
+            let Some((at, size)) = found.filter(|(at, size)| (0..3).all(|k| at[k] < shape[k] && size[k] > 0)) else {
+                let found = format!("a chunk at {:?}", chunk.offsets());
+                return Err(self.invalid(data.name(), found, format!("chunks within {:?}", data.shape())));
+            };
             wanted = shape.iter().zip(&size).map(|(s, n)| s.div_ceil(*n) as u64).product();
             seen += 1;
             let held = chunk.bytes().len() / number.bytes();
             allowance::numbers(&self.place, data.name(), held.saturating_sub(decoded.capacity()))?;
             decoded.clear();
             number.singles(order, chunk.bytes(), &mut decoded);
-            // Frames, rows and columns of the chunk.
-            let [depth, height, width] = match size[..] {
-                [d, h, w] => [d, h, w],
-                [d, w] => [d, 1, w],
-                _ => [0; 3],
-            };
+            let [depth, height, width] = size;
             if depth.checked_mul(height).and_then(|n| n.checked_mul(width)) != Some(decoded.len()) {
                 let found = format!("a chunk of {} values", decoded.len());
-                return Err(self.invalid(data.name(), found, format!("chunks of {size:?}")));
+                return Err(self.invalid(data.name(), found, format!("chunks of {:?}", chunk.shape())));
             }
-            let [row, column] = [if shape.len() == 3 { at[1] } else { 0 }, at[shape.len() - 1]];
+            let [frame, row, column] = at;
             let [height_in, width_in] = [height.min(rows - row), width.min(columns - column)];
-            for (d, place) in places[at[0]..].iter().take(depth).enumerate() {
+            for (d, place) in places[frame..].iter().take(depth).enumerate() {
                 let Some(place) = place else { continue };
-                let end = (place + 1) * frame;
+                let end = (place + 1) * rows * columns;
                 if out.len() < end {
                     let more = end - out.len();
                     memory::grow(&mut out, more, total, &self.place, data.name())?;
@@ -328,7 +322,7 @@ impl Container {
                 }
                 for h in 0..height_in {
                     let from = (d * height + h) * width;
-                    let to = place * frame + (row + h) * columns + column;
+                    let to = (place * rows + row + h) * columns + column;
                     out[to..to + width_in].copy_from_slice(&decoded[from..from + width_in]);
                 }
             }
@@ -342,21 +336,18 @@ impl Container {
     }
 
     /// Reads a few frames at a time.
-    fn contiguous(&self, data: &Dataset, shape: &[usize], places: &[Option<usize>], total: usize) -> Result<Vec<f32>> {
+    fn contiguous(&self, data: &Dataset, places: &[Option<usize>], frame: usize, total: usize) -> Result<Vec<f32>> {
         let (number, _) = self.number(data)?;
-        let frame: usize = shape[1..].iter().product();
         let step = (SLAB_BYTES / (frame as u64 * number.bytes() as u64).max(1)).max(1) as usize;
         let mut out: Vec<f32> = Vec::new();
         memory::grow(&mut out, total, usize::MAX, &self.place, data.name())?;
-        allowance::memory(&self.place, data.name(), 2 * (step.min(shape[0]) * frame * number.bytes()) as u64)?;
-        for from in (0..shape[0]).step_by(step) {
-            let to = (from + step).min(shape[0]);
-            let places = &places[from..to];
+        allowance::memory(&self.place, data.name(), 2 * (step.min(places.len()) * frame * number.bytes()) as u64)?;
+        for (from, places) in (0u64..).step_by(step).zip(places.chunks(step)) {
             if places.iter().all(Option::is_none) {
                 continue;
             }
-            let mut selection = SliceInfo::all(shape.len());
-            selection.selections[0] = SliceInfoElem::Slice { start: from as u64, end: to as u64, step: 1 };
+            let mut selection = SliceInfo::all(data.ndim());
+            selection.selections[0] = SliceInfoElem::Slice { start: from, end: from + places.len() as u64, step: 1 };
             let slab = data.read_slice::<Single>(&selection).map_err(|e| self.broken(data, &e))?;
             for (values, _) in slab.outer_iter().zip(places).filter(|(_, place)| place.is_some()) {
                 out.extend(values.iter().map(|x| x.0));
@@ -399,6 +390,17 @@ impl Container {
         let as_float = || attribute.read_scalar::<f64>().or(attribute.read_scalar::<f32>().map(f64::from));
         as_float().or_else(|_| as_integer()).ok().filter(|x| x.is_finite())
     }
+}
+
+/// Positions or sizes along frames, rows and columns; if there are two, each row is a frame, and `row` is that of its only
+/// row. `None` for another number of axes.
+fn three(all: &[u64], row: u64) -> Option<[usize; 3]> {
+    let three = match *all {
+        [frame, column] => [frame, row, column],
+        [frame, row, column] => [frame, row, column],
+        _ => return None,
+    };
+    Some(three.map(|n| usize::try_from(n).unwrap_or(usize::MAX)))
 }
 
 /// How values of the type `dtype` are stored; `None` if they are not numbers.

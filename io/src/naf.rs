@@ -111,7 +111,6 @@ pub(crate) fn read(path: &Path, with_test: bool) -> Result<DataSet> {
 
     let said = stated_unit(&place, &top)?;
     let mut agreement = data.as_ref().and_then(|d| rays::agreement(&train, d));
-    let mut swapped = false;
     if let (None, Some(data), Some(given)) = (&said, &data, agreement)
         && file.offset[0] != file.offset[1]
     {
@@ -120,8 +119,11 @@ pub(crate) fn read(path: &Path, with_test: bool) -> Result<DataSet> {
         other.turn(&mut turned.geometry, &file);
         if let Some(better) = rays::agreement(&turned, data).filter(|o| o.residual < 0.5 * given.residual) {
             tracing::warn!("{place}: offDetector fits the image as [u, v], not as [v, u], and is read so");
-            (train, agreement, swapped) = (turned, Some(better), true);
+            (train, agreement) = (turned, Some(better));
             test.iter_mut().for_each(|t| other.turn(&mut t.geometry, &file));
+            for s in [Some(&mut train), test.as_mut()].into_iter().flatten() {
+                s.provenance["offset_from"] = json!("image and projections: offDetector is [u, v]");
+            }
         }
     }
     let units = match said {
@@ -130,17 +132,7 @@ pub(crate) fn read(path: &Path, with_test: bool) -> Result<DataSet> {
             unit::from_numbers(&place, agreement, &READINGS, "nothing: taken for lengths in mm, attenuation in 1/mm")
         }
     };
-    for s in [Some(&mut train), test.as_mut()].into_iter().flatten() {
-        s.geometry = s.geometry.scaled(units.length_mm);
-        s.unit = units.unit.clone();
-        s.provenance["unit_from"] = json!(units.found);
-        if swapped {
-            s.provenance["offset_from"] = json!("image and projections: offDetector is [u, v]");
-        }
-        s.validate(&place)?;
-    }
-    let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
-    Ok(DataSet { train, test, volume })
+    units.data_set(&place, train, test, data)
 }
 
 /// The entries shared by all views, in mm.
@@ -338,11 +330,9 @@ fn stated_unit(place: &str, top: &Item) -> Result<Option<Unit>> {
 pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let (orbit, test_orbit) = common_orbit(&place, "NAF's format", train, test)?;
+    let (orbit, test_orbit) = common_orbit(&place, "NAF's format", train, test, volume)?;
     let (g, grid) = (&train.geometry, &train.geometry.volume);
     if let Some(v) = volume {
-        let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", grid.shape));
-        ensure(v.data.shape() == grid.shape, &place, "shape of the volume", found, expected)?;
         if let Some((at, x)) = stray(&v.data) {
             let field = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
             return Err(Error::invalid(place, field, x, "a finite number"));

@@ -3,16 +3,17 @@
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::orbit::{Beam, CircularOrbit};
-use conefield_core::scan::Scan;
+use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 
 /// The orbits of `train` and `test` for a `format` that supports only circles, the same for both scans. Refuses
-/// anything else, and a test scan with another detector or grid.
+/// anything else, a test scan with another detector or grid, and a `volume` that does not fill the grid.
 pub(crate) fn common_orbit(
     place: &str,
     format: &str,
     train: &Scan,
     test: Option<&Scan>,
+    volume: Option<&Volume>,
 ) -> Result<(CircularOrbit, Option<CircularOrbit>)> {
     let fit = |name: &str, s: &Scan| -> Result<CircularOrbit> {
         s.validate(&format!("{place}: {name}"))?;
@@ -22,6 +23,10 @@ pub(crate) fn common_orbit(
         })
     };
     let orbit = fit("training", train)?;
+    if let Some(v) = volume {
+        let (found, grid) = (v.data.shape(), train.geometry.volume.shape);
+        ensure(found == grid, place, "shape of the volume", format!("{found:?}"), format!("{grid:?}"))?;
+    }
     let Some(test) = test else { return Ok((orbit, None)) };
     let other = fit("test", test)?;
     let near = |a: f64, b: f64| (a - b).abs() <= 1e-6 * orbit.dsd;

@@ -145,18 +145,11 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
         let provenance = json!({ "format": "r2", "folder": folder.file_name().map(|n| n.to_string_lossy()) });
         Ok(Scan { geometry, projections, unit: Unit { name: "r2".into(), mm: 1.0 }, provenance })
     };
-    let mut train = scan("proj_train", &meta.proj_train)?;
-    let mut test = (with_test && !meta.proj_test.is_empty()).then(|| scan("proj_test", &meta.proj_test)).transpose()?;
+    let train = scan("proj_train", &meta.proj_train)?;
+    let test = (with_test && !meta.proj_test.is_empty()).then(|| scan("proj_test", &meta.proj_test)).transpose()?;
     let data = meta.vol.as_deref().map(|name| volume(folder, &place, name, s.nVoxel)).transpose()?;
     let units = length_unit(&place, meta.unit, &train, data.as_ref())?;
-    for s in [Some(&mut train), test.as_mut()].into_iter().flatten() {
-        s.geometry = s.geometry.scaled(units.length_mm);
-        s.unit = units.unit.clone();
-        s.provenance["unit_from"] = json!(units.found);
-        s.validate(&place)?;
-    }
-    let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
-    Ok(DataSet { train, test, volume })
+    units.data_set(&place, train, test, data)
 }
 
 /// The size of the folder's training views. `reading` covers the spare capacity of a growing list, and the volume,
@@ -266,11 +259,7 @@ fn volume(folder: &Path, place: &str, name: &str, shape: [usize; 3]) -> Result<A
 pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let folder = folder.as_ref();
     let place = folder.display().to_string();
-    let (orbit, test_orbit) = common_orbit(&place, "R2-Gaussian's format", train, test)?;
-    if let Some(v) = volume {
-        let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", train.geometry.volume.shape));
-        ensure(v.data.shape() == train.geometry.volume.shape, &place, "shape of the volume", found, expected)?;
-    }
+    let (orbit, test_orbit) = common_orbit(&place, "R2-Gaussian's format", train, test, volume)?;
     let known = |n: &str| [META, "proj_train", "proj_test", "vol_gt.npy"].contains(&n);
     folder::may_replace(folder, "R2-Gaussian folder", known, &[META])?;
     for split in ["proj_train", "proj_test"] {
