@@ -100,7 +100,7 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
         if pickle::is_pickle(path)? {
             return Ok(ScanFile::Naf(path.to_path_buf()));
         }
-        if scanner::Vendor::of(path).is_some() {
+        if scanner::is_vendors(path) {
             return Ok(ScanFile::Scanner(path.to_path_buf()));
         }
         return match (path.file_name().and_then(|n| n.to_str()), path.extension().and_then(|e| e.to_str())) {
@@ -128,22 +128,5 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
             foreign::refuse_folder(path)?;
             Err(Error::invalid(place, "scan", "none of the files that describe one", understood))
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::testing::says;
-
-    #[test]
-    fn a_refusal_lists_the_files_of_a_scan() {
-        let dir = tempfile::tempdir().unwrap();
-        says(read_scan(dir.path()), &["scan.toml", "scan.json", "meta_data.json"]);
-        says(read_scan(dir.path().join("none")), &["none"]);
-        std::fs::write(dir.path().join("scan.toml"), "").unwrap();
-        std::fs::write(dir.path().join("scan.json"), "").unwrap();
-        assert!(read_scan(dir.path()).unwrap_err().to_string().contains("both"));
-        assert!(read_truth(dir.path()).unwrap_err().to_string().contains("both"));
     }
 }

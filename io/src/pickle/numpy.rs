@@ -96,10 +96,10 @@ impl Dtype {
 pub(super) struct Array<'a> {
     dtype: Dtype,
     /// Lengths in storage order, slowest first.
-    stored: Vec<usize>,
+    pub stored: Vec<usize>,
     /// Axis `k` of the array is axis `axes[k]` of the storage.
-    axes: Vec<usize>,
-    count: usize,
+    pub axes: Vec<usize>,
+    pub count: usize,
     data: Value<'a>,
 }
 
@@ -108,25 +108,9 @@ impl<'a> Array<'a> {
         self.axes.iter().map(|&a| self.stored[a]).collect()
     }
 
-    pub fn stored(&self) -> &[usize] {
-        &self.stored
-    }
-
-    pub fn axes(&self) -> &[usize] {
-        &self.axes
-    }
-
-    pub fn count(&self) -> usize {
-        self.count
-    }
-
-    /// The numbers as `f32`, in storage order; `None` if they do not fit in memory.
-    pub fn floats(&self, heap: &Heap<'a>) -> Option<Vec<f32>> {
-        let mut out = Vec::new();
-        out.try_reserve_exact(self.count).ok()?;
-        let raw = heap.bytes(self.data).unwrap_or_default();
-        self.dtype.number.singles(self.dtype.order, raw, &mut out);
-        Some(out)
+    /// Appends the numbers as `f32`, in storage order.
+    pub fn singles(&self, heap: &Heap<'a>, out: &mut Vec<f32>) {
+        self.dtype.number.singles(self.dtype.order, heap.bytes(self.data).unwrap_or_default(), out);
     }
 
     /// The numbers in storage order.

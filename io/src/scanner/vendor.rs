@@ -22,46 +22,33 @@ pub(super) const MOST_PIXELS: usize = 1_000_000;
 /// may not fit in memory.
 const MOST_VOXELS: f64 = 512.0;
 
-/// A vendor's description of a scan.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Vendor {
-    Nikon,
-    SkyScan,
-    /// Varian's XIM.
-    TrueBeam,
-    /// Varian's HND and HNC.
-    Obi,
-    Elekta,
-    Zeiss,
+/// What reads a vendor's description of a scan, in the terms of `scanner.toml`.
+type Reader = fn(&Path) -> Result<Description>;
+
+/// The vendors' descriptions by extension, with words that only such a file holds where others use the extension too.
+const READERS: [(&str, &str, Reader); 6] = [
+    ("xtekct", "", xtekct::scan),
+    ("txrm", "", txrm::scan),
+    ("log", skyscan::MARK, skyscan::scan),
+    ("xml", xim::MARK, xim::scan),
+    ("xml", obi::MARK, obi::scan),
+    ("xml", his::MARK, his::scan),
+];
+
+/// The reader of the vendor that describes a scan in the file `path`.
+pub(super) fn reader(path: &Path) -> Option<Reader> {
+    let extension = path.extension()?.to_string_lossy().to_lowercase();
+    let mut readers = READERS.iter().filter(|(end, ..)| *end == extension).peekable();
+    let text = match readers.peek()? {
+        (_, "", _) => String::new(),
+        _ => read_foreign(path, LONGEST_TEXT).ok()?,
+    };
+    readers.find(|(_, mark, _)| text.contains(mark)).map(|(.., reader)| *reader)
 }
 
-impl Vendor {
-    /// The vendor that describes a scan in the file `path`, by its extension and, where others use that too, by words
-    /// in it.
-    pub fn of(path: &Path) -> Option<Self> {
-        let extension = path.extension()?.to_string_lossy().to_lowercase();
-        let marks: &[(&str, Self)] = match &extension[..] {
-            "xtekct" => return Some(Self::Nikon),
-            "txrm" => return Some(Self::Zeiss),
-            "log" => &[(skyscan::MARK, Self::SkyScan)],
-            "xml" => &[(xim::MARK, Self::TrueBeam), (obi::MARK, Self::Obi), (his::MARK, Self::Elekta)],
-            _ => return None,
-        };
-        let text = read_foreign(path, LONGEST_TEXT).ok()?;
-        marks.iter().find(|(words, _)| text.contains(words)).map(|(_, vendor)| *vendor)
-    }
-
-    /// The scan as a description in the terms of `scanner.toml`.
-    pub(super) fn description(self, path: &Path) -> Result<Description> {
-        match self {
-            Self::Nikon => xtekct::scan(path),
-            Self::SkyScan => skyscan::scan(path),
-            Self::TrueBeam => xim::scan(path),
-            Self::Obi => obi::scan(path),
-            Self::Elekta => his::scan(path),
-            Self::Zeiss => txrm::scan(path),
-        }
-    }
+/// Whether the file `path` is a vendor's description of a scan.
+pub(crate) fn is_vendors(path: &Path) -> bool {
+    reader(path).is_some()
 }
 
 /// The open beam.
