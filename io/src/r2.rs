@@ -324,53 +324,29 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{is_geometry, says, scan};
+    use crate::testing::{consistent, is_geometry, says, scan};
+    use serde_json::Value;
     use std::fs;
 
+    /// Changes the description in the folder `path`.
+    fn changed(path: &Path, change: &dyn Fn(&mut Value)) {
+        let file = path.join(META);
+        let mut meta = text::read(&file).unwrap();
+        change(&mut meta);
+        fs::write(&file, serde_json::to_string_pretty(&meta).unwrap()).unwrap();
+    }
+
+    /// The folder in `tests/fixtures` has lengths in metres.
     #[test]
     fn the_unit_comes_from_the_numbers() {
         let dir = tempfile::tempdir().unwrap();
-        let mut s = scan();
-        s.unit = Unit { name: "r2".into(), mm: 1.0 };
-        // Without its offset the small detector sees the volume.
-        let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
-        orbit.offset = [0.25, -0.5];
-        s.geometry.views = orbit.views();
-        let data = Array3::from_shape_fn((5, 6, 7), |(x, y, z)| 0.01 + 0.001 * (x + y * z) as f32);
-        let g = s.geometry.clone();
-        for ((a, v, u), p) in s.projections.indexed_iter_mut() {
-            *p = rays::integral(&data, &g.volume, &g.ray(a, v, u)) as f32;
-        }
-        let volume = Volume { data, grid: g.volume, affine: None };
         let path = dir.path().join("r2");
+        let (s, volume) = consistent(Unit { name: "r2".into(), mm: 1.0 });
         write_r2(&path, &s, None, Some(&volume)).unwrap();
-        let file = path.join(META);
-        let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
-        meta.as_object_mut().unwrap().remove("unit");
-        let mut save = |factor: f64| {
-            let scale = |v: &mut serde_json::Value| *v = json!(v.as_f64().unwrap() * factor);
-            let scanner = &mut meta["scanner"];
-            for key in ["DSO", "DSD"] {
-                scale(&mut scanner[key]);
-            }
-            for key in ["sDetector", "sVoxel", "offOrigin", "offDetector"] {
-                scanner[key].as_array_mut().unwrap().iter_mut().for_each(scale);
-            }
-            fs::write(&file, meta.to_string()).unwrap();
-        };
-        save(1.0);
+        changed(&path, &|meta| drop(meta.as_object_mut().unwrap().remove("unit")));
         let back = read_r2(&path).unwrap();
-        assert_eq!(back.train.unit.name, "r2");
-        is_geometry(&back.train.geometry, &g);
-        save(0.001);
-        let back = read_r2(&path).unwrap();
-        assert_eq!(back.train.unit, Unit::default());
-        is_geometry(&back.train.geometry, &g);
-        // Neither ratio: the values are used unchanged.
-        save(100.0);
-        let back = read_r2(&path).unwrap();
-        assert_eq!(back.train.unit.name, "r2");
-        is_geometry(&back.train.geometry, &g.scaled(0.1));
+        assert_eq!((back.train.unit, &back.train.provenance["unit_from"]), (s.unit, &json!("volume and projections")));
+        is_geometry(&back.train.geometry, &s.geometry);
     }
 
     #[test]
@@ -389,7 +365,7 @@ mod tests {
         assert_eq!(back.test.unwrap().projections, test.projections);
         assert_eq!(back.volume.unwrap().data, volume.data);
         // Lengths are written in the scan's own unit, centimetres here.
-        let meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(path.join(META)).unwrap()).unwrap();
+        let meta: Value = text::read(&path.join(META)).unwrap();
         assert!((meta["scanner"]["DSO"].as_f64().unwrap() - 50.0).abs() < 1e-9);
         // Overwritten, without volume and test views.
         write_r2(&path, &train, None, None).unwrap();
@@ -407,32 +383,29 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("r2");
         write_r2(&path, &scan(), None, None).unwrap();
-        let file = path.join(META);
-        let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
-        assert_eq!(others(&meta), Vec::<String>::new());
-        meta["scanner"]["rotDetector"] = json!([0, 0.01, 0]);
-        meta["scanner"]["COR"] = json!(0);
-        meta["scanner"]["possion_noise"] = json!(1e4);
-        meta["proj_train"][3]["offDetector"] = json!([1, 0]);
-        assert_eq!(others(&meta), ["scanner.rotDetector = [0,0.01,0]", "proj_train[3].offDetector"]);
-        // A backslash separates folders: the file was made on Windows.
-        for (i, frame) in meta["proj_train"].as_array_mut().unwrap().iter_mut().enumerate() {
-            frame["file_path"] = json!(format!("proj_train\\proj_train_{i:04}.npy"));
-        }
-        fs::write(&file, meta.to_string()).unwrap();
+        let found = || others(&text::read(&path.join(META)).unwrap());
+        assert_eq!(found(), Vec::<String>::new());
+        changed(&path, &|meta| {
+            meta["scanner"]["rotDetector"] = json!([0, 0.01, 0]);
+            meta["scanner"]["COR"] = json!(0);
+            meta["scanner"]["possion_noise"] = json!(1e4);
+            meta["proj_train"][3]["offDetector"] = json!([1, 0]);
+            // A backslash separates folders: the file was made on Windows.
+            for (i, frame) in meta["proj_train"].as_array_mut().unwrap().iter_mut().enumerate() {
+                frame["file_path"] = json!(format!("proj_train\\proj_train_{i:04}.npy"));
+            }
+        });
+        assert_eq!(found(), ["scanner.rotDetector = [0,0.01,0]", "proj_train[3].offDetector"]);
         assert_eq!(read_r2(&path).unwrap().train.projections, scan().projections);
     }
 
     #[test]
     fn lying_descriptions_are_refused_in_words() {
-        let refused = |change: &dyn Fn(&mut serde_json::Value), words: &[&str]| {
+        let refused = |lie: &dyn Fn(&mut Value), words: &[&str]| {
             let dir = tempfile::tempdir().unwrap();
             let path = dir.path().join("r2");
             write_r2(&path, &scan(), None, None).unwrap();
-            let file = path.join(META);
-            let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
-            change(&mut meta);
-            fs::write(&file, serde_json::to_string_pretty(&meta).unwrap()).unwrap();
+            changed(&path, lie);
             says(read_r2(&path), words);
         };
         refused(&|m| m["scanner"]["nVoxel"] = json!([1u64 << 40, 1u64 << 40, 1]), &["volume.shape"]);

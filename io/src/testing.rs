@@ -1,8 +1,9 @@
 //! Helpers shared by the tests of several modules.
 
-use crate::{I0, OpenBeam, Stored, is_volume, read_volume, volume_voxels, write_volume};
+use crate::{I0, OpenBeam, Stored, is_volume, rays, read_volume, volume_voxels, write_volume};
 use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use ndarray::Array3;
 use std::io::Write;
@@ -183,4 +184,19 @@ pub(crate) fn scan() -> Scan {
         unit: Unit { name: "cm".into(), mm: 10.0 },
         provenance: serde_json::json!({"from": "a test", "noise": {"photons": 10000, "sigma": 0.5}}),
     }
+}
+
+/// A scan that matches its volume, with another offset than that of [`scan`].
+pub(crate) fn consistent(unit: Unit) -> (Scan, Volume) {
+    let mut s = Scan { unit, ..scan() };
+    let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
+    orbit.offset = [0.25, -1.5];
+    s.geometry.views = orbit.views();
+    let data = Array3::from_shape_fn((5, 6, 7), |(x, y, z)| 0.01 + 0.002 * (x + y * z) as f32);
+    let (g, mm) = (&s.geometry, s.unit.mm);
+    s.projections.indexed_iter_mut().for_each(|((view, row, column), p)| {
+        *p = (rays::integral(&data, &g.volume, &g.ray(view, row, column)) / mm) as f32;
+    });
+    let grid = s.geometry.volume;
+    (s, Volume { data, grid, affine: None })
 }
