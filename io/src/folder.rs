@@ -42,6 +42,15 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
     Ok(path)
 }
 
+/// Splits the name of a file from that of an array, data set or column in it: `scan.npz:counts`, `scan.h5:/exchange/data`.
+/// No name of a file in a description holds a colon.
+pub(crate) fn split(name: &str) -> (&str, Option<&str>) {
+    match name.split_once(':') {
+        Some((file, part)) if Path::new(file).extension().is_some() => (file, Some(part)),
+        _ => (name, None),
+    }
+}
+
 /// The files that a description has named so far. A short description that names one large file many times would
 /// otherwise fill memory.
 #[derive(Default)]

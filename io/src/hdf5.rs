@@ -65,16 +65,6 @@ pub(crate) enum ScanPart {
     Dark,
 }
 
-/// Splits a file name from the name of a data set or group in it: `scan.h5:/exchange/data`.
-pub(crate) fn split(name: &str) -> (&str, Option<&str>) {
-    let ends = [".h5", ".hdf5", ".hdf", ".nxs", ".nx"];
-    let cut = name.match_indices(':').find(|(at, _)| ends.iter().any(|e| name[..*at].ends_with(e)));
-    match cut {
-        Some((at, _)) => (&name[..at], Some(&name[at + 1..])),
-        None => (name, None),
-    }
-}
-
 /// The shape of the result of [`read`], from headers and image keys alone.
 pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Vec<usize>> {
     let file = Container::open(path)?;

@@ -248,17 +248,10 @@ fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<(Ve
 }
 
 fn source(folder: &Path, place: &str, field: &str, name: &str, oddities: &mut Vec<String>) -> Result<Vec<StackFile>> {
-    let named = [".npz:", ".mat:"].iter().find_map(|end| Some((name.split_once(end)?, end.trim_end_matches(':'))));
-    let (file, array) = match named {
-        Some(((stem, array), end)) => (format!("{stem}{end}"), Some(array.to_string())),
-        None => {
-            let (file, array) = hdf5::split(name);
-            (file.to_string(), array.map(str::to_owned))
-        }
-    };
-    let path = folder::within(folder, place, field, &file)?;
-    if path.is_file() {
-        return Ok(vec![StackFile { path, array }]);
+    let (file, array) = folder::split(name);
+    let path = folder::within(folder, place, field, file)?;
+    if array.is_some() || path.is_file() {
+        return Ok(vec![StackFile { path, array: array.map(str::to_owned) }]);
     }
     let mut chosen = Vec::new();
     for ends in [&["tif", "tiff"][..], &["npy"], &["his"], &["hnd", "hnc"], &["xim"]] {

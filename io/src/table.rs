@@ -27,7 +27,7 @@ pub(crate) enum Numbers<T> {
 /// named data set, or the angles of a scan's projections. Refuses rows of another width and numbers that are not
 /// finite.
 pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: usize) -> Result<Vec<Vec<f64>>> {
-    let (file, part) = split(name);
+    let (file, part) = folder::split(name);
     let path = folder::inside(folder, place, field, file)?;
     let mut input = Input::open(&path)?;
     let head = input.take(8)?;
@@ -52,14 +52,6 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: u
         }
     }
     Ok(rows)
-}
-
-/// Splits a file name from the name of an array or column in it.
-fn split(name: &str) -> (&str, Option<&str>) {
-    match name.rsplit_once(':') {
-        Some((file, part)) if file.contains('.') => (file, Some(part)),
-        _ => (name, None),
-    }
 }
 
 fn arrayed(place: &str, (shape, values): (Vec<usize>, Vec<f64>), width: usize) -> Result<Vec<Vec<f64>>> {
@@ -136,7 +128,7 @@ mod tests {
 
     fn found(name: &str, content: &[u8], width: usize) -> Result<Vec<Vec<f64>>> {
         let dir = tempfile::tempdir().unwrap();
-        let (file, _) = split(name);
+        let (file, _) = folder::split(name);
         fs::write(dir.path().join(file), content).unwrap();
         read(dir.path(), "s.toml", "circle.angles_deg", name, width)
     }

@@ -55,22 +55,9 @@ impl Ellipsoids {
         read_scanner(path, None).unwrap()
     }
 
-    /// Root-mean-square difference of a scan and the integrals through the volume along its rays, relative to the
-    /// integrals.
+    /// How far a scan is off the volume, relative to the scan.
     fn error(&self, scan: &Scan) -> f64 {
-        let volume = self.exact.volume.as_ref().unwrap();
-        let (mut d, mut m) = (0.0, 0.0);
-        let g = &scan.geometry;
-        for view in (0..25).step_by(2) {
-            for row in (0..g.detector[0]).step_by(3) {
-                for column in (0..g.detector[1]).step_by(3) {
-                    let i = rays::integral(&volume.data, &g.volume, &g.ray(view, row, column));
-                    d += (f64::from(scan.projections[[view, row, column]]) - i).powi(2);
-                    m += i.powi(2);
-                }
-            }
-        }
-        (d / m).sqrt()
+        rays::agreement(scan, &self.exact.volume.as_ref().unwrap().data).unwrap().residual
     }
 }
 
@@ -180,7 +167,7 @@ fn hostile_descriptions_are_refused_in_words() {
     edit("[volume]", "[values]\nflat_includes_dark = true\n[volume]", &["values.flat_includes_dark", "files.dark"]);
     edit("flat = \"flat.tif\"", "", &["files.flat", "nothing", "--i0"]);
     edit("\"views\"", "3", &["projections", "a file name or a list of file names"]);
-    edit("\"flat.tif\"", "\"flat.tif:a\"", &["files.flat"]);
+    edit("\"flat.tif\"", "\"flat.tif:a\"", &["flat.tif: array", "the name \"a\""]);
     let circle = &text[text.find("[circle]").unwrap()..text.find("[volume]").unwrap()];
     edit(circle, "", &["circle", "nothing", "one of [circle]"]);
     let rtk = "[rtk]\nfile = \"../g.xml\"\npixel = { u = 1, v = 1 }\n\n";
