@@ -18,7 +18,7 @@ use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance, files};
 use hdf5_reader::datatype_api::H5Type;
 use hdf5_reader::{Dataset, Datatype, FileStorage, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
-use layout::{Found, Layout};
+use layout::Layout;
 use ndarray::{ArrayD, Dimension, IxDyn};
 use std::path::Path;
 use std::sync::Arc;
@@ -68,7 +68,7 @@ pub(crate) enum ScanPart {
 /// The shape of the result of [`read`], from headers and image keys alone.
 pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Vec<usize>> {
     let file = Container::open(path)?;
-    let (data, kept) = file.frames(name, part)?;
+    let (data, kept) = Layout::find(&file, name)?.frames(&file, part)?;
     let mut shape = file.shape(&data)?;
     if let Some(kept) = kept {
         shape[0] = kept.iter().filter(|k| **k).count();
@@ -82,8 +82,9 @@ pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<V
 /// other types, sizes that the file cannot hold, missing chunks and values that are not finite.
 pub(crate) fn read(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Stored> {
     let file = Container::open(path)?;
-    let frames_first = matches!(file.find(name)?, Found::Layout(_));
-    let (data, kept) = file.frames(name, part)?;
+    let layout = Layout::find(&file, name)?;
+    let (data, kept) = layout.frames(&file, part)?;
+    let frames_first = !matches!(layout, Layout::Plain(_));
     Ok(Stored { values: file.values(&data, kept.as_deref())?, frames_first })
 }
 
@@ -98,19 +99,13 @@ pub(crate) struct Stored {
 /// the data set's unit is radians.
 pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>, Vec<f64>)> {
     let file = Container::open(path)?;
-    let (data, kept) = match file.find(name)? {
-        Found::Data(data) => (*data, None),
-        Found::Layout(layout) => {
-            let (angles, keys) = layout.angles(&file)?;
-            (angles, keys.map(|k| k.iter().map(|k| *k == 0).collect::<Vec<bool>>()))
-        }
-    };
+    let (data, keys) = Layout::find(&file, name)?.angles(&file)?;
     let mut shape = file.shape(&data)?;
     let mut values = file.small(&data)?;
-    if let Some(kept) = kept {
-        file.one_each(&data, values.len(), kept.len())?;
-        let mut keep = kept.iter();
-        values.retain(|_| keep.next() == Some(&true));
+    if let Some(keys) = keys {
+        file.one_each(&data, values.len(), keys.len())?;
+        let mut keys = keys.iter();
+        values.retain(|_| keys.next() == Some(&0));
         shape = vec![values.len()];
     }
     // CIL calls the attribute `angle_unit`.
@@ -185,22 +180,6 @@ impl Container {
     /// Names of the groups at the root.
     fn root_groups(&self) -> Vec<String> {
         self.file.root_group().and_then(|g| g.member_names()).map(|(groups, _)| groups).unwrap_or_default()
-    }
-
-    /// The data set or layout named `name`.
-    fn find(&self, name: Option<&str>) -> Result<Found> {
-        if let Some(data) = name.and_then(|n| self.data(n)) {
-            return Ok(Found::Data(Box::new(data)));
-        }
-        Ok(Found::Layout(Layout::find(self, name)?))
-    }
-
-    /// The data set with the frames of `part`, and which of them belong to it.
-    fn frames(&self, name: Option<&str>, part: ScanPart) -> Result<(Dataset, Option<Vec<bool>>)> {
-        match self.find(name)? {
-            Found::Data(data) => Ok((*data, None)),
-            Found::Layout(layout) => layout.frames(self, part),
-        }
     }
 
     /// The shape; every axis is at least 1 and the file can hold all values.
