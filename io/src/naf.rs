@@ -3,7 +3,7 @@
 //! Their world is conefield's: source at `DSO·(cos a, sin a, 0)`, columns along `(-sin a, cos a, 0)`, rows towards −z.
 //! `nDetector`, `dDetector` and `offDetector` are \[v, u\]. As in TIGRE, the offset's v points towards +z, against the
 //! rows. Volumes are \[x, y, z\]; `offOrigin` is the volume's centre. Lengths are millimetres. The format does not name
-//! the unit of `image`: see [`read_naf`].
+//! the unit of `image`: see [`read`].
 
 use crate::input::read_bytes;
 use crate::orbit::{common_orbit, written};
@@ -57,7 +57,7 @@ const READINGS: [Reading; 2] = [
     },
 ];
 
-/// Reads a scan of NAF, SAX-NeRF or TIGRE's demos: training views, `val` views and `image`.
+/// Reads a scan of NAF, SAX-NeRF or TIGRE's demos: training views, `val` views if `with_test` says so, and `image`.
 ///
 /// Lengths are mm and angles radians; a warning is logged if the angles look like degrees. The format does not name the
 /// unit of `image`. A `unit` entry, as [`write_naf`] adds, decides. Otherwise the rays decide: if the integrals of
@@ -70,25 +70,6 @@ const READINGS: [Reading; 2] = [
 ///
 /// Nothing in the file is ever called. Names other than those of NumPy's arrays, missing or misspelt keys, shapes that
 /// do not match and values that are not finite are refused with the byte or the key.
-pub fn read_naf(path: impl AsRef<Path>) -> Result<DataSet> {
-    read(path.as_ref(), true)
-}
-
-/// Like [`read_naf`], without the test views.
-pub(crate) fn read_train(path: &Path) -> Result<Scan> {
-    read(path, false).map(|r| r.train)
-}
-
-/// Reads only the volume. Its voxel sizes are in mm whatever the unit of its values, so the projections are not needed.
-pub(crate) fn read_truth(path: &Path) -> Result<Option<Volume>> {
-    let place = path.display().to_string();
-    let bytes = read_bytes(path)?;
-    let pickle = Pickle::parse(&place, &bytes)?;
-    let file = Description::read(&pickle.top())?;
-    let data = file.image(&pickle.top())?;
-    Ok(data.map(|data| Volume { data, grid: file.grid, affine: None }))
-}
-
 pub(crate) fn read(path: &Path, with_test: bool) -> Result<DataSet> {
     let place = path.display().to_string();
     let bytes = read_bytes(path)?;
@@ -133,6 +114,16 @@ pub(crate) fn read(path: &Path, with_test: bool) -> Result<DataSet> {
         }
     };
     units.data_set(&place, train, test, data)
+}
+
+/// Reads only the volume. Its voxel sizes are in mm whatever the unit of its values, so the projections are not needed.
+pub(crate) fn read_truth(path: &Path) -> Result<Option<Volume>> {
+    let place = path.display().to_string();
+    let bytes = read_bytes(path)?;
+    let pickle = Pickle::parse(&place, &bytes)?;
+    let file = Description::read(&pickle.top())?;
+    let data = file.image(&pickle.top())?;
+    Ok(data.map(|data| Volume { data, grid: file.grid, affine: None }))
 }
 
 /// The entries shared by all views, in mm.
@@ -413,7 +404,7 @@ mod tests {
         let (_, test) = train.split(&[1, 4]).unwrap();
         let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
         write_naf(&path, &train, Some(&test), Some(&volume)).unwrap();
-        let back = read_naf(&path).unwrap();
+        let back = read(&path, true).unwrap();
         is_geometry(&back.train.geometry, &train.geometry);
         assert_eq!((&back.train.unit, &back.train.projections), (&train.unit, &train.projections));
         assert_eq!(back.train.provenance["unit_from"], "the file");
@@ -422,7 +413,7 @@ mod tests {
         assert_eq!(back_test.projections, test.projections);
         assert_eq!(back.volume.unwrap().data, volume.data);
         write_naf(&path, &train, None, None).unwrap();
-        let back = read_naf(&path).unwrap();
+        let back = read(&path, true).unwrap();
         assert!(back.test.is_none() && back.volume.is_none() && read_truth(&path).unwrap().is_none());
         let mut odd = train.clone();
         odd.geometry.views[0].source[2] += 1.0;
@@ -439,18 +430,18 @@ mod tests {
         for unit in [Unit { name: "m".into(), mm: 1000.0 }, Unit::default()] {
             let (s, volume) = consistent(unit);
             write_without_unit(&path, &s, Some(&volume));
-            let back = read_naf(&path).unwrap();
+            let back = read(&path, true).unwrap();
             assert_eq!(back.train.unit, s.unit);
             is_geometry(&back.train.geometry, &s.geometry);
             assert_eq!(back.volume.unwrap().data, volume.data);
             write_without_unit(&path, &s, None);
-            let back = read_naf(&path).unwrap();
+            let back = read(&path, true).unwrap();
             assert_eq!(back.train.unit, Unit::default());
             assert!(back.train.provenance["unit_from"].as_str().unwrap().starts_with("nothing"));
         }
         let (s, volume) = consistent(Unit { name: "cm".into(), mm: 10.0 });
         write_without_unit(&path, &s, Some(&volume));
-        assert_eq!(read_naf(&path).unwrap().train.unit, Unit::default());
+        assert_eq!(read(&path, true).unwrap().train.unit, Unit::default());
     }
 
     #[test]
@@ -464,12 +455,12 @@ mod tests {
         orbit.offset = [-orbit.offset[1], -orbit.offset[0]];
         swapped.geometry.views = orbit.views();
         write_without_unit(&path, &swapped, Some(&volume));
-        let back = read_naf(&path).unwrap();
+        let back = read(&path, true).unwrap();
         is_geometry(&back.train.geometry, &s.geometry);
         assert!(back.train.provenance["offset_from"].as_str().unwrap().contains("[u, v]"));
         // conefield's own files skip this comparison.
         write_naf(&path, &swapped, None, Some(&volume)).unwrap();
-        is_geometry(&read_naf(&path).unwrap().train.geometry, &swapped.geometry);
+        is_geometry(&read(&path, true).unwrap().train.geometry, &swapped.geometry);
     }
 
     type Entries = Vec<(&'static str, Out<'static>)>;
@@ -504,12 +495,12 @@ mod tests {
     #[test]
     fn lists_arrays_ints_and_floats_will_do() {
         let (_dir, path) = written(&|_| {});
-        let s = read_naf(&path).unwrap().train;
+        let s = read(&path, true).unwrap().train;
         assert_eq!((s.geometry.detector, s.geometry.volume.shape), ([2, 3], [2, 2, 2]));
         assert_eq!(s.geometry.volume.spacing, [1.0, 1.0, 1.5]);
         // An empty list of test views counts as none.
         let (_dir, path) = written(&|e| e.push(("val", views(&[], [0, 2, 3], 0.0))));
-        assert!(read_naf(&path).unwrap().test.is_none());
+        assert!(read(&path, true).unwrap().test.is_none());
     }
 
     #[test]
@@ -524,14 +515,14 @@ mod tests {
         let bytes = fs::read(&path).unwrap();
         let pickle = Pickle::parse("a.pickle", &bytes).unwrap();
         assert_eq!(others(&pickle.top()).unwrap(), ["rotDetector"]);
-        assert!(read_naf(&path).is_ok());
+        assert!(read(&path, true).is_ok());
     }
 
     #[test]
     fn lying_descriptions_are_refused_in_words() {
         let refused = |change: &dyn Fn(&mut Entries), words: &[&str]| {
             let (_dir, path) = written(change);
-            says(read_naf(&path), &[&["a.pickle"], words].concat());
+            says(read(&path, true), &[&["a.pickle"], words].concat());
         };
         refused(&|e| e[0].1 = Out::Int(1), &["mode", "found 1", "a text"]);
         refused(&|e| e[1].1 = Out::None, &["DSO", "None"]);

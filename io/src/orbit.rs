@@ -61,7 +61,7 @@ pub(crate) fn written(orbit: &CircularOrbit, volume: &VoxelGrid) -> (&'static st
 mod tests {
     use super::*;
     use crate::testing::scan;
-    use crate::{read_naf, read_r2, write_naf, write_r2};
+    use crate::{naf, r2};
     use conefield_core::geometry::{norm, sub};
 
     #[test]
@@ -72,12 +72,12 @@ mod tests {
         let orbit = CircularOrbit::parallel(&train.geometry.volume, [2.0, 1.5], [-1.0, 30.0], angles);
         train.geometry.views = orbit.views();
         let (_, test) = train.split(&[1, 4]).unwrap();
-        let [r2, naf] = ["r2", "scan.pickle"].map(|name| dir.path().join(name));
-        write_r2(&r2, &train, Some(&test), None).unwrap();
-        write_naf(&naf, &train, Some(&test), None).unwrap();
-        let meta = std::fs::read_to_string(r2.join("meta_data.json")).unwrap();
+        let [folder, file] = ["r2", "scan.pickle"].map(|name| dir.path().join(name));
+        r2::write_r2(&folder, &train, Some(&test), None).unwrap();
+        naf::write_naf(&file, &train, Some(&test), None).unwrap();
+        let meta = std::fs::read_to_string(folder.join("meta_data.json")).unwrap();
         assert!(meta.contains("\"mode\": \"parallel\""), "{meta}");
-        for back in [read_r2(&r2).unwrap(), read_naf(&naf).unwrap()] {
+        for back in [r2::read(&folder, true).unwrap(), naf::read(&file, true).unwrap()] {
             let g = &back.train.geometry;
             for view in 0..7 {
                 assert!(g.is_parallel(view));

@@ -58,33 +58,21 @@ struct Scanner {
     offDetector: [f64; 2],
 }
 
-/// Reads R2-Gaussian's folder: training views, test views and the volume.
+/// Reads R2-Gaussian's folder: training views, test views if `with_test` says so, and the volume.
 ///
 /// The format does not name its unit of length. A `unit` entry decides. Otherwise the volume decides: if its integrals
 /// over the file's lengths match the projections, as in the published data, the unit is called `r2` and counts as 1 mm;
 /// if the projections are a thousand times larger, the lengths are metres and the volume is in 1/mm. Any other ratio
 /// counts as the first case, with a warning.
-pub fn read_r2(path: impl AsRef<Path>) -> Result<DataSet> {
-    warn_of_others(path.as_ref())?;
-    read(path.as_ref(), true)
-}
-
-/// Like [`read_r2`], without the test views.
-pub(crate) fn read_train(folder: &Path) -> Result<DataSet> {
-    warn_of_others(folder)?;
-    read(folder, false)
-}
-
-/// The volume of [`read_r2`], in the unit that the training views give.
-pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
-    read(folder, false).map(|r| r.volume)
-}
-
-fn warn_of_others(folder: &Path) -> Result<()> {
+pub(crate) fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
-    let meta = text::read(&file)?;
-    text::warn(&file.display().to_string(), unread(&others(&meta)));
-    Ok(())
+    text::warn(&file.display().to_string(), unread(&others(&text::read(&file)?)));
+    described(folder, with_test)
+}
+
+/// The volume of [`read`], in the unit that the training views give.
+pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
+    described(folder, false).map(|r| r.volume)
 }
 
 /// Keys of the scanner that do not move source, detector or volume, beside those of noise.
@@ -122,7 +110,7 @@ const SCANNER_KEYS: [&str; 11] = [
     "offDetector",
 ];
 
-fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
+fn described(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
     let place = file.display().to_string();
     let meta: Meta = text::read(&file)?;
@@ -344,7 +332,7 @@ mod tests {
         let (s, volume) = consistent(Unit { name: "r2".into(), mm: 1.0 });
         write_r2(&path, &s, None, Some(&volume)).unwrap();
         changed(&path, &|meta| drop(meta.as_object_mut().unwrap().remove("unit")));
-        let back = read_r2(&path).unwrap();
+        let back = read(&path, true).unwrap();
         assert_eq!((back.train.unit, &back.train.provenance["unit_from"]), (s.unit, &json!("volume and projections")));
         is_geometry(&back.train.geometry, &s.geometry);
     }
@@ -357,7 +345,7 @@ mod tests {
         let (_, test) = train.split(&[1, 4]).unwrap();
         let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
         write_r2(&path, &train, Some(&test), Some(&volume)).unwrap();
-        let back = read_r2(&path).unwrap();
+        let back = read(&path, true).unwrap();
         is_geometry(&back.train.geometry, &train.geometry);
         is_geometry(&back.test.as_ref().unwrap().geometry, &test.geometry);
         assert_eq!(back.train.unit, train.unit);
@@ -369,7 +357,7 @@ mod tests {
         assert!((meta["scanner"]["DSO"].as_f64().unwrap() - 50.0).abs() < 1e-9);
         // Overwritten, without volume and test views.
         write_r2(&path, &train, None, None).unwrap();
-        let back = read_r2(&path).unwrap();
+        let back = read(&path, true).unwrap();
         assert!(back.test.is_none() && back.volume.is_none());
         fs::write(path.join("mine.txt"), "").unwrap();
         assert!(write_r2(&path, &train, None, None).unwrap_err().to_string().contains("mine.txt"));
@@ -396,7 +384,7 @@ mod tests {
             }
         });
         assert_eq!(found(), ["scanner.rotDetector = [0,0.01,0]", "proj_train[3].offDetector"]);
-        assert_eq!(read_r2(&path).unwrap().train.projections, scan().projections);
+        assert_eq!(read(&path, true).unwrap().train.projections, scan().projections);
     }
 
     #[test]
@@ -406,7 +394,7 @@ mod tests {
             let path = dir.path().join("r2");
             write_r2(&path, &scan(), None, None).unwrap();
             changed(&path, lie);
-            says(read_r2(&path), words);
+            says(read(&path, true), words);
         };
         refused(&|m| m["scanner"]["nVoxel"] = json!([1u64 << 40, 1u64 << 40, 1]), &["volume.shape"]);
         refused(&|m| m["scanner"]["sVoxel"] = json!(null), &["scanner.sVoxel", "nothing"]);

@@ -226,8 +226,7 @@ fn check_matrix(place: &str, node: Node, projection: &Projection) -> Result<()> 
 /// flipped for RTK. Refuses detectors whose rows and columns are not orthogonal, scans in which only some views have
 /// reversed rows, and numbers that are not finite. In RTK the pixels belong to the image; its centre is the detector's
 /// point (0, 0).
-pub fn write_rtk_geometry(path: impl AsRef<Path>, views: &[View]) -> Result<bool> {
-    let path = path.as_ref();
+pub(crate) fn write_rtk_geometry(path: &Path, views: &[View]) -> Result<bool> {
     let place = path.display().to_string();
     let mut text = format!("<?xml version=\"1.0\"?>\n<!DOCTYPE RTKGEOMETRY>\n<{ROOT} version=\"3\">\n");
     let mut reversed = None;

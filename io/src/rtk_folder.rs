@@ -48,7 +48,7 @@ pub fn write_rtk(folder: impl AsRef<Path>, scan: &Scan) -> Result<()> {
     let text = toml::to_string(&description)
         .map_err(|e| conefield_core::Error::invalid(&place, SCANNER, e, "a description that TOML can hold"))?;
     write_folder_atomic(folder, |new| {
-        let reversed = rtk::write_rtk_geometry(new.join(GEOMETRY), views)?;
+        let reversed = rtk::write_rtk_geometry(&new.join(GEOMETRY), views)?;
         let path = new.join(PROJECTIONS);
         write_atomic(&path, |w| metaimage::write(w, &path, &mut Image::new(scan, pixel, reversed)))?;
         write_text_atomic(new.join(SCANNER), &text)

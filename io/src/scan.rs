@@ -39,8 +39,8 @@ pub(crate) enum ScanFile {
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Stored> {
     let scan = match find(path.as_ref())? {
         ScanFile::Own(file) => scan_folder::read(&file),
-        ScanFile::R2(folder) => r2::read_train(&folder).map(|r| r.train),
-        ScanFile::Naf(file) => naf::read_train(&file),
+        ScanFile::R2(folder) => r2::read(&folder, false).map(|r| r.train),
+        ScanFile::Naf(file) => naf::read(&file, false).map(|r| r.train),
         ScanFile::Scanner(file) => return scanner::read_scanner(&file, None, None),
     };
     scan.map(Stored::Scan)
@@ -63,8 +63,7 @@ impl Parts {
 /// Reads a scan and the `parts` that its file or folder holds. Some formats give the volume unasked.
 pub fn read_data_set(path: impl AsRef<Path>, parts: Parts) -> Result<DataSet<Stored>> {
     let DataSet { train, test, volume } = match find(path.as_ref())? {
-        ScanFile::R2(folder) if parts.tests => r2::read_r2(&folder)?,
-        ScanFile::R2(folder) => r2::read_train(&folder)?,
+        ScanFile::R2(folder) => r2::read(&folder, parts.tests)?,
         ScanFile::Naf(file) if parts.tests || parts.volume => naf::read(&file, parts.tests)?,
         _ => {
             let volume = if parts.volume { read_truth(&path)? } else { None };

@@ -40,23 +40,20 @@ const VERSION: u32 = 1;
 const PROJECTIONS: &str = "projections.npy";
 const TRUTH: &str = "truth.nii.gz";
 
+/// TOML leaves out what is `None`.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Description {
     format: String,
     version: u32,
     projections: String,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     truth: Option<String>,
     #[serde(default)]
     unit: Unit,
     detector: Detector,
     volume: VoxelGrid,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     orbit: Option<OrbitTable>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     views: Option<Vec<View>>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     provenance: Option<serde_json::Map<String, serde_json::Value>>,
 }
 
@@ -75,13 +72,9 @@ struct OrbitTable {
     pixel: [f64; 2],
     #[serde(default)]
     offset: [f64; 2],
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     angles: Option<Vec<f64>>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     start: Option<f64>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     range: Option<f64>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     count: Option<usize>,
 }
 

@@ -3,7 +3,7 @@
 
 use conefield_core::geometry::{Vec3, dot, norm, sub};
 use conefield_core::scan::{Scan, Unit, Volume};
-use conefield_io::{DataSet, Stored, read_naf, read_r2, read_scan, read_truth};
+use conefield_io::{DataSet, Parts, Stored, read_data_set, read_scan, read_truth};
 use std::path::{Path, PathBuf};
 
 /// Centre, half axes, rotation about z, attenuation, as in `make.py`.
@@ -15,6 +15,12 @@ const ELLIPSOIDS: [(Vec3, Vec3, f64, f64); 3] = [
 
 fn file(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
+}
+
+fn data_set(name: &str) -> DataSet {
+    let DataSet { train, test, volume } = read_data_set(file(name), Parts::ALL).unwrap();
+    let Stored::Scan(train) = train else { panic!("{name}: counts") };
+    DataSet { train, test, volume }
 }
 
 /// Transforms to the frame in which ellipsoid `e` is the unit ball.
@@ -89,7 +95,7 @@ fn data_is_right(data: &DataSet, what: &str) {
 #[test]
 fn nafs_pickle_is_read_as_it_is_meant() {
     for name in ["ellipsoids_numpy1.pickle", "ellipsoids_numpy2.pickle"] {
-        let data = read_naf(file(name)).unwrap();
+        let data = data_set(name);
         data_is_right(&data, name);
         let found = data.train.provenance["unit_from"].as_str().unwrap();
         assert!(found.contains("1/mm"), "{found}");
@@ -104,7 +110,7 @@ fn nafs_pickle_is_read_as_it_is_meant() {
 
 #[test]
 fn r2s_folder_is_read_as_it_is_meant() {
-    let data = read_r2(file("ellipsoids_r2")).unwrap();
+    let data = data_set("ellipsoids_r2");
     data_is_right(&data, "ellipsoids_r2");
     let found = data.train.provenance["unit_from"].as_str().unwrap();
     assert!(found.contains("lengths in m"), "{found}");
@@ -113,7 +119,7 @@ fn r2s_folder_is_read_as_it_is_meant() {
 /// Verifies that the comparison can fail.
 #[test]
 fn another_convention_is_found_out() {
-    let data = read_r2(file("ellipsoids_r2")).unwrap();
+    let data = data_set("ellipsoids_r2");
     let fails = |change: &dyn Fn(&mut Scan)| {
         let mut scan = data.train.clone();
         change(&mut scan);

@@ -1,7 +1,7 @@
 use super::*;
 use crate::scan_folder::write_scan;
 use crate::testing::{are_views, data, npy_bytes, read_scan, read_scanner, says, tiff16};
-use crate::{DataSet, rays, read_r2};
+use crate::{DataSet, r2, rays};
 use std::fs;
 use std::path::PathBuf;
 
@@ -41,7 +41,7 @@ impl Ellipsoids {
         let (counts, exact) = (data("interop/ellipsoids_counts.npz")?, data("interop/ellipsoids_50_r2")?);
         let dir = tempfile::tempdir().unwrap();
         fs::copy(counts, dir.path().join("scan.npz")).unwrap();
-        Some(Self { dir, exact: read_r2(exact).unwrap() })
+        Some(Self { dir, exact: r2::read(&exact, true).unwrap() })
     }
 
     fn changed(&self, changes: &[(&str, &str)]) -> Scan {
@@ -106,7 +106,7 @@ fn every_way_to_say_the_geometry_gives_the_same_scan() {
     near(&e.changed(&[(circle, &format!("[vectors]\ncone_vec = [{}]\n\n", rows.join(",\n")))]));
     // RTK's rows run up: the stack is flipped for it, and the reader flips it back.
     let xml = e.dir.path().join("geometry.xml");
-    assert!(crate::write_rtk_geometry(&xml, &want.geometry.views).unwrap());
+    assert!(crate::rtk::write_rtk_geometry(&xml, &want.geometry.views).unwrap());
     let rtk = "[rtk]\nfile = \"geometry.xml\"\npixel = { u = 2.0, v = 2.0 }\n[layout]\nflip_rows = true\n\n";
     near(&e.changed(&[(circle, rtk)]));
     // Written as conefield's own folder, the scan is read back unchanged.
