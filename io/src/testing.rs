@@ -98,21 +98,28 @@ pub(crate) fn data(name: &str) -> Option<PathBuf> {
     None
 }
 
-/// The scan `path`; counts are converted by the bare formula.
+/// The scan `path`, whose size is known before; counts are converted by the bare formula.
 pub(crate) fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
-    crate::read_scan(path).and_then(line_integrals)
+    let path = path.as_ref();
+    crate::read_scan(path).and_then(|stored| line_integrals(path, stored))
 }
 
 /// The same for a scanner's description.
 pub(crate) fn read_scanner(path: impl AsRef<Path>, i0: Option<I0>) -> Result<Scan> {
-    crate::read_scanner(path, i0, None).and_then(line_integrals)
+    let path = path.as_ref();
+    crate::read_scanner(path, i0, None).and_then(|stored| line_integrals(path, stored))
 }
 
-fn line_integrals(stored: Stored) -> Result<Scan> {
+fn line_integrals(path: &Path, stored: Stored) -> Result<Scan> {
+    let pixels = crate::scan_size(path)?.pixels;
     let mut counts = match stored {
-        Stored::Scan(scan) => return Ok(scan),
+        Stored::Scan(scan) => {
+            assert_eq!(scan.projections.len() as u64, pixels);
+            return Ok(scan);
+        }
         Stored::Counts(counts) => counts,
     };
+    assert_eq!(counts.values.len() as u64, pixels);
     let mut a = std::mem::take(&mut counts.values);
     a.indexed_iter_mut().for_each(|((_, row, column), x)| {
         let dark = counts.conversion.dark.as_ref().map_or(0.0, |d| d[[row, column]]);

@@ -1,6 +1,5 @@
 //! Files written by h5py (`tests/fixtures/make_formats.py`), intact and damaged.
 
-use crate::scan_size;
 use crate::testing::{is_view, read_scanner, says};
 use conefield_core::Result;
 use conefield_core::geometry::{Millimetres, Radians, View};
@@ -28,10 +27,7 @@ fn import(files: &str, rest: &str, change: &dyn Fn(&str, &mut Vec<u8>)) -> Resul
     let volume = "[volume]\nshape = [4, 3, 2]\nspacing = [0.5, 0.75, 2.0]\n";
     let path = dir.path().join("s.toml");
     fs::write(&path, format!("{head}[files]\n{files}\n{rest}\n{volume}")).unwrap();
-    let size = scan_size(&path);
-    let imported = read_scanner(&path, None)?;
-    assert_eq!(size?.pixels, imported.projections.len() as u64);
-    Ok(imported)
+    read_scanner(&path, None)
 }
 
 /// The same with the files as they are.
