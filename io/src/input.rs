@@ -45,11 +45,7 @@ impl Input {
     pub fn open(path: &Path) -> Result<Self> {
         let mut input = Self::open_plain(path)?;
         let start = input.reader.fill_buf().map_err(|e| Error::io(path, e))?;
-        if start.starts_with(&[0x1f, 0x8b]) {
-            input.reader = Box::new(BufReader::new(MultiGzDecoder::new(input.reader)));
-            input.packed = Some("gzip");
-        }
-        Ok(input)
+        Ok(if start.starts_with(&[0x1f, 0x8b]) { input.gunzip() } else { input })
     }
 
     /// Opens `path` without decompression.

@@ -230,28 +230,26 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
 
 /// The files that `names` stand for, and what is odd about the numbers in the names of folders' files.
 fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<(Vec<StackFile>, Vec<String>)> {
-    let mut oddities = Vec::new();
-    let all = match names {
-        Names::One(name) => source(folder, place, field, name, &mut oddities)?,
-        Names::Many(names) if names.is_empty() => {
-            return Err(Error::invalid(place, field, "an empty list", "file names"));
-        }
+    let (mut all, mut oddities) = (Vec::new(), Vec::new());
+    match names {
+        Names::One(name) => oddities.extend(source(folder, place, field, name, &mut all)?),
         Names::Many(names) => {
-            let mut all = Vec::new();
+            ensure(!names.is_empty(), place, field, "an empty list", "file names")?;
             for (i, name) in names.iter().enumerate() {
-                all.extend(source(folder, place, &format!("{field}[{i}]"), name, &mut oddities)?);
+                oddities.extend(source(folder, place, &format!("{field}[{i}]"), name, &mut all)?);
             }
-            all
         }
-    };
+    }
     Ok((all, oddities))
 }
 
-fn source(folder: &Path, place: &str, field: &str, name: &str, oddities: &mut Vec<String>) -> Result<Vec<StackFile>> {
+/// Adds the files that `name` stands for to `all`; what is odd about them.
+fn source(folder: &Path, place: &str, field: &str, name: &str, all: &mut Vec<StackFile>) -> Result<Option<String>> {
     let (file, array) = folder::split(name);
     let path = folder::within(folder, place, field, file)?;
     if array.is_some() || path.is_file() {
-        return Ok(vec![StackFile { path, array: array.map(str::to_owned) }]);
+        all.push(StackFile { path, array: array.map(str::to_owned) });
+        return Ok(None);
     }
     let mut chosen = Vec::new();
     for ends in [&["tif", "tiff"][..], &["npy"], &["his"], &["hnd", "hnc"], &["xim"]] {
@@ -261,20 +259,15 @@ fn source(folder: &Path, place: &str, field: &str, name: &str, oddities: &mut Ve
     }
     if chosen.is_empty() {
         foreign::refuse_folder(&path)?;
-        let what = format!("a folder \"{file}\" without them");
-        return Err(Error::invalid(
-            place,
-            field,
-            what,
-            "a folder with .tif, .tiff, .npy, .his, .hnd, .hnc or .xim files",
-        ));
+        let found = format!("a folder \"{file}\" without them");
+        let expected = "a folder with .tif, .tiff, .npy, .his, .hnd, .hnc or .xim files";
+        return Err(Error::invalid(place, field, found, expected));
     }
-    oddities.extend(folder::oddity(&chosen));
-    let inside = chosen.iter().map(|n| {
-        let path = folder::inside(folder, place, field, &format!("{}/{n}", file.trim_end_matches('/')))?;
-        Ok(StackFile { path, array: None })
-    });
-    inside.collect()
+    for name in &chosen {
+        let path = folder::inside(folder, place, field, &format!("{}/{name}", file.trim_end_matches('/')))?;
+        all.push(StackFile { path, array: None });
+    }
+    Ok(folder::oddity(&chosen))
 }
 
 #[cfg(test)]

@@ -262,9 +262,7 @@ impl<'p, 'a> Item<'p, 'a> {
         };
         let numbers = numbers.ok_or_else(|| self.other("a list or an array of numbers"))?;
         match numbers.iter().position(|x| !x.is_finite()) {
-            Some(i) => {
-                Err(Error::invalid(&self.pickle.place, format!("{}[{i}]", self.key()), numbers[i], "a finite number"))
-            }
+            Some(i) => Err(self.invalid_at(format!("{}[{i}]", self.key()), numbers[i], "a finite number")),
             None => Ok(numbers),
         }
     }
@@ -297,9 +295,7 @@ impl<'p, 'a> Item<'p, 'a> {
         let values = values.permuted_axes(&array.axes[..]);
         let values = memory::in_order(&self.pickle.place, self.key(), values)?;
         match stray(&values) {
-            Some((at, x)) => {
-                Err(Error::invalid(&self.pickle.place, format!("{}{:?}", self.key(), at.slice()), x, "a finite number"))
-            }
+            Some((at, x)) => Err(self.invalid_at(format!("{}{:?}", self.key(), at.slice()), x, "a finite number")),
             None => Ok(values),
         }
     }
