@@ -127,7 +127,7 @@ fn projections(keys: &Keys, path: &Path, step: f64, remarks: &mut Vec<String>) -
 
 #[cfg(test)]
 mod tests {
-    use crate::testing::{damage_is_refused, is_view, read_scan, read_scanner, replaced, says_just, tiff16};
+    use crate::testing::{damage_is_refused, is_view, read_scan, read_scanner, replaced, says, says_just, tiff16};
     use conefield_core::orbit::CircularOrbit;
     use std::fs;
     use std::path::PathBuf;
@@ -240,12 +240,6 @@ mod tests {
         says_just(read_scanner(&path, None), dir.path(), words);
         // Another program's log is no scan.
         fs::write(&path, "Object to Source=5").unwrap();
-        says_just(
-            read_scan(&path),
-            dir.path(),
-            "bone_~00.log: scan: found a file of another kind, expected a folder with scan.toml or scan.json (conefield), \
-             scanner.toml (a scanner's images) or meta_data.json (R2-Gaussian), a pickle (NAF) or a vendor's file \
-             (.xtekct, .log, .xml, .txrm)",
-        );
+        says(read_scan(&path), &["bone_~00.log: scan", "a file of another kind"]);
     }
 }
