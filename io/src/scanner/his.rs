@@ -121,12 +121,12 @@ mod tests {
         words.into_iter().chain(pixels).flat_map(u16::to_le_bytes).collect()
     }
 
-    fn written(frames: &[(f64, f64, f64)]) -> (tempfile::TempDir, PathBuf) {
+    fn written() -> (tempfile::TempDir, PathBuf) {
         let dir = tempfile::tempdir().unwrap();
         let mut text =
             "\u{feff}<?xml version=\"1.0\" encoding=\"utf-8\"?>\n<ProjectionSet><Image><kV>120</kV></Image><Frames>\n"
                 .to_owned();
-        for (i, (angle, u, v)) in frames.iter().enumerate() {
+        for (i, (angle, u, v)) in FRAMES.iter().enumerate() {
             fs::write(dir.path().join(format!("{:05}.1.3.46.his", i + 1)), image(i)).unwrap();
             writeln!(
                 text,
@@ -144,7 +144,7 @@ mod tests {
 
     #[test]
     fn a_scan_of_xvi_is_read() {
-        let (_dir, path) = written(&FRAMES);
+        let (_dir, path) = written();
         let scan = read_scan(&path).unwrap();
         assert_eq!(scan.projections.dim(), (3, 8, 8));
         for (i, row, column) in [(0, 1, 0), (1, 7, 3), (2, 2, 6)] {
@@ -166,20 +166,12 @@ mod tests {
 
     #[test]
     fn hostile_files_are_refused_in_words() {
-        let (dir, path) = written(&FRAMES);
+        let (dir, path) = written();
         let refused =
             |change: &dyn Fn(&mut Vec<u8>), words: &str| damage_is_refused(&path, "00001.1.3.46.his", change, words);
         let set = |at: usize, x: u16| move |b: &mut Vec<u8>| b[at..at + 2].copy_from_slice(&x.to_le_bytes());
         refused(&|b| b.truncate(60), "header: found the end of the file after 60 bytes, expected 68 bytes");
         refused(&set(0, 0x7100), "format: found [00, 71, 44, 00] at the start, expected 00 70 44 00");
-        refused(
-            &|b| b.truncate(200),
-            "pixels: found 100 bytes of data in the file, expected 128 bytes (64 values of 2 bytes, as the header says)",
-        );
-        refused(
-            &|b| b.push(0),
-            "pixels: found 129 bytes of data in the file, expected 128 bytes (64 values of 2 bytes, as the header says)",
-        );
         refused(&set(16, 0), "columns: found 1 to 0, expected a last one after the first");
         refused(
             &set(16, 65535),
