@@ -63,6 +63,12 @@ pub(crate) fn is_geometry(found: &Geometry, want: &Geometry) {
     assert!(pairs.all(|(a, b)| (a - b).abs() < 1e-12), "{a:?} is not {b:?}");
 }
 
+/// Fails unless the line integral at view, row and column is `want`, to a millionth.
+pub(crate) fn is_integral(scan: &Scan, at: [usize; 3], want: f64) {
+    let found = f64::from(scan.projections[at]);
+    assert!((found - want).abs() < 1e-6, "{at:?}: {found} is not {want}");
+}
+
 /// Writes a 16-bit TIFF with the pixels that `f` gives for row and column.
 pub(crate) fn tiff16(path: &Path, [rows, columns]: [usize; 2], f: impl Fn(usize, usize) -> u16) {
     use tiff::encoder::{TiffEncoder, colortype::Gray16};

@@ -100,7 +100,7 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
 
 #[cfg(test)]
 mod tests {
-    use crate::testing::{damage_is_refused, is_view, read_scan, read_scanner, replaced, says_just};
+    use crate::testing::{damage_is_refused, is_integral, is_view, read_scan, read_scanner, replaced, says_just};
     use std::fmt::Write;
     use std::fs;
     use std::path::PathBuf;
@@ -148,9 +148,8 @@ mod tests {
         let scan = read_scan(&path).unwrap();
         assert_eq!(scan.projections.dim(), (3, 8, 8));
         for (i, row, column) in [(0, 1, 0), (1, 7, 3), (2, 2, 6)] {
-            let want = (65536.0 / (65536.0 - f64::from(pixel(i, row, column)))).ln();
-            let found = f64::from(scan.projections[[i, row, column]]);
-            assert!((found - want).abs() < 1e-5, "{i} {row} {column}: {found} {want}");
+            let counts = 65536.0 - f64::from(pixel(i, row, column));
+            is_integral(&scan, [i, row, column], (65536.0 / counts).ln());
         }
         // 0 is a pixel without a count: air.
         assert!(scan.projections[[0, 0, 0]].abs() < 1e-4);

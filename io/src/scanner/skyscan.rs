@@ -127,7 +127,9 @@ fn projections(keys: &Keys, path: &Path, step: f64, remarks: &mut Vec<String>) -
 
 #[cfg(test)]
 mod tests {
-    use crate::testing::{damage_is_refused, is_view, read_scan, read_scanner, replaced, says, says_just, tiff16};
+    use crate::testing::{
+        damage_is_refused, is_integral, is_view, read_scan, read_scanner, replaced, says, says_just, tiff16,
+    };
     use conefield_core::orbit::CircularOrbit;
     use std::fs;
     use std::path::PathBuf;
@@ -161,8 +163,7 @@ mod tests {
         let scan = read_scan(&path).unwrap();
         assert_eq!(scan.projections.dim(), (4, 4, 6));
         for (i, row, column) in [(0, 0, 0), (3, 1, 5), (2, 3, 2)] {
-            let want = (60_000.0 / f32::from(count(i, row, column))).ln();
-            assert!((scan.projections[[i, row, column]] - want).abs() < 1e-6, "{i} {row} {column}");
+            is_integral(&scan, [i, row, column], (60_000.0 / f64::from(count(i, row, column))).ln());
         }
         // The pixel is 0.04 mm on the detector; its middle, row 2, is one row below the optical axis.
         let views = &scan.geometry.views;
