@@ -87,7 +87,7 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
     let pixel = [SIDE / rows as f64, SIDE / columns as f64];
     let mut stands = Vec::new();
     for frame in document.descendants().filter(|n| n.tag_name().name() == "Frame") {
-        let keys = Keys::xml(format!("{place}: frame {}", stands.len() + 1), frame);
+        let keys = Keys::below(format!("{place}: frame {}", stands.len() + 1), frame);
         let detector = [-keys.number("UCentre")?, -keys.number("VCentre")?];
         stands.push((keys.number("GantryAngle")?, detector));
     }

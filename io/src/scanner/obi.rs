@@ -13,10 +13,9 @@ use super::keys::Keys;
 use super::vendor::Open;
 use super::{Description, differences};
 use crate::folder;
-use crate::input::{Input, LONGEST_TEXT};
+use crate::input::Input;
 use crate::number::{ByteOrder, Number};
 use crate::scan_folder::folder_of;
-use crate::text::{self, read_foreign};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use ndarray::Array3;
@@ -114,10 +113,8 @@ pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
 
 /// The scan that the text `path` describes.
 pub(super) fn scan(path: &Path) -> Result<Description> {
-    let text = read_foreign(path, LONGEST_TEXT)?;
-    let place = path.display().to_string();
-    let document = text::xml(&place, &text, "Varian's ProjectionInfo.xml")?;
-    let keys = Keys::xml(place.clone(), document.root_element());
+    let keys = Keys::xml(path, "Varian's ProjectionInfo.xml")?;
+    let place = keys.place();
     let [sid, sdd] = [keys.length("CalibratedSAD")?, keys.length("CalibratedSID")?];
     let half = match keys.text("FanType") {
         Some(fan) if fan.eq_ignore_ascii_case("HalfFan") => keys.number("DetectorPosLat")?,
@@ -128,16 +125,16 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
     let folder = folder_of(path);
     let images = folder::below(folder, DEPTH, &["hnd", "hnc"])?;
     let heads: Vec<Head> =
-        images.iter().map(|n| head(&folder::inside(folder, &place, "images", n)?)).collect::<Result<_>>()?;
+        images.iter().map(|n| head(&folder::inside(folder, place, "images", n)?)).collect::<Result<_>>()?;
     let expected = "*.hnd or *.hnc beside the file or in a folder there";
-    let first = heads.first().ok_or_else(|| Error::invalid(&place, "images", "none", expected))?;
+    let first = heads.first().ok_or_else(|| keys.invalid("images", "none", expected))?;
     for (field, x) in [("pixel height", first.pixel[0]), ("pixel width", first.pixel[1])] {
         ensure(x > 0.0, &images[0], field, x, "a length above 0")?;
     }
     let stands: Vec<_> = heads.iter().map(|h| (h.angle, detector)).collect();
     let remark = format!("the files do not state the open beam; {I0} counts are taken, as RTK does (--i0 sets others)");
     let (open, size, pixel) = (Open::Number(I0), first.size, first.pixel);
-    Description::on_gantry(&place, images, open, [sid, sdd], size, pixel, &stands, vec![remark])
+    Description::on_gantry(place, images, open, [sid, sdd], size, pixel, &stands, vec![remark])
 }
 
 #[cfg(test)]

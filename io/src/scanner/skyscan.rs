@@ -17,10 +17,9 @@ use super::Description;
 use super::keys::Keys;
 use super::vendor::{MOST_PIXELS, MOST_VIEWS, Open, field_of_view};
 use crate::folder;
-use crate::input::LONGEST_TEXT;
 use crate::scan_folder::folder_of;
 use crate::stack::Names;
-use crate::text::{read_foreign, shortened, unread};
+use crate::text::{shortened, unread};
 use conefield_core::orbit::CircularOrbit;
 use conefield_core::{Error, Result};
 use std::path::Path;
@@ -52,8 +51,7 @@ const KNOWN: &[&str] = &[
 ];
 
 pub(super) fn scan(path: &Path) -> Result<Description> {
-    let text = read_foreign(path, LONGEST_TEXT)?;
-    let keys = Keys::ini(path.display().to_string(), &text, KNOWN)?;
+    let keys = Keys::ini(path, KNOWN)?;
     if let Some(found) = keys.text(TRAJECTORY).filter(|t| !t.eq_ignore_ascii_case("round")) {
         let what = format!("{}: {TRAJECTORY} {}", keys.place(), shortened(found));
         return Err(Error::unsupported(what, "only circles are read (ROUND)"));

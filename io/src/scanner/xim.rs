@@ -17,11 +17,10 @@ use super::keys::Keys;
 use super::vendor::{Open, Response};
 use super::{Description, differences};
 use crate::folder;
-use crate::input::{Input, LONGEST_TEXT};
+use crate::input::Input;
 use crate::number::{ByteOrder, Number};
 use crate::scan_folder::folder_of;
 use crate::stack::Names;
-use crate::text::{self, read_foreign};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use ndarray::Array3;
@@ -180,10 +179,8 @@ pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
 
 /// The scan that the `Scan.xml` at `path` describes.
 pub(super) fn scan(path: &Path) -> Result<Description> {
-    let text = read_foreign(path, LONGEST_TEXT)?;
-    let place = path.display().to_string();
-    let document = text::xml(&place, &text, "Varian's Scan.xml")?;
-    let keys = Keys::xml(place.clone(), document.root_element());
+    let keys = Keys::xml(path, "Varian's Scan.xml")?;
+    let place = keys.place();
     let [sid, sdd] = [keys.length("SAD")?, keys.length("SID")?];
     let bow_tie = keys.text("Bowtie").is_some_and(|b| !b.eq_ignore_ascii_case("none"));
     let folder = folder_of(path);
@@ -200,7 +197,7 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
     };
     let flats: Vec<String> = all.iter().filter(air).cloned().collect();
     let heads = |names: &[String]| -> Result<Vec<Head>> {
-        names.iter().map(|n| head(&folder::inside(folder, &place, "images", n)?)).collect()
+        names.iter().map(|n| head(&folder::inside(folder, place, "images", n)?)).collect()
     };
     let (found, open) = (heads(&images)?, heads(&flats)?);
     let mut remarks = Vec::new();
@@ -208,7 +205,7 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
     let (images, found): (Vec<String>, Vec<Head>) =
         images.into_iter().zip(found).filter(|(_, h)| h.size.iter().all(|n| *n > 0)).unzip();
     let first = found.first().ok_or_else(|| {
-        Error::invalid(&place, "images", "none", "Proj_*.xim with pixels beside Scan.xml or below Acquisitions")
+        keys.invalid("images", "none", "Proj_*.xim with pixels beside Scan.xml or below Acquisitions")
     })?;
     let pixel = [first.length("PixelHeight")?, first.length("PixelWidth")?];
     let stand = |h: &Head| -> Result<_> {
@@ -224,7 +221,7 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
         let factor = |h: &Head| h.length(CHAMBER).map(|c| (beam / c) as f32);
         (Open::Flat(Names::Many(flats)), Response::Factors(found.iter().map(factor).collect::<Result<_>>()?))
     };
-    let scan = Description::on_gantry(&place, images, open, [sid, sdd], first.size, pixel, &stands, remarks)?;
+    let scan = Description::on_gantry(place, images, open, [sid, sdd], first.size, pixel, &stands, remarks)?;
     Ok(Description { response, ..scan })
 }
 
