@@ -379,8 +379,7 @@ fn total(angles: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::read_truth;
-    use crate::testing::{consistent, is_geometry, says, scan};
+    use crate::testing::{consistent, data_set_comes_back, is_geometry, says};
     use std::fs;
     use std::path::PathBuf;
 
@@ -399,27 +398,7 @@ mod tests {
     #[test]
     fn what_is_written_comes_back() {
         let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("any name");
-        let train = scan();
-        let (_, test) = train.split(&[1, 4]).unwrap();
-        let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
-        write_naf(&path, &train, Some(&test), Some(&volume)).unwrap();
-        let back = read(&path, true).unwrap();
-        is_geometry(&back.train.geometry, &train.geometry);
-        assert_eq!((&back.train.unit, &back.train.projections), (&train.unit, &train.projections));
-        assert_eq!(back.train.provenance["unit_from"], "the file");
-        let back_test = back.test.unwrap();
-        is_geometry(&back_test.geometry, &test.geometry);
-        assert_eq!(back_test.projections, test.projections);
-        assert_eq!(back.volume.unwrap().data, volume.data);
-        write_naf(&path, &train, None, None).unwrap();
-        let back = read(&path, true).unwrap();
-        assert!(back.test.is_none() && back.volume.is_none() && read_truth(&path).unwrap().is_none());
-        let mut odd = train.clone();
-        odd.geometry.views[0].source[2] += 1.0;
-        says(write_naf(dir.path().join("odd"), &odd, None, None), &["NAF", "circle"]);
-        let small = Volume::centered(Array3::ones((2, 2, 2)), [1.0; 3]);
-        assert!(write_naf(&path, &train, None, Some(&small)).unwrap_err().to_string().contains("[5, 6, 7]"));
+        data_set_comes_back(&dir.path().join("any name"), &|p, s, test, v| write_naf(p, s, test, v), &read);
     }
 
     #[test]

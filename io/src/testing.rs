@@ -1,6 +1,6 @@
 //! Helpers shared by the tests of several modules.
 
-use crate::{I0, OpenBeam, Stored, is_volume, rays, read_volume, volume_voxels, write_volume};
+use crate::{DataSet, I0, OpenBeam, Stored, is_volume, rays, read_volume, volume_voxels, write_volume};
 use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
 use conefield_core::orbit::CircularOrbit;
@@ -212,4 +212,33 @@ pub(crate) fn consistent(unit: Unit) -> (Scan, Volume) {
     });
     let grid = s.geometry.volume;
     (s, Volume { data, grid, affine: None })
+}
+
+/// Fails unless `read` gives back what `write` writes to `path`: views, test views and a volume, and then views alone in
+/// their place. Neither a scan that is no circle nor a volume of another shape is written.
+pub(crate) fn data_set_comes_back(
+    path: &Path,
+    write: &dyn Fn(&Path, &Scan, Option<&Scan>, Option<&Volume>) -> Result<()>,
+    read: &dyn Fn(&Path, bool) -> Result<DataSet>,
+) {
+    let train = scan();
+    let (_, test) = train.split(&[1, 4]).unwrap();
+    let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
+    write(path, &train, Some(&test), Some(&volume)).unwrap();
+    let back = read(path, true).unwrap();
+    for (found, want) in [(&back.train, &train), (back.test.as_ref().unwrap(), &test)] {
+        is_geometry(&found.geometry, &want.geometry);
+        assert_eq!((&found.unit, &found.projections), (&want.unit, &want.projections));
+        assert_eq!(found.provenance["unit_from"], "the file");
+    }
+    assert_eq!(back.volume.unwrap().data, volume.data);
+    assert!(read(path, false).unwrap().test.is_none());
+    write(path, &train, None, None).unwrap();
+    let back = read(path, true).unwrap();
+    assert!(back.test.is_none() && back.volume.is_none() && crate::read_truth(path).unwrap().is_none());
+    let mut odd = train.clone();
+    odd.geometry.views[0].source[2] += 1.0;
+    says(write(path, &odd, None, None), &["circle"]);
+    let small = Volume::centered(Array3::ones((2, 2, 2)), [1.0; 3]);
+    says(write(path, &train, None, Some(&small)), &["shape of the volume", "[2, 2, 2]", "[5, 6, 7]"]);
 }
