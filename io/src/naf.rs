@@ -11,7 +11,6 @@ use crate::pickle::{self, Item, Out, Pickle};
 use crate::scan::DataSet;
 use crate::unit::{self, Reading, Units};
 use crate::{rays, text, write_atomic};
-use conefield_core::error::ensure;
 use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::orbit::{Beam, CircularOrbit};
