@@ -17,7 +17,7 @@ use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
 use serde::Deserialize;
-use serde_json::json;
+use serde_json::{Map, Value, json};
 use std::path::Path;
 
 /// The file that describes the folder.
@@ -38,6 +38,9 @@ struct Meta {
 struct Frame {
     file_path: String,
     angle: f64,
+    /// The keys that are not read.
+    #[serde(flatten)]
+    rest: Map<String, Value>,
 }
 
 #[derive(Deserialize)]
@@ -56,6 +59,9 @@ struct Scanner {
     offOrigin: [f64; 3],
     #[serde(default)]
     offDetector: [f64; 2],
+    /// The keys that are not read.
+    #[serde(flatten)]
+    rest: Map<String, Value>,
 }
 
 /// Reads R2-Gaussian's folder: training views, test views if `with_test` says so, and the volume.
@@ -66,13 +72,14 @@ struct Scanner {
 /// counts as the first case, with a warning.
 pub(crate) fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
-    text::warn(&file.display().to_string(), unread(&others(&text::read(&file)?)));
-    described(folder, with_test)
+    let meta = text::read(&file)?;
+    text::warn(&file.display().to_string(), unread(&others(&meta)));
+    described(folder, meta, with_test)
 }
 
 /// The volume of [`read`], in the unit that the training views give.
 pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
-    described(folder, false).map(|r| r.volume)
+    described(folder, text::read(&folder.join(META))?, false).map(|r| r.volume)
 }
 
 /// Keys of the scanner that do not move source, detector or volume, beside those of noise.
@@ -80,40 +87,29 @@ const STILL: [&str; 4] = ["filter", "accuracy", "totalAngle", "startAngle"];
 
 /// Numbers other than 0 in a description that are not read: of the scanner (TIGRE's `rotDetector` and `COR`, say) and of
 /// single views.
-fn others(meta: &serde_json::Value) -> Vec<String> {
-    fn set(value: &serde_json::Value) -> bool {
+fn others(meta: &Meta) -> Vec<String> {
+    fn set(value: &Value) -> bool {
         match value {
-            serde_json::Value::Number(n) => n.as_f64() != Some(0.0),
-            serde_json::Value::Array(all) => all.iter().any(set),
+            Value::Number(n) => n.as_f64() != Some(0.0),
+            Value::Array(all) => all.iter().any(set),
             _ => false,
         }
     }
-    let known = |key: &str| SCANNER_KEYS.contains(&key) || STILL.contains(&key) || key.to_lowercase().contains("noise");
+    let moving = |key: &str| !STILL.contains(&key) && !key.to_lowercase().contains("noise");
     let mut all = Vec::new();
-    for (key, value) in meta["scanner"].as_object().into_iter().flatten() {
-        if !known(key) && set(value) {
-            all.push(format!("scanner.{key} = {}", shortened(&value.to_string()).trim_matches('"')));
-        }
+    for (key, value) in meta.scanner.rest.iter().filter(|(key, value)| moving(key) && set(value)) {
+        all.push(format!("scanner.{key} = {}", shortened(&value.to_string()).trim_matches('"')));
     }
-    for split in ["proj_train", "proj_test"] {
-        let frames = meta[split].as_array().into_iter().flatten().enumerate();
-        let mut keys = frames.flat_map(|(i, f)| f.as_object().into_iter().flatten().map(move |(key, v)| (i, key, v)));
-        let stranger = keys.find(|(_, key, value)| !["file_path", "angle"].contains(&key.as_str()) && set(value));
+    for (split, frames) in [("proj_train", &meta.proj_train), ("proj_test", &meta.proj_test)] {
+        let mut keys = frames.iter().enumerate().flat_map(|(i, f)| f.rest.iter().map(move |(key, v)| (i, key, v)));
+        let stranger = keys.find(|(.., value)| set(value));
         all.extend(stranger.map(|(i, key, _)| format!("{split}[{i}].{key}")));
     }
     all
 }
 
-/// The keys of [`Scanner`].
-const SCANNER_KEYS: [&str; 11] = [
-    "mode", "DSD", "DSO", "nDetector", "sDetector", "dDetector", "nVoxel", "sVoxel", "dVoxel", "offOrigin",
-    "offDetector",
-];
-
-fn described(folder: &Path, with_test: bool) -> Result<DataSet> {
-    let file = folder.join(META);
-    let place = file.display().to_string();
-    let meta: Meta = text::read(&file)?;
+fn described(folder: &Path, meta: Meta, with_test: bool) -> Result<DataSet> {
+    let place = folder.join(META).display().to_string();
     let s = &meta.scanner;
     for (field, x) in [("scanner.DSO", s.DSO), ("scanner.DSD", s.DSD)] {
         ensure(x.is_finite() && x > 0.0, &place, field, x, "a positive finite distance")?;
@@ -260,7 +256,7 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
     let (g, grid) = (&train.geometry, &train.geometry.volume);
     let size = grid.size();
     let half = size.iter().copied().fold(0.0, f64::max) / 2.0;
-    let frames = |split: &str, angles: &[f64]| -> Vec<serde_json::Value> {
+    let frames = |split: &str, angles: &[f64]| -> Vec<Value> {
         let frame = |(i, a): (usize, &f64)| json!({ "file_path": format!("{split}/{split}_{i:04}.npy"), "angle": a });
         angles.iter().enumerate().map(frame).collect()
     };
@@ -313,7 +309,6 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
 mod tests {
     use super::*;
     use crate::testing::{consistent, data_set_comes_back, is_geometry, says, scan};
-    use serde_json::Value;
     use std::fs;
 
     /// Changes the description in the folder `path`.
