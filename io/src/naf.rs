@@ -149,24 +149,19 @@ impl Description {
         };
         let distance = |key: &str| -> Result<f64> {
             let item = required(top, key)?;
-            positive(&item, [item.number()?], "a positive finite distance in mm").map(|[x]| x)
+            let found = item.number()?;
+            if found > 0.0 { Ok(found) } else { Err(item.invalid(found, "a positive finite distance in mm")) }
         };
-        let (detector, voxels) = (required(top, "nDetector")?, required(top, "nVoxel")?);
-        let (pixel, spacing) = (required(top, "dDetector")?, required(top, "dVoxel")?);
         Ok(Self {
             beam,
             dso: distance("DSO")?,
             dsd: distance("DSD")?,
-            detector: counts(&detector, "pixels along [v, u]")?,
-            pixel: positive(&pixel, pixel.list("pixel size along [v, u]")?, "positive lengths in mm along [v, u]")?,
+            detector: counts(top, "nDetector", "pixels along [v, u]")?,
+            pixel: lengths(top, "dDetector", "pixel size", "[v, u]")?,
             offset: top.get("offDetector")?.map_or(Ok([0.0; 2]), |i| i.list("mm along [v, u]"))?,
             grid: VoxelGrid {
-                shape: counts(&voxels, "voxels along [x, y, z]")?,
-                spacing: positive(
-                    &spacing,
-                    spacing.list("voxel size along [x, y, z]")?,
-                    "positive lengths in mm along [x, y, z]",
-                )?,
+                shape: counts(top, "nVoxel", "voxels along [x, y, z]")?,
+                spacing: lengths(top, "dVoxel", "voxel size", "[x, y, z]")?,
                 center: top.get("offOrigin")?.map_or(Ok([0.0; 3]), |i| i.list("mm along [x, y, z]"))?,
             },
         })
@@ -265,7 +260,8 @@ fn nearest<'k>(key: &str, names: impl Iterator<Item = &'k &'k str>) -> Option<(&
     names.map(|n| (*n, near(n))).max_by(|a, b| a.1.total_cmp(&b.1))
 }
 
-fn counts<const N: usize>(item: &Item, axes: &str) -> Result<[usize; N]> {
+fn counts<const N: usize>(top: &Item, key: &str, axes: &str) -> Result<[usize; N]> {
+    let item = required(top, key)?;
     let found: [f64; N] = item.list(axes)?;
     let whole = found.iter().all(|x| x.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(x));
     if !whole {
@@ -274,12 +270,13 @@ fn counts<const N: usize>(item: &Item, axes: &str) -> Result<[usize; N]> {
     Ok(found.map(|x| x as usize))
 }
 
-fn positive<const N: usize>(item: &Item, found: [f64; N], expected: &str) -> Result<[f64; N]> {
-    match found.iter().find(|x| **x <= 0.0) {
-        Some(_) if N > 1 => Err(item.invalid(format!("{found:?}"), expected)),
-        Some(x) => Err(item.invalid(x, expected)),
-        None => Ok(found),
+fn lengths<const N: usize>(top: &Item, key: &str, what: &str, axes: &str) -> Result<[f64; N]> {
+    let item = required(top, key)?;
+    let found: [f64; N] = item.list(&format!("{what} along {axes}"))?;
+    if found.iter().any(|x| *x <= 0.0) {
+        return Err(item.invalid(format!("{found:?}"), format!("positive lengths in mm along {axes}")));
     }
+    Ok(found)
 }
 
 /// Checks a count of views that NAF itself uses; it may be smaller than the number of views in the file.
