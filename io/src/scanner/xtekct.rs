@@ -292,13 +292,13 @@ mod tests {
     #[test]
     fn texts_of_windows_and_names_in_capitals_are_read() {
         let (dir, path) = written(TEXT);
-        fs::write(&path, [b"[XTekCT]\r\nOperatorID=K\xfcndig \xa9\r\n".as_slice(), TEXT.as_bytes()].concat()).unwrap();
         fs::create_dir(dir.path().join("Raw")).unwrap();
         for i in 1..=4 {
             let [from, to] = [format!("bone_{i:04}.tif"), format!("Raw/BONE_{i:05}.TIF")];
             fs::rename(dir.path().join(from), dir.path().join(to)).unwrap();
         }
-        fs::write(&path, TEXT.replace("InputFolderName=", "InputFolderName=.\\Raw")).unwrap();
+        let text = TEXT.replace("InputFolderName=", "InputFolderName=.\\Raw");
+        fs::write(&path, [&b"[XTekCT]\r\nOperatorID=K\xfcndig \xa9\r\n"[..], text.as_bytes()].concat()).unwrap();
         let scan = read_scan(&path).unwrap();
         assert_eq!(scan.projections.dim(), (3, 4, 5));
         is_integral(&scan, [1, 0, 0], 2.5f64.ln());
