@@ -18,7 +18,6 @@ use crate::scan_folder::folder_of;
 use crate::text::{self, read_foreign};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
-use ndarray::Array3;
 use std::path::Path;
 
 /// The type of the file, 0x7000, and the length of its header.
@@ -67,12 +66,10 @@ pub(super) fn shape(path: &Path) -> Result<[usize; 3]> {
     open(path).map(|(shape, _)| shape)
 }
 
-/// The numbers as stored.
-pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
+/// Shape and numbers as stored.
+pub(super) fn read(path: &Path) -> Result<([usize; 3], Vec<f32>)> {
     let (shape, mut input) = open(path)?;
-    let count = shape.iter().product();
-    let values = input.singles("pixels", count, Number::U16, ByteOrder::Little)?;
-    Array3::from_shape_vec(shape, values).map_err(|e| input.invalid("pixels", e, "as many as the header says"))
+    Ok((shape, input.singles("pixels", shape.iter().product(), Number::U16, ByteOrder::Little)?))
 }
 
 /// The scan that `_Frames.xml` at `path` describes.

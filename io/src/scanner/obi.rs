@@ -17,8 +17,7 @@ use crate::input::Input;
 use crate::number::{ByteOrder, Number};
 use crate::scan_folder::folder_of;
 use conefield_core::error::ensure;
-use conefield_core::{Error, Result};
-use ndarray::Array3;
+use conefield_core::Result;
 use std::path::Path;
 
 /// The start of both formats, and of others that are not read.
@@ -85,30 +84,23 @@ pub(super) fn head(path: &Path) -> Result<Head> {
     open(path).map(|(head, _)| head)
 }
 
-/// The image `path`.
-pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
+/// Shape and numbers of the image `path`.
+pub(super) fn read(path: &Path) -> Result<([usize; 3], Vec<f32>)> {
     let (Head { size: [rows, columns], compressed, .. }, mut input) = open(path)?;
-    let place = input.place();
-    let values = if compressed {
-        input.skip((HND_HEADER - HNC_HEADER) as u64, "header")?;
-        let left = usize::try_from(input.left().unwrap_or(0)).unwrap_or(usize::MAX);
-        let table = rows.saturating_sub(1).saturating_mul(columns) / 4;
-        let expected = format!("at most the {left} left in the file");
-        ensure(
-            table <= left,
-            &place,
-            "lookup table",
-            format!("{table} bytes, for {rows} x {columns} pixels"),
-            expected,
-        )?;
-        let codes = input.exactly(table, "lookup table")?;
-        let packed = input.exactly(left - table, "pixels")?;
-        differences::unpack(&place, [rows, columns], &codes, &packed)?
-    } else {
-        input.singles("pixels", rows.saturating_mul(columns), Number::U16, ByteOrder::Little)?
-    };
-    Array3::from_shape_vec((1, rows, columns), values)
-        .map_err(|e| Error::invalid(place, "pixels", e, "as many as rows and columns say"))
+    let shape = [1, rows, columns];
+    if !compressed {
+        let count = rows.saturating_mul(columns);
+        return Ok((shape, input.singles("pixels", count, Number::U16, ByteOrder::Little)?));
+    }
+    input.skip((HND_HEADER - HNC_HEADER) as u64, "header")?;
+    let left = usize::try_from(input.left().unwrap_or(0)).unwrap_or(usize::MAX);
+    let table = rows.saturating_sub(1).saturating_mul(columns) / 4;
+    let (found, expected) =
+        (format!("{table} bytes, for {rows} x {columns} pixels"), format!("at most the {left} left in the file"));
+    ensure(table <= left, &input.place(), "lookup table", found, expected)?;
+    let codes = input.exactly(table, "lookup table")?;
+    let packed = input.exactly(left - table, "pixels")?;
+    Ok((shape, differences::unpack(&input.place(), [rows, columns], &codes, &packed)?))
 }
 
 /// The scan that the text `path` describes.

@@ -23,7 +23,6 @@ use crate::scan_folder::folder_of;
 use crate::stack::Names;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
-use ndarray::Array3;
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -66,15 +65,8 @@ impl Head {
     }
 }
 
-/// An open file after its header.
-struct Opened {
-    input: Input,
-    size: [usize; 2],
-    bytes: usize,
-    compressed: bool,
-}
-
-fn open(path: &Path) -> Result<Opened> {
+/// The file after its header, rows and columns, and the bytes of a pixel if they are not compressed.
+fn open(path: &Path) -> Result<(Input, [usize; 2], Option<usize>)> {
     let mut input = Input::open_plain(path)?;
     let found = input.take(8)?;
     if !found.starts_with(MAGIC) {
@@ -88,7 +80,7 @@ fn open(path: &Path) -> Result<Opened> {
         integer(&mut input, "bytes per pixel")?,
         integer(&mut input, "compression")?,
     ];
-    Ok(Opened { input, size: [rows, columns], bytes, compressed: compressed != 0 })
+    Ok((input, [rows, columns], (compressed == 0).then_some(bytes)))
 }
 
 /// The next 32-bit integer, which is not negative.
@@ -110,7 +102,8 @@ fn length(input: &mut Input, field: &str) -> Result<usize> {
 
 /// Size and properties of the image `path`.
 pub(super) fn head(path: &Path) -> Result<Head> {
-    let Opened { mut input, size, compressed, .. } = open(path)?;
+    let (mut input, size, bytes) = open(path)?;
+    let compressed = bytes.is_none();
     if compressed {
         let table = length(&mut input, "lookup table")?;
         input.skip(table as u64, "lookup table")?;
@@ -150,31 +143,28 @@ pub(super) fn head(path: &Path) -> Result<Head> {
     Ok(Head { place: input.place(), size, numbers })
 }
 
-/// The image `path`.
-pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
-    let Opened { mut input, size: [rows, columns], bytes, compressed } = open(path)?;
-    let place = input.place();
-    let values = if compressed {
+/// Shape and numbers of the image `path`.
+pub(super) fn read(path: &Path) -> Result<([usize; 3], Vec<f32>)> {
+    let (mut input, [rows, columns], bytes) = open(path)?;
+    let shape = [1, rows, columns];
+    let Some(bytes) = bytes else {
         let length_of_table = length(&mut input, "lookup table")?;
         let table = input.exactly(length_of_table, "lookup table")?;
         let length_of_pixels = length(&mut input, "pixels")?;
         let packed = input.exactly(length_of_pixels, "pixels")?;
-        differences::unpack(&place, [rows, columns], &table, &packed)?
-    } else {
-        let number = match bytes {
-            1 => Number::U8,
-            2 => Number::U16,
-            4 => Number::I32,
-            _ => return Err(input.invalid("bytes per pixel", bytes, "1, 2 or 4")),
-        };
-        let count = rows.saturating_mul(columns);
-        let found = length(&mut input, "pixels")?;
-        let expected = format!("{} for {rows} x {columns} pixels", count.saturating_mul(bytes));
-        ensure(found == count.saturating_mul(bytes), &place, "pixels", format!("{found} bytes"), expected)?;
-        input.part(found as u64).singles("pixels", count, number, ByteOrder::Little)?
+        return Ok((shape, differences::unpack(&input.place(), [rows, columns], &table, &packed)?));
     };
-    Array3::from_shape_vec((1, rows, columns), values)
-        .map_err(|e| Error::invalid(place, "pixels", e, "as many as rows and columns say"))
+    let number = match bytes {
+        1 => Number::U8,
+        2 => Number::U16,
+        4 => Number::I32,
+        _ => return Err(input.invalid("bytes per pixel", bytes, "1, 2 or 4")),
+    };
+    let count = rows.saturating_mul(columns);
+    let (found, wanted) = (length(&mut input, "pixels")?, count.saturating_mul(bytes));
+    let expected = format!("{wanted} for {rows} x {columns} pixels");
+    ensure(found == wanted, &input.place(), "pixels", format!("{found} bytes"), expected)?;
+    Ok((shape, input.part(found as u64).singles("pixels", count, number, ByteOrder::Little)?))
 }
 
 /// The scan that the `Scan.xml` at `path` describes.
