@@ -73,7 +73,7 @@ use conefield_core::orbit::{Beam, CircularOrbit};
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis};
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 use vendor::Response;
@@ -228,10 +228,9 @@ struct Uv {
     v: f64,
 }
 
-#[derive(Deserialize, Clone, Copy, Default, PartialEq, Serialize)]
+#[derive(Deserialize, Clone, Copy, PartialEq)]
 #[serde(rename_all = "lowercase")]
 enum Direction {
-    #[default]
     Counterclockwise,
     Clockwise,
 }
@@ -287,18 +286,12 @@ struct Cil {
     file: String,
 }
 
-#[derive(Deserialize)]
+#[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields, default)]
 struct LayoutTable {
-    axes: Vec<StackAxis>,
+    axes: Option<Vec<StackAxis>>,
     flip_rows: bool,
     flip_columns: bool,
-}
-
-impl Default for LayoutTable {
-    fn default() -> Self {
-        Self { axes: vec![StackAxis::View, StackAxis::Row, StackAxis::Column], flip_rows: false, flip_columns: false }
-    }
 }
 
 #[derive(Deserialize, Clone, Copy, Default, PartialEq)]
@@ -317,9 +310,8 @@ enum I0Text {
 }
 
 #[derive(Deserialize, Default)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 struct ValuesTable {
-    #[serde(default)]
     kind: ValueKind,
     i0: Option<I0Text>,
     floor: Option<f64>,
@@ -426,13 +418,14 @@ fn straightened(place: &str, mut geometry: Geometry, mut projections: Array3<f32
 
 fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
     let all = [StackAxis::View, StackAxis::Row, StackAxis::Column];
-    let lacked: Vec<StackAxis> = all.into_iter().filter(|a| !table.axes.contains(a)).collect();
+    let stated = table.axes.as_deref().unwrap_or(&all);
+    let lacked: Vec<StackAxis> = all.into_iter().filter(|a| !stated.contains(a)).collect();
     // Files of images that lack the views are stacked along the first axis.
-    let all = if lacked == [StackAxis::View] { [&lacked, &table.axes[..]] } else { [&table.axes[..], &lacked] };
-    let axes = <[StackAxis; 3]>::try_from(all.concat()).ok();
+    let whole = if lacked == [StackAxis::View] { [&lacked, stated] } else { [stated, &lacked] };
+    let axes = <[StackAxis; 3]>::try_from(whole.concat()).ok();
     let Some(axes) = axes.filter(|_| lacked.len() < 2) else {
         let expected = "each of \"view\", \"row\" and \"column\" once, or two of them";
-        return Err(Error::invalid(place, "layout.axes", format!("{:?}", table.axes), expected));
+        return Err(Error::invalid(place, "layout.axes", format!("{stated:?}"), expected));
     };
     let lacked = lacked.first().copied().unwrap_or(StackAxis::View);
     Ok(StackLayout { axes, lacked, flip_rows: table.flip_rows, flip_columns: table.flip_columns })

@@ -16,8 +16,8 @@ use crate::folder;
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
 use crate::scan_folder::folder_of;
-use conefield_core::error::ensure;
 use conefield_core::Result;
+use conefield_core::error::ensure;
 use std::path::Path;
 
 /// The start of both formats, and of others that are not read.
