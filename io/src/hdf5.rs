@@ -150,14 +150,9 @@ impl Container {
     }
 
     fn broken(&self, data: &Dataset, e: &hdf5_reader::error::Error) -> Error {
-        if let hdf5_reader::error::Error::UnsupportedFilter(text) = e {
-            return self.packed_otherwise(data, text);
-        }
-        self.invalid(data.name(), e, "data that is not damaged, unpacked or packed by deflate")
-    }
-
-    /// The error about a filter that is not read; `text` is the library's, which ends with the filter's number.
-    fn packed_otherwise(&self, data: &Dataset, text: &str) -> Error {
+        let hdf5_reader::error::Error::UnsupportedFilter(text) = e else {
+            return self.invalid(data.name(), e, "data that is not damaged, unpacked or packed by deflate");
+        };
         let number = text.strip_prefix("filter id ").and_then(|n| n.parse::<u32>().ok());
         let name = FILTERS.iter().find(|(id, _)| Some(*id) == number).map_or("a filter", |(_, name)| name);
         Error::unsupported(
@@ -206,12 +201,10 @@ impl Container {
 
     /// Storage type of the values.
     fn number(&self, data: &Dataset) -> Result<(Number, ByteOrder)> {
-        stored(data.dtype()).ok_or_else(|| self.other_type(data))
-    }
-
-    fn other_type(&self, data: &Dataset) -> Error {
-        let found: String = format!("{:?}", data.dtype()).chars().take(80).collect();
-        self.invalid(data.name(), found, "integers of 1 to 8 bytes or floats of 4 or 8")
+        stored(data.dtype()).ok_or_else(|| {
+            let found: String = format!("{:?}", data.dtype()).chars().take(80).collect();
+            self.invalid(data.name(), found, "integers of 1 to 8 bytes or floats of 4 or 8")
+        })
     }
 
     /// The values of the `kept` frames along the first axis, or of all.
@@ -340,10 +333,8 @@ impl Container {
 
     /// Refuses `found` values of `data` unless there is one per frame.
     fn one_each(&self, data: &Dataset, found: usize, frames: usize) -> Result<()> {
-        if found == frames {
-            return Ok(());
-        }
-        Err(self.invalid(data.name(), format!("{found} values"), format!("{frames}, one for each frame")))
+        let expected = format!("{frames}, one for each frame");
+        ensure(found == frames, &self.place, data.name(), format!("{found} values"), expected)
     }
 
     /// A text attribute of `data`.

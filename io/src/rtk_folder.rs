@@ -49,8 +49,12 @@ pub fn write_rtk(folder: impl AsRef<Path>, scan: &Scan) -> Result<()> {
         .map_err(|e| conefield_core::Error::invalid(&place, SCANNER, e, "a description that TOML can hold"))?;
     write_folder_atomic(folder, |new| {
         let reversed = rtk::write_rtk_geometry(&new.join(GEOMETRY), views)?;
-        let path = new.join(PROJECTIONS);
-        write_atomic(&path, |w| metaimage::write(w, &path, &mut Image::new(scan, pixel, reversed)))?;
+        let mut data = scan.projections.view();
+        if reversed {
+            data.invert_axis(Axis(1));
+        }
+        let (path, mut image) = (new.join(PROJECTIONS), Image { data: data.reversed_axes(), pixel });
+        write_atomic(&path, |w| metaimage::write(w, &path, &mut image))?;
         write_text_atomic(new.join(SCANNER), &text)
     })
 }
@@ -60,16 +64,6 @@ struct Image<'s> {
     /// `[x, y, z]`.
     data: ArrayView3<'s, f32>,
     pixel: [f64; 2],
-}
-
-impl<'s> Image<'s> {
-    fn new(scan: &'s Scan, pixel: [f64; 2], reversed: bool) -> Self {
-        let mut data = scan.projections.view();
-        if reversed {
-            data.invert_axis(Axis(1));
-        }
-        Self { data: data.reversed_axes(), pixel }
-    }
 }
 
 impl Voxels for Image<'_> {
