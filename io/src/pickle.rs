@@ -54,24 +54,14 @@ pub(crate) fn is_pickle(path: &Path) -> Result<bool> {
 impl<'a> Pickle<'a> {
     /// Reads `bytes`, the content of the file `place`.
     pub fn parse(place: &str, bytes: &'a [u8]) -> Result<Self> {
-        let mut machine = Machine {
-            place,
-            bytes,
-            at: 0,
-            start: 0,
-            stack: Vec::new(),
-            marks: Vec::new(),
-            memo: HashMap::new(),
-            heap: Heap::default(),
-            made: 0,
-            encoded: 0,
-        };
+        let mut machine = Machine { place, bytes, ..Machine::default() };
         let top = machine.run()?;
         machine.heap.check_nesting(top).map_err(|r| Error::invalid(place, "content", r.found, r.expected))?;
         Ok(Self { place: place.to_owned(), heap: machine.heap, top })
     }
 }
 
+#[derive(Default)]
 struct Machine<'p, 'a> {
     place: &'p str,
     bytes: &'a [u8],

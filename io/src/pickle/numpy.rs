@@ -18,36 +18,32 @@ pub(super) enum Global {
     Encode,
 }
 
+/// The names, as NumPy 1 has them.
+const NAMES: [(&str, Global); 6] = [
+    ("numpy.ndarray", Global::Ndarray),
+    ("numpy.dtype", Global::Dtype),
+    ("numpy.core.multiarray._reconstruct", Global::Reconstruct),
+    ("numpy.core.multiarray.scalar", Global::Scalar),
+    ("numpy.core.numeric._frombuffer", Global::FromBuffer),
+    ("_codecs.encode", Global::Encode),
+];
+
 impl Global {
     pub fn find(module: &str, name: &str) -> Result<Self, Refusal> {
         // NumPy 2 renamed its core.
-        let part = module.strip_prefix("numpy.core.").or_else(|| module.strip_prefix("numpy._core."));
-        match (module, part, name) {
-            ("numpy", _, "ndarray") => Ok(Self::Ndarray),
-            ("numpy", _, "dtype") => Ok(Self::Dtype),
-            (_, Some("multiarray"), "_reconstruct") => Ok(Self::Reconstruct),
-            (_, Some("multiarray"), "scalar") => Ok(Self::Scalar),
-            (_, Some("numeric"), "_frombuffer") => Ok(Self::FromBuffer),
-            ("_codecs", _, "encode") => Ok(Self::Encode),
-            _ => {
-                let shown = |t: &str| t.chars().take(60).flat_map(char::escape_debug).collect::<String>();
-                Err(Refusal::new(
-                    format!("the name {}.{}", shown(module), shown(name)),
-                    "data only: the names that NumPy's arrays, dtypes and numbers need",
-                ))
-            }
-        }
+        let whole = match module.strip_prefix("numpy._core.") {
+            Some(part) => format!("numpy.core.{part}.{name}"),
+            None => format!("{module}.{name}"),
+        };
+        NAMES.iter().find(|(known, _)| *known == whole).map(|(_, global)| *global).ok_or_else(|| {
+            let shown = |t: &str| t.chars().take(60).flat_map(char::escape_debug).collect::<String>();
+            let expected = "data only: the names that NumPy's arrays, dtypes and numbers need";
+            Refusal::new(format!("the name {}.{}", shown(module), shown(name)), expected)
+        })
     }
 
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Reconstruct => "numpy.core.multiarray._reconstruct",
-            Self::Ndarray => "numpy.ndarray",
-            Self::Dtype => "numpy.dtype",
-            Self::Scalar => "numpy.core.multiarray.scalar",
-            Self::FromBuffer => "numpy.core.numeric._frombuffer",
-            Self::Encode => "_codecs.encode",
-        }
+        NAMES.iter().find(|(_, global)| *global == self).map_or("unknown", |(name, _)| name)
     }
 }
 
