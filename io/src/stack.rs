@@ -85,33 +85,29 @@ pub(crate) fn read(
     text::warn(&format!("{place}: {field}"), oddities);
     let mut named = folder::NamedFiles::default();
     sources.iter().try_for_each(|s| named.once(place, field, &s.path, s.array.as_deref()))?;
-    let mut all: Option<(Vec<f32>, [usize; 2], usize)> = None;
-    let single = sources.len() == 1;
-    let mut numbers = None;
+    let mut values: Vec<f32> = Vec::new();
+    // Rows, columns and numbers of the first file.
+    let mut first = None;
+    let mut views = 0;
     for source in &sources {
-        let (stack, stored) = raw(source, part, layout)?;
-        let stack = layout.arrange(&source.path.display().to_string(), stack)?;
-        if single {
+        let (stack, numbers) = raw(source, part, layout)?;
+        let file = source.path.display().to_string();
+        let stack = layout.arrange(&file, stack)?;
+        if sources.len() == 1 {
             return Ok(stack);
         }
-        let (views, rows, columns) = stack.dim();
-        let (values, size, count) = all.get_or_insert_with(|| (Vec::new(), [rows, columns], 0));
-        if *size != [rows, columns] {
-            let found = format!("{rows} x {columns}");
-            let expected = format!("{} x {} (rows x columns), as in {}", size[0], size[1], sources[0].path.display());
-            return Err(Error::invalid(source.path.display().to_string(), "image", found, expected));
-        }
-        let first = numbers.get_or_insert_with(|| stored.clone());
-        if stored != *first {
-            let shown = |n: &Option<String>| n.clone().unwrap_or_else(|| "another format".into());
-            let expected = format!("{}, as in {}", shown(first), sources[0].path.display());
-            return Err(Error::invalid(source.path.display().to_string(), "numbers", shown(&stored), expected));
-        }
-        memory::grow(values, stack.len(), usize::MAX, place, field)?;
+        let (count, rows, columns) = stack.dim();
+        let (size, usual) = first.get_or_insert_with(|| ([rows, columns], numbers.clone()));
+        let like = |what: String| format!("{what}, as in {}", sources[0].path.display());
+        let expected = like(format!("{} x {} (rows x columns)", size[0], size[1]));
+        ensure(*size == [rows, columns], &file, "image", format!("{rows} x {columns}"), expected)?;
+        let shown = |n: &Option<String>| n.clone().unwrap_or_else(|| "another format".into());
+        ensure(numbers == *usual, &file, "numbers", shown(&numbers), like(shown(usual)))?;
+        memory::grow(&mut values, stack.len(), usize::MAX, place, field)?;
         values.extend(stack.iter());
-        *count += views;
+        views += count;
     }
-    let (values, [rows, columns], views) = all.unwrap_or_default();
+    let [rows, columns] = first.map_or([0; 2], |(size, _)| size);
     Array3::from_shape_vec((views, rows, columns), values)
         .map_err(|e| Error::invalid(place, field, e, "one image per view"))
 }
