@@ -76,23 +76,16 @@ pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<V
     Ok(shape)
 }
 
-/// Reads all of the data set `name`, or `part` of the scan in the group `name` (or in the file if there is no name).
+/// Reads all of the data set `name`, or `part` of the scan in the group `name` (or in the file if there is no name), and
+/// whether it is such a scan, whose first axis is the views.
 ///
 /// Accepts two or three axes of integers of 1 to 8 bytes or floats of 4 or 8; the axes keep the file's order. Refuses
 /// other types, sizes that the file cannot hold, missing chunks and values that are not finite.
-pub(crate) fn read(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Stored> {
+pub(crate) fn read(path: &Path, name: Option<&str>, part: ScanPart) -> Result<(ArrayD<f32>, bool)> {
     let file = Container::open(path)?;
     let layout = Layout::find(&file, name)?;
     let (data, kept) = layout.frames(&file, part)?;
-    let frames_first = !matches!(layout, Layout::Plain(_));
-    Ok(Stored { values: file.values(&data, kept.as_deref())?, frames_first })
-}
-
-/// The result of [`read`].
-pub(crate) struct Stored {
-    pub values: ArrayD<f32>,
-    /// Whether the layout says that the first axis is the views.
-    pub frames_first: bool,
+    Ok((file.values(&data, kept.as_deref())?, !matches!(layout, Layout::Plain(_))))
 }
 
 /// Shape and numbers of the small data set `name`, or the projection angles of a scan's layout. Converted to degrees if

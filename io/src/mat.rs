@@ -47,7 +47,7 @@ fn is_hdf5(head: &[u8]) -> bool {
 pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
     if let Some(data) = data_set(path, name)? {
         // HDF5 counts MATLAB's axes from the last one.
-        return Ok(hdf5::read(path, Some(&data), ScanPart::Projections)?.values.reversed_axes());
+        return Ok(hdf5::read(path, Some(&data), ScanPart::Projections)?.0.reversed_axes());
     }
     let (mut input, header) = open(path, name)?;
     npy::array(&mut input, &header, sets).map(|(array, _)| array)

@@ -195,9 +195,9 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
         })
     };
     if head == hdf5::MAGIC {
-        let stored = hdf5::read(path, source.array.as_deref(), part)?;
-        let values = three(stored.values)?;
-        return Ok((if stored.frames_first { pages(values)? } else { values }, None));
+        let (values, views_first) = hdf5::read(path, source.array.as_deref(), part)?;
+        let values = three(values)?;
+        return Ok((if views_first { pages(values)? } else { values }, None));
     }
     if let Some(array) = &source.array {
         let expected = "an .npz archive, a .mat file or an HDF5 file, whose arrays have names";
