@@ -319,11 +319,9 @@ pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volu
     let place = path.display().to_string();
     let (orbit, test_orbit) = common_orbit(&place, "NAF's format", train, test, volume)?;
     let (g, grid) = (&train.geometry, &train.geometry.volume);
-    if let Some(v) = volume {
-        if let Some((at, x)) = stray(&v.data) {
-            let field = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
-            return Err(Error::invalid(place, field, x, "a finite number"));
-        }
+    if let Some((at, x)) = volume.and_then(|v| stray(&v.data)) {
+        let field = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
+        return Err(Error::invalid(place, field, x, "a finite number"));
     }
     let ints = |xs: &[usize]| Out::List(xs.iter().map(|x| Out::Int(*x)).collect());
     let floats = |xs: &[f64]| Out::List(xs.iter().map(|x| Out::Float(*x)).collect());

@@ -214,13 +214,12 @@ pub(crate) fn consistent(unit: Unit) -> (Scan, Volume) {
     (s, Volume { data, grid, affine: None })
 }
 
+/// Writes views, test views and a volume.
+type WriteDataSet<'a> = &'a dyn Fn(&Path, &Scan, Option<&Scan>, Option<&Volume>) -> Result<()>;
+
 /// Fails unless `read` gives back what `write` writes to `path`: views, test views and a volume, and then views alone in
 /// their place. Neither a scan that is no circle nor a volume of another shape is written.
-pub(crate) fn data_set_comes_back(
-    path: &Path,
-    write: &dyn Fn(&Path, &Scan, Option<&Scan>, Option<&Volume>) -> Result<()>,
-    read: &dyn Fn(&Path, bool) -> Result<DataSet>,
-) {
+pub(crate) fn data_set_comes_back(path: &Path, write: WriteDataSet, read: &dyn Fn(&Path, bool) -> Result<DataSet>) {
     let train = scan();
     let (_, test) = train.split(&[1, 4]).unwrap();
     let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
