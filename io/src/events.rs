@@ -74,11 +74,8 @@ impl EventFile {
     /// Adds the image `png`, named `name`, at `step`. Does nothing if it is not a PNG.
     pub fn picture(&mut self, step: u64, name: &str, png: &[u8]) -> Result<()> {
         // Width and height are in the first chunk.
-        let Some([_, _, _, _, a, b, c, d, e, f, g, h]) = png.get(12..24).and_then(|s| <[u8; 12]>::try_from(s).ok())
-        else {
-            return Ok(());
-        };
-        let [width, height] = [[a, b, c, d], [e, f, g, h]].map(|x| u64::from(u32::from_be_bytes(x)));
+        let number = |at: usize| png.get(at..)?.first_chunk().map(|b| u64::from(u32::from_be_bytes(*b)));
+        let (Some(width), Some(height)) = (number(16), number(20)) else { return Ok(()) };
         // Colour space 3 is RGB.
         let image = [number_field(1, height), number_field(2, width), number_field(3, 3), bytes_field(4, png)];
         let value = [bytes_field(1, name.as_bytes()), bytes_field(4, &image.concat())].concat();
@@ -188,16 +185,10 @@ mod tests {
         file.picture(302, "slices", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x07\0\0\x01\0rest").unwrap();
         file.picture(303, "slices", b"no picture").unwrap();
         let bytes = std::fs::read(&path).unwrap();
-        let (mut at, mut events) = (0, vec![]);
-        while at < bytes.len() {
-            let n = u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
-            let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
-            assert_eq!(word(at + 8), masked(crc32c(&bytes[at..at + 8])));
-            assert_eq!(word(at + 12 + n), masked(crc32c(&bytes[at + 12..at + 12 + n])));
-            // The bytes after the time.
-            events.push(bytes[at + 12 + 9..at + 12 + n].to_vec());
-            at += 16 + n;
-        }
+        let mut reader = &bytes[..];
+        // The bytes after the time.
+        let events: Vec<Vec<u8>> = std::iter::from_fn(|| next(&mut reader)).map(|event| event[9..].to_vec()).collect();
+        assert!(reader.is_empty());
         let half = 0.5f32.to_le_bytes();
         let loss = [&[0x10, 0xac, 2, 0x2a, 13, 0x0a, 11, 0x0a, 4][..], b"loss", &[0x15], &half].concat();
         assert_eq!(events[..2], [[&[0x1a, 13][..], b"brain.Event:2"].concat(), loss]);
@@ -205,6 +196,7 @@ mod tests {
         // Height 256, width 7.
         assert!(events[2].windows(6).any(|w| w == [0x08, 0x80, 2, 0x10, 7, 0x18]), "{:?}", events[2]);
     }
+
     #[test]
     fn a_resumed_file_keeps_what_comes_before_the_step() {
         let dir = tempfile::tempdir().unwrap();

@@ -2,6 +2,7 @@
 
 use conefield_core::{Error, Result};
 use std::collections::{BTreeMap, HashSet};
+use std::fs::DirEntry;
 use std::path::{Component, Path, PathBuf};
 
 /// The file `name` in `folder`; refuses anything but a plain file name.
@@ -41,6 +42,15 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
     Ok(path)
 }
 
+/// Splits the name of a file from that of an array, data set or column in it: `scan.npz:counts`, `scan.h5:/exchange/data`.
+/// No name of a file in a description holds a colon.
+pub(crate) fn split(name: &str) -> (&str, Option<&str>) {
+    match name.split_once(':') {
+        Some((file, part)) if Path::new(file).extension().is_some() => (file, Some(part)),
+        _ => (name, None),
+    }
+}
+
 /// The files that a description has named so far. A short description that names one large file many times would
 /// otherwise fill memory.
 #[derive(Default)]
@@ -61,7 +71,6 @@ impl NamedFiles {
 /// Refuses to replace a folder that holds anything but the files that the format itself writes, as `known` decides.
 pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> bool, mark: &[&str]) -> Result<()> {
     let place = folder.display().to_string();
-    let io = |e| Error::io(folder, e);
     // What a killed program kept aside is looked at, too.
     crate::lease::put_back_missing(folder)?;
     if folder.symlink_metadata().is_err() {
@@ -70,10 +79,8 @@ pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> b
     if !folder.is_dir() {
         return Err(Error::invalid(place, "folder", "a file", "a new name, an empty folder or an earlier scan"));
     }
-    let mut names = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        names.push(entry.map_err(io)?.file_name().to_string_lossy().into_owned());
-    }
+    let mut names: Vec<String> =
+        entries(folder)?.iter().map(|e| e.file_name().to_string_lossy().into_owned()).collect();
     names.sort();
     if names.is_empty() {
         return Ok(());
@@ -89,11 +96,7 @@ pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> b
 /// The names in `folder` that end in one of `ends` (small letters, no dot), in the order of the numbers in them; hidden
 /// files are left out.
 pub(crate) fn names(folder: &Path, ends: &[&str]) -> Result<Vec<String>> {
-    let io = |e| Error::io(folder, e);
-    let mut found = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        found.extend(entry.map_err(io)?.file_name().into_string());
-    }
+    let mut found: Vec<String> = entries(folder)?.iter().filter_map(|e| e.file_name().into_string().ok()).collect();
     found.retain(|n| {
         let end = n.rsplit_once('.').map(|(_, e)| e.to_ascii_lowercase()).unwrap_or_default();
         !n.starts_with('.') && ends.contains(&end.as_str())
@@ -106,22 +109,17 @@ pub(crate) fn names(folder: &Path, ends: &[&str]) -> Result<Vec<String>> {
 /// slashes, in the order of [`names`]. Links to folders are not followed.
 pub(crate) fn below(folder: &Path, depth: usize, ends: &[&str]) -> Result<Vec<String>> {
     let mut found = names(folder, ends)?;
-    if depth == 0 {
-        return Ok(found);
-    }
-    let io = |e| Error::io(folder, e);
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        let entry = entry.map_err(io)?;
-        let (is_folder, Ok(name)) = (entry.file_type().is_ok_and(|t| t.is_dir()), entry.file_name().into_string())
-        else {
-            continue;
-        };
-        if is_folder {
+    for entry in entries(folder)?.iter().filter(|e| depth > 0 && e.file_type().is_ok_and(|t| t.is_dir())) {
+        if let Ok(name) = entry.file_name().into_string() {
             found.extend(below(&entry.path(), depth - 1, ends)?.into_iter().map(|n| format!("{name}/{n}")));
         }
     }
     found.sort_by_cached_key(|n| natural(n));
     Ok(found)
+}
+
+fn entries(folder: &Path) -> Result<Vec<DirEntry>> {
+    std::fs::read_dir(folder).and_then(Iterator::collect).map_err(|e| Error::io(folder, e))
 }
 
 /// Those of `names` that are `start`, in small or capital letters, a number and an extension, by their numbers.

@@ -18,7 +18,7 @@ use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance, files};
 use hdf5_reader::datatype_api::H5Type;
 use hdf5_reader::{Dataset, Datatype, FileStorage, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
-use layout::{Found, Layout};
+use layout::Layout;
 use ndarray::{ArrayD, Dimension, IxDyn};
 use std::path::Path;
 use std::sync::Arc;
@@ -65,20 +65,10 @@ pub(crate) enum ScanPart {
     Dark,
 }
 
-/// Splits a file name from the name of a data set or group in it: `scan.h5:/exchange/data`.
-pub(crate) fn split(name: &str) -> (&str, Option<&str>) {
-    let ends = [".h5", ".hdf5", ".hdf", ".nxs", ".nx"];
-    let cut = name.match_indices(':').find(|(at, _)| ends.iter().any(|e| name[..*at].ends_with(e)));
-    match cut {
-        Some((at, _)) => (&name[..at], Some(&name[at + 1..])),
-        None => (name, None),
-    }
-}
-
 /// The shape of the result of [`read`], from headers and image keys alone.
 pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Vec<usize>> {
     let file = Container::open(path)?;
-    let (data, kept) = file.frames(name, part)?;
+    let (data, kept) = Layout::find(&file, name)?.frames(&file, part)?;
     let mut shape = file.shape(&data)?;
     if let Some(kept) = kept {
         shape[0] = kept.iter().filter(|k| **k).count();
@@ -86,41 +76,29 @@ pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<V
     Ok(shape)
 }
 
-/// Reads all of the data set `name`, or `part` of the scan in the group `name` (or in the file if there is no name).
+/// Reads all of the data set `name`, or `part` of the scan in the group `name` (or in the file if there is no name), and
+/// whether it is such a scan, whose first axis is the views.
 ///
 /// Accepts two or three axes of integers of 1 to 8 bytes or floats of 4 or 8; the axes keep the file's order. Refuses
 /// other types, sizes that the file cannot hold, missing chunks and values that are not finite.
-pub(crate) fn read(path: &Path, name: Option<&str>, part: ScanPart) -> Result<Stored> {
+pub(crate) fn read(path: &Path, name: Option<&str>, part: ScanPart) -> Result<(ArrayD<f32>, bool)> {
     let file = Container::open(path)?;
-    let frames_first = matches!(file.find(name)?, Found::Layout(_));
-    let (data, kept) = file.frames(name, part)?;
-    Ok(Stored { values: file.values(&data, kept.as_deref())?, frames_first })
-}
-
-/// The result of [`read`].
-pub(crate) struct Stored {
-    pub values: ArrayD<f32>,
-    /// Whether the layout says that the first axis is the views.
-    pub frames_first: bool,
+    let layout = Layout::find(&file, name)?;
+    let (data, kept) = layout.frames(&file, part)?;
+    Ok((file.values(&data, kept.as_deref())?, !matches!(layout, Layout::Plain(_))))
 }
 
 /// Shape and numbers of the small data set `name`, or the projection angles of a scan's layout. Converted to degrees if
 /// the data set's unit is radians.
 pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>, Vec<f64>)> {
     let file = Container::open(path)?;
-    let (data, kept) = match file.find(name)? {
-        Found::Data(data) => (*data, None),
-        Found::Layout(layout) => {
-            let (angles, keys) = layout.angles(&file)?;
-            (angles, keys.map(|k| k.iter().map(|k| *k == 0).collect::<Vec<bool>>()))
-        }
-    };
+    let (data, keys) = Layout::find(&file, name)?.angles(&file)?;
     let mut shape = file.shape(&data)?;
     let mut values = file.small(&data)?;
-    if let Some(kept) = kept {
-        file.one_each(&data, values.len(), kept.len())?;
-        let mut keep = kept.iter();
-        values.retain(|_| keep.next() == Some(&true));
+    if let Some(keys) = keys {
+        file.one_each(&data, values.len(), keys.len())?;
+        let mut keys = keys.iter();
+        values.retain(|_| keys.next() == Some(&0));
         shape = vec![values.len()];
     }
     // CIL calls the attribute `angle_unit`.
@@ -165,14 +143,9 @@ impl Container {
     }
 
     fn broken(&self, data: &Dataset, e: &hdf5_reader::error::Error) -> Error {
-        if let hdf5_reader::error::Error::UnsupportedFilter(text) = e {
-            return self.packed_otherwise(data, text);
-        }
-        self.invalid(data.name(), e, "data that is not damaged, unpacked or packed by deflate")
-    }
-
-    /// The error about a filter that is not read; `text` is the library's, which ends with the filter's number.
-    fn packed_otherwise(&self, data: &Dataset, text: &str) -> Error {
+        let hdf5_reader::error::Error::UnsupportedFilter(text) = e else {
+            return self.invalid(data.name(), e, "data that is not damaged, unpacked or packed by deflate");
+        };
         let number = text.strip_prefix("filter id ").and_then(|n| n.parse::<u32>().ok());
         let name = FILTERS.iter().find(|(id, _)| Some(*id) == number).map_or("a filter", |(_, name)| name);
         Error::unsupported(
@@ -195,22 +168,6 @@ impl Container {
     /// Names of the groups at the root.
     fn root_groups(&self) -> Vec<String> {
         self.file.root_group().and_then(|g| g.member_names()).map(|(groups, _)| groups).unwrap_or_default()
-    }
-
-    /// The data set or layout named `name`.
-    fn find(&self, name: Option<&str>) -> Result<Found> {
-        if let Some(data) = name.and_then(|n| self.data(n)) {
-            return Ok(Found::Data(Box::new(data)));
-        }
-        Ok(Found::Layout(Layout::find(self, name)?))
-    }
-
-    /// The data set with the frames of `part`, and which of them belong to it.
-    fn frames(&self, name: Option<&str>, part: ScanPart) -> Result<(Dataset, Option<Vec<bool>>)> {
-        match self.find(name)? {
-            Found::Data(data) => Ok((*data, None)),
-            Found::Layout(layout) => layout.frames(self, part),
-        }
     }
 
     /// The shape; every axis is at least 1 and the file can hold all values.
@@ -237,21 +194,19 @@ impl Container {
 
     /// Storage type of the values.
     fn number(&self, data: &Dataset) -> Result<(Number, ByteOrder)> {
-        stored(data.dtype()).ok_or_else(|| self.other_type(data))
-    }
-
-    fn other_type(&self, data: &Dataset) -> Error {
-        let found: String = format!("{:?}", data.dtype()).chars().take(80).collect();
-        self.invalid(data.name(), found, "integers of 1 to 8 bytes or floats of 4 or 8")
+        stored(data.dtype()).ok_or_else(|| {
+            let found: String = format!("{:?}", data.dtype()).chars().take(80).collect();
+            self.invalid(data.name(), found, "integers of 1 to 8 bytes or floats of 4 or 8")
+        })
     }
 
     /// The values of the `kept` frames along the first axis, or of all.
     fn values(&self, data: &Dataset, kept: Option<&[bool]>) -> Result<ArrayD<f32>> {
         let mut shape = self.shape(data)?;
-        if !(2..=3).contains(&shape.len()) {
-            let found = format!("{shape:?}");
-            return Err(self.invalid(data.name(), found, "two axes (row, column) or three (view, row, column)"));
-        }
+        let Some([_, rows, columns]) = three(data.shape(), 1) else {
+            let expected = "two axes (row, column) or three (view, row, column)";
+            return Err(self.invalid(data.name(), format!("{shape:?}"), expected));
+        };
         // The place of each frame in the result.
         let mut count = 0;
         let places: Vec<Option<usize>> = (0..shape[0])
@@ -261,10 +216,9 @@ impl Container {
                 place
             })
             .collect();
-        let frame: usize = shape[1..].iter().product();
         let values = match data.chunks() {
-            Some(_) => self.chunked(data, &shape, &places, count * frame)?,
-            None => self.contiguous(data, &shape, &places, count * frame)?,
+            Some(_) => self.chunked(data, &places, [rows, columns], count * rows * columns)?,
+            None => self.contiguous(data, &places, rows * columns, count * rows * columns)?,
         };
         shape[0] = count;
         let array = ArrayD::from_shape_vec(IxDyn(&shape), values)
@@ -275,12 +229,17 @@ impl Container {
         }
     }
 
-    /// Reads chunk by chunk, in the order of the file; memory grows with the frames read.
-    fn chunked(&self, data: &Dataset, shape: &[usize], places: &[Option<usize>], total: usize) -> Result<Vec<f32>> {
+    /// Reads frames of `rows` and `columns` chunk by chunk, in the order of the file, each to its place; memory grows with
+    /// the `total` values read.
+    fn chunked(
+        &self,
+        data: &Dataset,
+        places: &[Option<usize>],
+        [rows, columns]: [usize; 2],
+        total: usize,
+    ) -> Result<Vec<f32>> {
         let (number, order) = self.number(data)?;
-        let frame: usize = shape[1..].iter().product();
-        // With two axes each row is a frame of one row.
-        let [rows, columns] = [if shape.len() == 3 { shape[1] } else { 1 }, shape[shape.len() - 1]];
+        let shape = [places.len(), rows, columns];
         // The stored and the decompressed chunk.
         let chunk =
             data.chunks().into_iter().flatten().fold(number.bytes() as u64, |n, k| n.saturating_mul(u64::from(k)));
@@ -290,37 +249,27 @@ impl Container {
         let (mut seen, mut wanted) = (0u64, 1u64);
         for chunk in data.iter_chunks().map_err(|e| self.broken(data, &e))? {
             let chunk = chunk.map_err(|e| self.broken(data, &e))?;
-            let at: Vec<usize> = chunk.offsets().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
-            let size: Vec<usize> = chunk.shape().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
-            let inside = at.iter().zip(shape).all(|(a, s)| a < s) && size.iter().all(|n| *n > 0);
-            if at.len() != shape.len() || size.len() != shape.len() || !inside {
-                return Err(self.invalid(
-                    data.name(),
-                    format!("a chunk at {at:?}"),
-                    format!("chunks within {shape:?}"),
-                ));
-            }
+            let found = three(chunk.offsets(), 0).zip(three(chunk.shape(), 1));
+            let Some((at, size)) = found.filter(|(at, size)| (0..3).all(|k| at[k] < shape[k] && size[k] > 0)) else {
+                let found = format!("a chunk at {:?}", chunk.offsets());
+                return Err(self.invalid(data.name(), found, format!("chunks within {:?}", data.shape())));
+            };
             wanted = shape.iter().zip(&size).map(|(s, n)| s.div_ceil(*n) as u64).product();
             seen += 1;
             let held = chunk.bytes().len() / number.bytes();
             allowance::numbers(&self.place, data.name(), held.saturating_sub(decoded.capacity()))?;
             decoded.clear();
             number.singles(order, chunk.bytes(), &mut decoded);
-            // Frames, rows and columns of the chunk.
-            let [depth, height, width] = match size[..] {
-                [d, h, w] => [d, h, w],
-                [d, w] => [d, 1, w],
-                _ => [0; 3],
-            };
+            let [depth, height, width] = size;
             if depth.checked_mul(height).and_then(|n| n.checked_mul(width)) != Some(decoded.len()) {
                 let found = format!("a chunk of {} values", decoded.len());
-                return Err(self.invalid(data.name(), found, format!("chunks of {size:?}")));
+                return Err(self.invalid(data.name(), found, format!("chunks of {:?}", chunk.shape())));
             }
-            let [row, column] = [if shape.len() == 3 { at[1] } else { 0 }, at[shape.len() - 1]];
+            let [frame, row, column] = at;
             let [height_in, width_in] = [height.min(rows - row), width.min(columns - column)];
-            for (d, place) in places[at[0]..].iter().take(depth).enumerate() {
+            for (d, place) in places[frame..].iter().take(depth).enumerate() {
                 let Some(place) = place else { continue };
-                let end = (place + 1) * frame;
+                let end = (place + 1) * rows * columns;
                 if out.len() < end {
                     let more = end - out.len();
                     memory::grow(&mut out, more, total, &self.place, data.name())?;
@@ -328,7 +277,7 @@ impl Container {
                 }
                 for h in 0..height_in {
                     let from = (d * height + h) * width;
-                    let to = place * frame + (row + h) * columns + column;
+                    let to = (place * rows + row + h) * columns + column;
                     out[to..to + width_in].copy_from_slice(&decoded[from..from + width_in]);
                 }
             }
@@ -342,21 +291,18 @@ impl Container {
     }
 
     /// Reads a few frames at a time.
-    fn contiguous(&self, data: &Dataset, shape: &[usize], places: &[Option<usize>], total: usize) -> Result<Vec<f32>> {
+    fn contiguous(&self, data: &Dataset, places: &[Option<usize>], frame: usize, total: usize) -> Result<Vec<f32>> {
         let (number, _) = self.number(data)?;
-        let frame: usize = shape[1..].iter().product();
         let step = (SLAB_BYTES / (frame as u64 * number.bytes() as u64).max(1)).max(1) as usize;
         let mut out: Vec<f32> = Vec::new();
         memory::grow(&mut out, total, usize::MAX, &self.place, data.name())?;
-        allowance::memory(&self.place, data.name(), 2 * (step.min(shape[0]) * frame * number.bytes()) as u64)?;
-        for from in (0..shape[0]).step_by(step) {
-            let to = (from + step).min(shape[0]);
-            let places = &places[from..to];
+        allowance::memory(&self.place, data.name(), 2 * (step.min(places.len()) * frame * number.bytes()) as u64)?;
+        for (from, places) in (0u64..).step_by(step).zip(places.chunks(step)) {
             if places.iter().all(Option::is_none) {
                 continue;
             }
-            let mut selection = SliceInfo::all(shape.len());
-            selection.selections[0] = SliceInfoElem::Slice { start: from as u64, end: to as u64, step: 1 };
+            let mut selection = SliceInfo::all(data.ndim());
+            selection.selections[0] = SliceInfoElem::Slice { start: from, end: from + places.len() as u64, step: 1 };
             let slab = data.read_slice::<Single>(&selection).map_err(|e| self.broken(data, &e))?;
             for (values, _) in slab.outer_iter().zip(places).filter(|(_, place)| place.is_some()) {
                 out.extend(values.iter().map(|x| x.0));
@@ -380,10 +326,8 @@ impl Container {
 
     /// Refuses `found` values of `data` unless there is one per frame.
     fn one_each(&self, data: &Dataset, found: usize, frames: usize) -> Result<()> {
-        if found == frames {
-            return Ok(());
-        }
-        Err(self.invalid(data.name(), format!("{found} values"), format!("{frames}, one for each frame")))
+        let expected = format!("{frames}, one for each frame");
+        ensure(found == frames, &self.place, data.name(), format!("{found} values"), expected)
     }
 
     /// A text attribute of `data`.
@@ -399,6 +343,17 @@ impl Container {
         let as_float = || attribute.read_scalar::<f64>().or(attribute.read_scalar::<f32>().map(f64::from));
         as_float().or_else(|_| as_integer()).ok().filter(|x| x.is_finite())
     }
+}
+
+/// Positions or sizes along frames, rows and columns; if there are two, each row is a frame, and `row` is that of its only
+/// row. `None` for another number of axes.
+fn three(all: &[u64], row: u64) -> Option<[usize; 3]> {
+    let three = match *all {
+        [frame, column] => [frame, row, column],
+        [frame, row, column] => [frame, row, column],
+        _ => return None,
+    };
+    Some(three.map(|n| usize::try_from(n).unwrap_or(usize::MAX)))
 }
 
 /// How values of the type `dtype` are stored; `None` if they are not numbers.

@@ -45,11 +45,7 @@ impl Input {
     pub fn open(path: &Path) -> Result<Self> {
         let mut input = Self::open_plain(path)?;
         let start = input.reader.fill_buf().map_err(|e| Error::io(path, e))?;
-        if start.starts_with(&[0x1f, 0x8b]) {
-            input.reader = Box::new(BufReader::new(MultiGzDecoder::new(input.reader)));
-            input.packed = Some("gzip");
-        }
-        Ok(input)
+        Ok(if start.starts_with(&[0x1f, 0x8b]) { input.gunzip() } else { input })
     }
 
     /// Opens `path` without decompression.
@@ -100,26 +96,17 @@ impl Input {
     pub fn take(&mut self, n: usize) -> Result<Vec<u8>> {
         let mut out = Vec::with_capacity(n.min(1 << 16));
         let got = self.reader.by_ref().take(n as u64).read_to_end(&mut out);
-        match got {
-            Ok(_) => {
-                self.at += out.len() as u64;
-                Ok(out)
-            }
-            Err(e) => Err(self.broken(e)),
-        }
+        self.at += got.map_err(|e| self.broken(e))? as u64;
+        Ok(out)
     }
 
     /// Reads one line of at most `most` bytes, including its line feed; the line feed is missing at the end of the file
     /// or at `most`.
     pub fn line(&mut self, most: usize) -> Result<Vec<u8>> {
         let mut out = Vec::new();
-        match self.reader.by_ref().take(most as u64).read_until(b'\n', &mut out) {
-            Ok(n) => {
-                self.at += n as u64;
-                Ok(out)
-            }
-            Err(e) => Err(self.broken(e)),
-        }
+        let got = self.reader.by_ref().take(most as u64).read_until(b'\n', &mut out);
+        self.at += got.map_err(|e| self.broken(e))? as u64;
+        Ok(out)
     }
 
     /// Reads exactly `n` bytes of `field`.

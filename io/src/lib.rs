@@ -2,9 +2,8 @@
 //!
 //! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NRRD, NumPy, TIFF stacks,
 //!   OME-Zarr, a DICOM series).
-//! - Scans: [`read_scan`], [`read_truth`], [`write_scan`] (conefield's own folder), [`read_r2`], [`write_r2`]
-//!   (R2-Gaussian's folder), [`read_naf`], [`write_naf`] (NAF's file), [`write_rtk`] (for RTK); [`read_data_set`] also
-//!   reads test views.
+//! - Scans: [`read_scan`], [`read_truth`]; [`read_data_set`] also reads test views. [`write_scan`] (conefield's own
+//!   folder), [`write_r2`] (R2-Gaussian's folder), [`write_naf`] (NAF's file), [`write_rtk`] (for RTK).
 //! - Projections from scanners: [`read_scanner`] (a description in TOML; TIFF, NumPy, HDF5, RTK's XML geometry; the
 //!   files of vendors), as [`Stored`]: line integrals or counts.
 //! - Sizes, before memory is allocated: [`scan_size`], [`scanner_size`], [`volume_voxels`].
@@ -69,9 +68,9 @@ pub use dicom::DicomTemplate;
 pub use events::EventFile;
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
 pub use lease::{Contents, FolderLock, Lease, Progressed, SharedLease, is_aside, try_alone};
-pub use naf::{read_naf, write_naf};
-pub use r2::{read_r2, write_r2};
-pub use rtk::{read_rtk_geometry, write_rtk_geometry};
+pub use naf::write_naf;
+pub use r2::write_r2;
+pub use rtk::read_rtk_geometry;
 pub use rtk_folder::write_rtk;
 pub use scan::{DataSet, Parts, read_data_set, read_scan, read_truth, scan_unit};
 pub use scan_folder::write_scan;

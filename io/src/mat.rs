@@ -15,7 +15,7 @@ use crate::number::{ByteOrder, Number};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result, files};
 use ndarray::ArrayD;
-use std::io::{Cursor, Read, Seek, SeekFrom};
+use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
 /// Bytes of a file's header.
@@ -47,7 +47,7 @@ fn is_hdf5(head: &[u8]) -> bool {
 pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
     if let Some(data) = data_set(path, name)? {
         // HDF5 counts MATLAB's axes from the last one.
-        return Ok(hdf5::read(path, Some(&data), ScanPart::Projections)?.values.reversed_axes());
+        return Ok(hdf5::read(path, Some(&data), ScanPart::Projections)?.0.reversed_axes());
     }
     let (mut input, header) = open(path, name)?;
     npy::array(&mut input, &header, sets).map(|(array, _)| array)
@@ -97,11 +97,12 @@ struct Variable {
     name: String,
 }
 
-/// The tag of an element. Up to 4 bytes of data may be in the tag itself.
+/// The tag of an element.
 struct Tag {
     kind: u32,
     bytes: u64,
-    inside: Option<[u8; 4]>,
+    /// The same with the padding behind the data.
+    padded: u64,
 }
 
 /// The data of the array `name` as an input that ends with it, and what it holds.
@@ -143,27 +144,16 @@ impl File<'_> {
     /// The names of all variables, and where they are; `whole` is behind the header.
     fn variables(&self, whole: &mut Input) -> Result<Vec<(String, Place)>> {
         let mut all = vec![];
-        let mut at = HEADER as u64;
+        let end = HEADER as u64 + whole.left().unwrap_or(0);
         while whole.left().is_some_and(|left| left > 0) {
-            let Tag { kind, bytes, inside } = self.tag(whole, "element")?;
-            at += 8;
-            let place = Place { kind, at, bytes };
+            let Tag { kind, bytes, padded } = self.tag(whole, "element")?;
+            let place = Place { kind, at: end - whole.left().unwrap_or(0), bytes };
             if [MATRIX, COMPRESSED].contains(&kind) && bytes > 0 {
-                ensure(
-                    all.len() < MOST_VARIABLES,
-                    &whole.place(),
-                    "variables",
-                    "more",
-                    format!("at most {MOST_VARIABLES}"),
-                )?;
+                let expected = format!("at most {MOST_VARIABLES}");
+                ensure(all.len() < MOST_VARIABLES, &whole.place(), "variables", "more", expected)?;
                 all.push((self.variable(&place)?.1.name, place));
             }
-            if inside.is_none() {
-                // A stream is not padded.
-                let bytes = if kind == COMPRESSED { bytes } else { padded(bytes) };
-                whole.skip(bytes, "element")?;
-                at += bytes;
-            }
+            whole.skip(padded, "element")?;
         }
         Ok(all)
     }
@@ -182,16 +172,15 @@ impl File<'_> {
         Ok((input, variable))
     }
 
-    /// Reads a tag.
+    /// Reads a tag: type and length, or both in its first half if up to 4 bytes of data are in the other.
     fn tag(&self, input: &mut Input, field: &str) -> Result<Tag> {
-        let raw = input.exactly(8, field)?;
-        let (first, second) = (self.number(&raw[..4]), self.number(&raw[4..]));
-        Ok(match first >> 16 {
-            0 => Tag { kind: first, bytes: second.into(), inside: None },
-            bytes => {
-                Tag { kind: first & 0xffff, bytes: bytes.min(4).into(), inside: Some([raw[4], raw[5], raw[6], raw[7]]) }
-            }
-        })
+        let kind = self.number(&input.exactly(4, field)?);
+        if kind >> 16 > 0 {
+            return Ok(Tag { kind: kind & 0xffff, bytes: (kind >> 16).min(4).into(), padded: 4 });
+        }
+        let bytes = self.number(&input.exactly(4, field)?).into();
+        // A stream is not padded.
+        Ok(Tag { kind, bytes, padded: if kind == COMPRESSED { bytes } else { bytes.next_multiple_of(8) } })
     }
 
     /// The 32-bit number in `raw`.
@@ -205,19 +194,11 @@ impl File<'_> {
 
     /// Reads a short element of `field`, with its padding.
     fn short(&self, input: &mut Input, field: &str) -> Result<Vec<u8>> {
-        let Tag { bytes, inside, .. } = self.tag(input, field)?;
-        if let Some(inside) = inside {
-            return Ok(inside[..bytes as usize].to_vec());
-        }
-        ensure(
-            bytes <= LONGEST_LIST,
-            &input.place(),
-            field,
-            format!("{bytes} bytes"),
-            format!("at most {LONGEST_LIST}"),
-        )?;
+        let Tag { bytes, padded, .. } = self.tag(input, field)?;
+        let expected = format!("at most {LONGEST_LIST}");
+        ensure(bytes <= LONGEST_LIST, &input.place(), field, format!("{bytes} bytes"), expected)?;
         let data = input.exactly(bytes as usize, field)?;
-        input.skip(padded(bytes) - bytes, field)?;
+        input.skip(padded - bytes, field)?;
         Ok(data)
     }
 
@@ -272,48 +253,30 @@ impl File<'_> {
         let names: Vec<String> = if length > 0 { names.chunks(length).map(text).collect() } else { vec![] };
         let Some(at) = names.iter().position(|n| Some(&n[..]) == wanted) else {
             let found = wanted.map_or("a struct".into(), |wanted| format!("no field \"{wanted}\""));
-            return Err(input.invalid(
-                name,
-                found,
-                format!("one of its fields, as {name}.FIELD: {}", names.join(", ")),
-            ));
+            let expected = format!("one of its fields, as {name}.FIELD: {}", names.join(", "));
+            return Err(input.invalid(name, found, expected));
         };
         for name in &names[..at] {
-            let tag = self.tag(input, name)?;
-            input.skip(if tag.inside.is_none() { padded(tag.bytes) } else { 0 }, name)?;
+            let Tag { padded, .. } = self.tag(input, name)?;
+            input.skip(padded, name)?;
         }
         let Tag { kind, bytes, .. } = self.tag(input, &names[at])?;
-        let found = format!("type {kind} of {bytes} bytes");
-        ensure(
-            kind == MATRIX && bytes > 0,
-            &input.place(),
-            &names[at],
-            found,
-            "type 14, a variable that is not empty",
-        )?;
+        let (fits, found) = (kind == MATRIX && bytes > 0, format!("type {kind} of {bytes} bytes"));
+        ensure(fits, &input.place(), &names[at], found, "type 14, a variable that is not empty")?;
         // Fields have no names of their own.
         Ok(Variable { name: format!("{name}.{}", names[at]), ..self.head(input)? })
     }
 
     /// The data of an array, and what it holds.
     fn numbers(&self, mut input: Input, shape: Vec<usize>, name: &str) -> Result<(Input, Header)> {
-        let Tag { kind, bytes, inside } = self.tag(&mut input, name)?;
+        let Tag { kind, bytes, .. } = self.tag(&mut input, name)?;
         let number =
             stored(kind).ok_or_else(|| input.invalid(name, format!("type {kind}"), "a type of numbers, 1 to 13"))?;
         let want = shape.iter().try_fold(number.bytes() as u64, |n, s| n.checked_mul(*s as u64));
         let expected = format!("as many {number} as the shape {shape:?} has");
         ensure(want == Some(bytes), &input.place(), name, format!("{bytes} bytes"), expected)?;
-        let input = match inside {
-            Some(inside) => Input::within(self.path.to_path_buf(), Cursor::new(inside).take(bytes), bytes),
-            None => input.part(bytes),
-        };
-        Ok((input, Header { number, order: self.order, fortran: true, shape }))
+        Ok((input.part(bytes), Header { number, order: self.order, fortran: true, shape }))
     }
-}
-
-/// `bytes` with the padding to 8.
-fn padded(bytes: u64) -> u64 {
-    bytes.next_multiple_of(8)
 }
 
 /// The storage type of numbers.
@@ -403,14 +366,6 @@ mod tests {
             }
             let angles = read_exact(&path, Some("s.parameters.angles")).unwrap();
             assert_eq!(angles, (vec![1, 3], vec![0.0, 30.0, 60.0]));
-            says(read(&path, None, SETS), &["scan.mat: array", "2 variables", "FILE.mat:NAME"]);
-            says(read(&path, Some("b"), SETS), &["scan.mat: array", "no variable \"b\"", "a"]);
-            says(read(&path, Some("s"), SETS), &["scan.mat: s", "a struct", "s.FIELD: parameters, sinogram"]);
-            says(read(&path, Some("s.p"), SETS), &["scan.mat: s", "no field \"p\"", "parameters, sinogram"]);
-            says(
-                read(&path, Some("s.parameters.text"), SETS),
-                &["scan.mat: s.parameters.text", "text", "real numbers"],
-            );
             says(read(&path, Some("a.b"), SETS), &["scan.mat: a", "no field \"b\"", "a struct"]);
         }
         std::fs::write(&path, file(&[sinogram("a")])).unwrap();
@@ -451,10 +406,6 @@ mod tests {
                 says(read(&path, Some("a"), SETS), &["scan.mat", words[0], words[1]]);
             }
         }
-        let mut turned = file(&[]);
-        turned[126..].copy_from_slice(b"XY");
-        std::fs::write(&path, turned).unwrap();
-        says(read(&path, None, SETS), &["byte order", "IM"]);
     }
 
     #[test]

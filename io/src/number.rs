@@ -95,18 +95,3 @@ pub(crate) fn write(w: &mut dyn Write, values: &[f32]) -> std::io::Result<()> {
     }
     Ok(())
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn both_byte_orders_are_read() {
-        let mut out = Vec::new();
-        Number::I16.singles(ByteOrder::Little, &(-2i16).to_le_bytes(), &mut out);
-        Number::I16.singles(ByteOrder::Big, &(-2i16).to_be_bytes(), &mut out);
-        Number::F64.singles(ByteOrder::Big, &1.5f64.to_be_bytes(), &mut out);
-        Number::U64.singles(ByteOrder::Little, &u64::MAX.to_le_bytes(), &mut out);
-        assert_eq!(out, [-2.0, -2.0, 1.5, u64::MAX as f32]);
-    }
-}

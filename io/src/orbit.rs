@@ -3,16 +3,17 @@
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::orbit::{Beam, CircularOrbit};
-use conefield_core::scan::Scan;
+use conefield_core::scan::{Scan, Volume};
 use conefield_core::{Error, Result};
 
 /// The orbits of `train` and `test` for a `format` that supports only circles, the same for both scans. Refuses
-/// anything else, and a test scan with another detector or grid.
+/// anything else, a test scan with another detector or grid, and a `volume` that does not fill the grid.
 pub(crate) fn common_orbit(
     place: &str,
     format: &str,
     train: &Scan,
     test: Option<&Scan>,
+    volume: Option<&Volume>,
 ) -> Result<(CircularOrbit, Option<CircularOrbit>)> {
     let fit = |name: &str, s: &Scan| -> Result<CircularOrbit> {
         s.validate(&format!("{place}: {name}"))?;
@@ -22,6 +23,10 @@ pub(crate) fn common_orbit(
         })
     };
     let orbit = fit("training", train)?;
+    if let Some(v) = volume {
+        let (found, grid) = (v.data.shape(), train.geometry.volume.shape);
+        ensure(found == grid, place, "shape of the volume", format!("{found:?}"), format!("{grid:?}"))?;
+    }
     let Some(test) = test else { return Ok((orbit, None)) };
     let other = fit("test", test)?;
     let near = |a: f64, b: f64| (a - b).abs() <= 1e-6 * orbit.dsd;
@@ -56,7 +61,7 @@ pub(crate) fn written(orbit: &CircularOrbit, volume: &VoxelGrid) -> (&'static st
 mod tests {
     use super::*;
     use crate::testing::scan;
-    use crate::{read_naf, read_r2, write_naf, write_r2};
+    use crate::{naf, r2};
     use conefield_core::geometry::{norm, sub};
 
     #[test]
@@ -67,12 +72,12 @@ mod tests {
         let orbit = CircularOrbit::parallel(&train.geometry.volume, [2.0, 1.5], [-1.0, 30.0], angles);
         train.geometry.views = orbit.views();
         let (_, test) = train.split(&[1, 4]).unwrap();
-        let [r2, naf] = ["r2", "scan.pickle"].map(|name| dir.path().join(name));
-        write_r2(&r2, &train, Some(&test), None).unwrap();
-        write_naf(&naf, &train, Some(&test), None).unwrap();
-        let meta = std::fs::read_to_string(r2.join("meta_data.json")).unwrap();
+        let [folder, file] = ["r2", "scan.pickle"].map(|name| dir.path().join(name));
+        r2::write_r2(&folder, &train, Some(&test), None).unwrap();
+        naf::write_naf(&file, &train, Some(&test), None).unwrap();
+        let meta = std::fs::read_to_string(folder.join("meta_data.json")).unwrap();
         assert!(meta.contains("\"mode\": \"parallel\""), "{meta}");
-        for back in [read_r2(&r2).unwrap(), read_naf(&naf).unwrap()] {
+        for back in [r2::read(&folder, true).unwrap(), naf::read(&file, true).unwrap()] {
             let g = &back.train.geometry;
             for view in 0..7 {
                 assert!(g.is_parallel(view));

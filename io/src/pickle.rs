@@ -54,28 +54,14 @@ pub(crate) fn is_pickle(path: &Path) -> Result<bool> {
 impl<'a> Pickle<'a> {
     /// Reads `bytes`, the content of the file `place`.
     pub fn parse(place: &str, bytes: &'a [u8]) -> Result<Self> {
-        let mut machine = Machine {
-            place,
-            bytes,
-            at: 0,
-            start: 0,
-            stack: Vec::new(),
-            marks: Vec::new(),
-            memo: HashMap::new(),
-            heap: Heap::default(),
-            made: 0,
-            encoded: 0,
-        };
+        let mut machine = Machine { place, bytes, ..Machine::default() };
         let top = machine.run()?;
-        if machine.at < bytes.len() {
-            let found = format!("{} bytes after the end of the pickle", bytes.len() - machine.at);
-            return Err(Error::invalid(place, "content", found, "one pickle in the file"));
-        }
         machine.heap.check_nesting(top).map_err(|r| Error::invalid(place, "content", r.found, r.expected))?;
         Ok(Self { place: place.to_owned(), heap: machine.heap, top })
     }
 }
 
+#[derive(Default)]
 struct Machine<'p, 'a> {
     place: &'p str,
     bytes: &'a [u8],
@@ -86,7 +72,7 @@ struct Machine<'p, 'a> {
     stack: Vec<Value<'a>>,
     /// Heights of the stack at the open marks.
     marks: Vec<usize>,
-    memo: HashMap<u32, Value<'a>>,
+    memo: HashMap<u64, Value<'a>>,
     heap: Heap<'a>,
     /// Values created so far.
     made: usize,
@@ -128,177 +114,77 @@ impl<'a> Machine<'_, 'a> {
     }
 
     fn step(&mut self, code: u8) -> Result<()> {
-        let done = self.scalar(code)?
-            || self.sequence(code)?
-            || self.dict(code)?
-            || self.rearrange(code)?
-            || self.memory(code)?
-            || self.object(code)?;
-        if done { Ok(()) } else { Err(self.refused(code)) }
-    }
-
-    /// Creates a value without children. Like the methods below, returns whether it handles the opcode.
-    fn scalar(&mut self, code: u8) -> Result<bool> {
         match code {
-            op::NONE => self.push(Value::None)?,
-            op::NEWTRUE => self.push(Value::Bool(true))?,
-            op::NEWFALSE => self.push(Value::Bool(false))?,
-            op::BININT => {
-                let x = i32::from_le_bytes(self.array()?);
-                self.push(Value::Int(x.into()))?;
-            }
-            op::BININT1 => {
-                let x = self.byte()?;
-                self.push(Value::Int(x.into()))?;
-            }
-            op::BININT2 => {
-                let x = u16::from_le_bytes(self.array()?);
-                self.push(Value::Int(x.into()))?;
-            }
-            op::LONG1 => self.integer::<1>()?,
-            op::LONG4 => self.integer::<4>()?,
-            op::BINFLOAT => {
-                let x = f64::from_be_bytes(self.array()?);
-                self.push(Value::Float(x))?;
-            }
-            op::SHORT_BINUNICODE => self.text::<1>()?,
-            op::BINUNICODE => self.text::<4>()?,
-            op::BINUNICODE8 => self.text::<8>()?,
-            op::SHORT_BINBYTES | op::SHORT_BINSTRING => self.binary::<1>()?,
-            op::BINBYTES | op::BINSTRING => self.binary::<4>()?,
-            op::BINBYTES8 | op::BYTEARRAY8 => self.binary::<8>()?,
-            _ => return Ok(false),
-        }
-        Ok(true)
-    }
+            op::NONE => self.push(Value::None),
+            op::NEWTRUE => self.push(Value::Bool(true)),
+            op::NEWFALSE => self.push(Value::Bool(false)),
+            op::BININT => self.take(4).and_then(|raw| self.signed(raw)),
+            op::BININT1 => self.unsigned(1).and_then(|x| self.push(Value::Int(x.into()))),
+            op::BININT2 => self.unsigned(2).and_then(|x| self.push(Value::Int(x.into()))),
+            op::LONG1 => self.counted(1).and_then(|raw| self.signed(raw)),
+            op::LONG4 => self.counted(4).and_then(|raw| self.signed(raw)),
+            // The only number that is big-endian.
+            op::BINFLOAT => self.unsigned(8).and_then(|x| self.push(Value::Float(f64::from_bits(x.swap_bytes())))),
+            op::SHORT_BINUNICODE => self.text(1),
+            op::BINUNICODE => self.text(4),
+            op::BINUNICODE8 => self.text(8),
+            op::SHORT_BINBYTES | op::SHORT_BINSTRING => self.binary(1),
+            op::BINBYTES | op::BINSTRING => self.binary(4),
+            op::BINBYTES8 | op::BYTEARRAY8 => self.binary(8),
 
-    /// Creates or fills a tuple or list.
-    fn sequence(&mut self, code: u8) -> Result<bool> {
-        match code {
-            op::EMPTY_TUPLE => self.make(Node::Tuple(Vec::new()))?,
-            op::TUPLE1 => self.tuple(1)?,
-            op::TUPLE2 => self.tuple(2)?,
-            op::TUPLE3 => self.tuple(3)?,
-            op::TUPLE => {
-                let items = self.above_mark()?;
-                self.make(Node::Tuple(items))?;
-            }
-            op::EMPTY_LIST => self.make(Node::List(Vec::new()))?,
-            op::LIST => {
-                let items = self.above_mark()?;
-                self.make(Node::List(items))?;
-            }
-            op::APPEND => {
-                let item = self.pop()?;
-                self.append(vec![item])?;
-            }
-            op::APPENDS => {
-                let items = self.above_mark()?;
-                self.append(items)?;
-            }
-            _ => return Ok(false),
-        }
-        Ok(true)
-    }
-
-    /// Creates or fills a dict.
-    fn dict(&mut self, code: u8) -> Result<bool> {
-        match code {
-            op::EMPTY_DICT => self.make(Node::Dict(Vec::new()))?,
+            op::EMPTY_TUPLE => self.tuple(0),
+            op::TUPLE1 => self.tuple(1),
+            op::TUPLE2 => self.tuple(2),
+            op::TUPLE3 => self.tuple(3),
+            op::TUPLE => self.above_mark().and_then(|items| self.make(Node::Tuple(items))),
+            op::EMPTY_LIST => self.make(Node::List(Vec::new())),
+            op::LIST => self.above_mark().and_then(|items| self.make(Node::List(items))),
+            op::APPEND => self.pop().and_then(|item| self.append(vec![item])),
+            op::APPENDS => self.above_mark().and_then(|items| self.append(items)),
+            op::EMPTY_DICT => self.make(Node::Dict(Vec::new())),
             op::DICT => {
                 let items = self.above_mark()?;
                 self.make(Node::Dict(Vec::new()))?;
-                self.set_items(items)?;
+                self.set_items(items)
             }
             op::SETITEM => {
                 let value = self.pop()?;
                 let key = self.pop()?;
-                self.set_items(vec![key, value])?;
+                self.set_items(vec![key, value])
             }
-            op::SETITEMS => {
-                let items = self.above_mark()?;
-                self.set_items(items)?;
-            }
-            _ => return Ok(false),
-        }
-        Ok(true)
-    }
+            op::SETITEMS => self.above_mark().and_then(|items| self.set_items(items)),
 
-    /// Rearranges the stack, or does nothing.
-    fn rearrange(&mut self, code: u8) -> Result<bool> {
-        match code {
-            op::PROTO => self.protocol()?,
-            op::FRAME => {
-                let length = self.count::<8>()?;
-                self.within(length)?;
-            }
+            op::PROTO => self.protocol(),
+            op::FRAME => self.unsigned(8).and_then(|length| self.within(length)),
             op::MARK => {
                 self.count_value()?;
                 self.marks.push(self.stack.len());
+                Ok(())
             }
-            op::POP => self.pop_or_mark()?,
-            op::POP_MARK => drop(self.above_mark()?),
-            op::DUP => {
-                let value = self.peek()?;
-                self.push(value)?;
-            }
-            _ => return Ok(false),
-        }
-        Ok(true)
-    }
+            op::POP => self.pop_or_mark(),
+            op::POP_MARK => self.above_mark().map(drop),
+            op::DUP => self.peek().and_then(|value| self.push(value)),
 
-    /// Stores a value in the memo or recalls one.
-    fn memory(&mut self, code: u8) -> Result<bool> {
-        match code {
-            op::MEMOIZE => {
-                let index = self.memo.len() as u32;
-                self.remember(index)?;
-            }
-            op::BINPUT => {
-                let index = self.byte()?;
-                self.remember(index.into())?;
-            }
-            op::LONG_BINPUT => {
-                let index = u32::from_le_bytes(self.array()?);
-                self.remember(index)?;
-            }
-            op::BINGET => {
-                let index = self.byte()?;
-                self.recall(index.into())?;
-            }
-            op::LONG_BINGET => {
-                let index = u32::from_le_bytes(self.array()?);
-                self.recall(index)?;
-            }
-            _ => return Ok(false),
-        }
-        Ok(true)
-    }
+            op::MEMOIZE => self.remember(self.memo.len() as u64),
+            op::BINPUT => self.unsigned(1).and_then(|index| self.remember(index)),
+            op::LONG_BINPUT => self.unsigned(4).and_then(|index| self.remember(index)),
+            op::BINGET => self.unsigned(1).and_then(|index| self.recall(index)),
+            op::LONG_BINGET => self.unsigned(4).and_then(|index| self.recall(index)),
 
-    /// Creates one of the few permitted objects.
-    fn object(&mut self, code: u8) -> Result<bool> {
-        match code {
             op::GLOBAL => {
                 let (module, name) = (self.line()?, self.line()?);
-                self.global(module, name)?;
+                self.global(module, name)
             }
             op::STACK_GLOBAL => {
                 let (name, module) = (self.pop()?, self.pop()?);
                 match (self.heap.text(module), self.heap.text(name)) {
-                    (Some(module), Some(name)) => self.global(module, name)?,
-                    _ => return Err(self.wrong(self.heap.kind(name), "a module and a name")),
+                    (Some(module), Some(name)) => self.global(module, name),
+                    _ => Err(self.wrong(self.heap.kind(name), "a module and a name")),
                 }
             }
-            op::REDUCE => self.reduce()?,
-            op::BUILD => self.build()?,
-            _ => return Ok(false),
-        }
-        Ok(true)
-    }
+            op::REDUCE => self.reduce(),
+            op::BUILD => self.build(),
 
-    /// Why an opcode is refused.
-    fn refused(&self, code: u8) -> Error {
-        match code {
             op::PERSID
             | op::BINPERSID
             | op::EXT1
@@ -310,13 +196,13 @@ impl<'a> Machine<'_, 'a> {
             | op::OBJ
             | op::NEXT_BUFFER
             | op::READONLY_BUFFER => {
-                self.wrong("an opcode that refers to something outside or makes an object", "data only")
+                Err(self.wrong("an opcode that refers to something outside or makes an object", "data only"))
             }
-            op::EMPTY_SET | op::ADDITEMS | op::FROZENSET => self.wrong("a set", "a list, tuple or dict"),
+            op::EMPTY_SET | op::ADDITEMS | op::FROZENSET => Err(self.wrong("a set", "a list, tuple or dict")),
             op::INT | op::LONG | op::FLOAT | op::STRING | op::UNICODE | op::GET | op::PUT => {
-                self.wrong("an opcode of protocol 0", "protocol 2 or later: write the file with Python 3")
+                Err(self.wrong("an opcode of protocol 0", "protocol 2 or later: write the file with Python 3"))
             }
-            other => self.wrong(format!("0x{other:02x}"), "an opcode of protocols 2 to 5"),
+            other => Err(self.wrong(format!("0x{other:02x}"), "an opcode of protocols 2 to 5")),
         }
     }
 
@@ -353,19 +239,19 @@ impl<'a> Machine<'_, 'a> {
         Ok(taken)
     }
 
-    fn array<const N: usize>(&mut self) -> Result<[u8; N]> {
-        let mut out = [0; N];
-        out.copy_from_slice(self.take(N as u64)?);
-        Ok(out)
-    }
-
     fn byte(&mut self) -> Result<u8> {
-        self.array::<1>().map(|[b]| b)
+        self.take(1).map(|raw| raw[0])
     }
 
-    /// A length of `N` bytes.
-    fn count<const N: usize>(&mut self) -> Result<u64> {
-        Ok(self.array::<N>()?.iter().rev().fold(0, |n, b| n << 8 | u64::from(*b)))
+    /// A number of `bytes` bytes, at most 8.
+    fn unsigned(&mut self, bytes: u64) -> Result<u64> {
+        Ok(self.take(bytes)?.iter().rev().fold(0, |n, b| n << 8 | u64::from(*b)))
+    }
+
+    /// The bytes behind a length of `bytes` bytes.
+    fn counted(&mut self, bytes: u64) -> Result<&'a [u8]> {
+        let length = self.unsigned(bytes)?;
+        self.take(length)
     }
 
     fn line(&mut self) -> Result<&'a str> {
@@ -432,34 +318,32 @@ impl<'a> Machine<'_, 'a> {
         self.make(Node::Tuple(items))
     }
 
-    fn integer<const N: usize>(&mut self) -> Result<()> {
-        let length = self.count::<N>()?;
-        let raw = self.take(length)?;
+    /// Pushes an integer in two's complement.
+    fn signed(&mut self, raw: &[u8]) -> Result<()> {
         if raw.len() > LONGEST_INTEGER {
             let expected = format!("at most {LONGEST_INTEGER} bytes");
             return Err(self.wrong(format!("an integer of {} bytes", raw.len()), expected));
         }
-        // Two's complement: sign extension of the last byte.
+        // Sign extension of the last byte.
         let sign = if raw.last().is_some_and(|b| b & 0x80 != 0) { 0xff } else { 0 };
         let mut whole = [sign; LONGEST_INTEGER];
         whole[..raw.len()].copy_from_slice(raw);
         self.push(Value::Int(i128::from_le_bytes(whole)))
     }
 
-    fn text<const N: usize>(&mut self) -> Result<()> {
-        let length = self.count::<N>()?;
-        let raw = self.take(length)?;
+    /// Pushes a text behind a length of `bytes` bytes.
+    fn text(&mut self, bytes: u64) -> Result<()> {
+        let raw = self.counted(bytes)?;
         let text = std::str::from_utf8(raw).map_err(|e| self.wrong(format!("no UTF-8: {e}"), "UTF-8 text"))?;
         self.push(Value::Text(text))
     }
 
-    fn binary<const N: usize>(&mut self) -> Result<()> {
-        let length = self.count::<N>()?;
-        let raw = self.take(length)?;
+    fn binary(&mut self, bytes: u64) -> Result<()> {
+        let raw = self.counted(bytes)?;
         self.push(Value::Bytes(raw))
     }
 
-    fn remember(&mut self, index: u32) -> Result<()> {
+    fn remember(&mut self, index: u64) -> Result<()> {
         let value = self.peek()?;
         if self.memo.len() >= MOST_MEMO && !self.memo.contains_key(&index) {
             return Err(self.wrong(format!("more than {MOST_MEMO} numbered values"), "fewer"));
@@ -468,7 +352,7 @@ impl<'a> Machine<'_, 'a> {
         Ok(())
     }
 
-    fn recall(&mut self, index: u32) -> Result<()> {
+    fn recall(&mut self, index: u64) -> Result<()> {
         match self.memo.get(&index) {
             Some(value) => self.push(*value),
             None => Err(self.wrong(format!("number {index}"), "a value that was numbered before")),

@@ -17,7 +17,7 @@ use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
 use serde::Deserialize;
-use serde_json::json;
+use serde_json::{Map, Value, json};
 use std::path::Path;
 
 /// The file that describes the folder.
@@ -38,6 +38,9 @@ struct Meta {
 struct Frame {
     file_path: String,
     angle: f64,
+    /// The keys that are not read.
+    #[serde(flatten)]
+    rest: Map<String, Value>,
 }
 
 #[derive(Deserialize)]
@@ -56,35 +59,27 @@ struct Scanner {
     offOrigin: [f64; 3],
     #[serde(default)]
     offDetector: [f64; 2],
+    /// The keys that are not read.
+    #[serde(flatten)]
+    rest: Map<String, Value>,
 }
 
-/// Reads R2-Gaussian's folder: training views, test views and the volume.
+/// Reads R2-Gaussian's folder: training views, test views if `with_test` says so, and the volume.
 ///
 /// The format does not name its unit of length. A `unit` entry decides. Otherwise the volume decides: if its integrals
 /// over the file's lengths match the projections, as in the published data, the unit is called `r2` and counts as 1 mm;
 /// if the projections are a thousand times larger, the lengths are metres and the volume is in 1/mm. Any other ratio
 /// counts as the first case, with a warning.
-pub fn read_r2(path: impl AsRef<Path>) -> Result<DataSet> {
-    warn_of_others(path.as_ref())?;
-    read(path.as_ref(), true)
-}
-
-/// Like [`read_r2`], without the test views.
-pub(crate) fn read_train(folder: &Path) -> Result<DataSet> {
-    warn_of_others(folder)?;
-    read(folder, false)
-}
-
-/// The volume of [`read_r2`], in the unit that the training views give.
-pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
-    read(folder, false).map(|r| r.volume)
-}
-
-fn warn_of_others(folder: &Path) -> Result<()> {
+pub(crate) fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
     let meta = text::read(&file)?;
     text::warn(&file.display().to_string(), unread(&others(&meta)));
-    Ok(())
+    described(folder, meta, with_test)
+}
+
+/// The volume of [`read`], in the unit that the training views give.
+pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
+    described(folder, text::read(&folder.join(META))?, false).map(|r| r.volume)
 }
 
 /// Keys of the scanner that do not move source, detector or volume, beside those of noise.
@@ -92,40 +87,29 @@ const STILL: [&str; 4] = ["filter", "accuracy", "totalAngle", "startAngle"];
 
 /// Numbers other than 0 in a description that are not read: of the scanner (TIGRE's `rotDetector` and `COR`, say) and of
 /// single views.
-fn others(meta: &serde_json::Value) -> Vec<String> {
-    fn set(value: &serde_json::Value) -> bool {
+fn others(meta: &Meta) -> Vec<String> {
+    fn set(value: &Value) -> bool {
         match value {
-            serde_json::Value::Number(n) => n.as_f64() != Some(0.0),
-            serde_json::Value::Array(all) => all.iter().any(set),
+            Value::Number(n) => n.as_f64() != Some(0.0),
+            Value::Array(all) => all.iter().any(set),
             _ => false,
         }
     }
-    let known = |key: &str| SCANNER_KEYS.contains(&key) || STILL.contains(&key) || key.to_lowercase().contains("noise");
+    let moving = |key: &str| !STILL.contains(&key) && !key.to_lowercase().contains("noise");
     let mut all = Vec::new();
-    for (key, value) in meta["scanner"].as_object().into_iter().flatten() {
-        if !known(key) && set(value) {
-            all.push(format!("scanner.{key} = {}", shortened(&value.to_string()).trim_matches('"')));
-        }
+    for (key, value) in meta.scanner.rest.iter().filter(|(key, value)| moving(key) && set(value)) {
+        all.push(format!("scanner.{key} = {}", shortened(&value.to_string()).trim_matches('"')));
     }
-    for split in ["proj_train", "proj_test"] {
-        let frames = meta[split].as_array().into_iter().flatten().enumerate();
-        let mut keys = frames.flat_map(|(i, f)| f.as_object().into_iter().flatten().map(move |(key, v)| (i, key, v)));
-        let stranger = keys.find(|(_, key, value)| !["file_path", "angle"].contains(&key.as_str()) && set(value));
+    for (split, frames) in [("proj_train", &meta.proj_train), ("proj_test", &meta.proj_test)] {
+        let mut keys = frames.iter().enumerate().flat_map(|(i, f)| f.rest.iter().map(move |(key, v)| (i, key, v)));
+        let stranger = keys.find(|(.., value)| set(value));
         all.extend(stranger.map(|(i, key, _)| format!("{split}[{i}].{key}")));
     }
     all
 }
 
-/// The keys of [`Scanner`].
-const SCANNER_KEYS: [&str; 11] = [
-    "mode", "DSD", "DSO", "nDetector", "sDetector", "dDetector", "nVoxel", "sVoxel", "dVoxel", "offOrigin",
-    "offDetector",
-];
-
-fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
-    let file = folder.join(META);
-    let place = file.display().to_string();
-    let meta: Meta = text::read(&file)?;
+fn described(folder: &Path, meta: Meta, with_test: bool) -> Result<DataSet> {
+    let place = folder.join(META).display().to_string();
     let s = &meta.scanner;
     for (field, x) in [("scanner.DSO", s.DSO), ("scanner.DSD", s.DSD)] {
         ensure(x.is_finite() && x > 0.0, &place, field, x, "a positive finite distance")?;
@@ -145,18 +129,11 @@ fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
         let provenance = json!({ "format": "r2", "folder": folder.file_name().map(|n| n.to_string_lossy()) });
         Ok(Scan { geometry, projections, unit: Unit { name: "r2".into(), mm: 1.0 }, provenance })
     };
-    let mut train = scan("proj_train", &meta.proj_train)?;
-    let mut test = (with_test && !meta.proj_test.is_empty()).then(|| scan("proj_test", &meta.proj_test)).transpose()?;
+    let train = scan("proj_train", &meta.proj_train)?;
+    let test = (with_test && !meta.proj_test.is_empty()).then(|| scan("proj_test", &meta.proj_test)).transpose()?;
     let data = meta.vol.as_deref().map(|name| volume(folder, &place, name, s.nVoxel)).transpose()?;
     let units = length_unit(&place, meta.unit, &train, data.as_ref())?;
-    for s in [Some(&mut train), test.as_mut()].into_iter().flatten() {
-        s.geometry = s.geometry.scaled(units.length_mm);
-        s.unit = units.unit.clone();
-        s.provenance["unit_from"] = json!(units.found);
-        s.validate(&place)?;
-    }
-    let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
-    Ok(DataSet { train, test, volume })
+    units.data_set(&place, train, test, data)
 }
 
 /// The size of the folder's training views. `reading` covers the spare capacity of a growing list, and the volume,
@@ -266,11 +243,7 @@ fn volume(folder: &Path, place: &str, name: &str, shape: [usize; 3]) -> Result<A
 pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volume: Option<&Volume>) -> Result<()> {
     let folder = folder.as_ref();
     let place = folder.display().to_string();
-    let (orbit, test_orbit) = common_orbit(&place, "R2-Gaussian's format", train, test)?;
-    if let Some(v) = volume {
-        let (found, expected) = (format!("{:?}", v.data.shape()), format!("{:?}", train.geometry.volume.shape));
-        ensure(v.data.shape() == train.geometry.volume.shape, &place, "shape of the volume", found, expected)?;
-    }
+    let (orbit, test_orbit) = common_orbit(&place, "R2-Gaussian's format", train, test, volume)?;
     let known = |n: &str| [META, "proj_train", "proj_test", "vol_gt.npy"].contains(&n);
     folder::may_replace(folder, "R2-Gaussian folder", known, &[META])?;
     for split in ["proj_train", "proj_test"] {
@@ -283,7 +256,7 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
     let (g, grid) = (&train.geometry, &train.geometry.volume);
     let size = grid.size();
     let half = size.iter().copied().fold(0.0, f64::max) / 2.0;
-    let frames = |split: &str, angles: &[f64]| -> Vec<serde_json::Value> {
+    let frames = |split: &str, angles: &[f64]| -> Vec<Value> {
         let frame = |(i, a): (usize, &f64)| json!({ "file_path": format!("{split}/{split}_{i:04}.npy"), "angle": a });
         angles.iter().enumerate().map(frame).collect()
     };
@@ -335,94 +308,40 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{says, scan};
+    use crate::testing::{consistent, data_set_comes_back, is_geometry, says, scan};
     use std::fs;
 
-    fn near(a: &Geometry, b: &Geometry) {
-        assert_eq!((a.detector, a.volume.shape), (b.detector, b.volume.shape));
-        for (v, w) in a.views.iter().zip(&b.views) {
-            let pair = [(v.source, w.source), (v.detector, w.detector), (v.u, w.u), (v.v, w.v)];
-            assert!(pair.iter().all(|(x, y)| (0..3).all(|k| (x[k] - y[k]).abs() < 1e-9)), "{v:?} {w:?}");
-        }
-        for k in 0..3 {
-            assert!((a.volume.spacing[k] - b.volume.spacing[k]).abs() < 1e-12);
-            assert!((a.volume.center[k] - b.volume.center[k]).abs() < 1e-12);
-        }
+    /// Changes the description in the folder `path`.
+    fn changed(path: &Path, change: &dyn Fn(&mut Value)) {
+        let file = path.join(META);
+        let mut meta = text::read(&file).unwrap();
+        change(&mut meta);
+        fs::write(&file, serde_json::to_string_pretty(&meta).unwrap()).unwrap();
     }
 
+    /// The folder in `tests/fixtures` has lengths in metres.
     #[test]
     fn the_unit_comes_from_the_numbers() {
         let dir = tempfile::tempdir().unwrap();
-        let mut s = scan();
-        s.unit = Unit { name: "r2".into(), mm: 1.0 };
-        // Without its offset the small detector sees the volume.
-        let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
-        orbit.offset = [0.25, -0.5];
-        s.geometry.views = orbit.views();
-        let data = Array3::from_shape_fn((5, 6, 7), |(x, y, z)| 0.01 + 0.001 * (x + y * z) as f32);
-        let g = s.geometry.clone();
-        for ((a, v, u), p) in s.projections.indexed_iter_mut() {
-            *p = rays::integral(&data, &g.volume, &g.ray(a, v, u)) as f32;
-        }
-        let volume = Volume { data, grid: g.volume, affine: None };
         let path = dir.path().join("r2");
+        let (s, volume) = consistent(Unit { name: "r2".into(), mm: 1.0 });
         write_r2(&path, &s, None, Some(&volume)).unwrap();
-        let file = path.join(META);
-        let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
-        meta.as_object_mut().unwrap().remove("unit");
-        let mut save = |factor: f64| {
-            let scale = |v: &mut serde_json::Value| *v = json!(v.as_f64().unwrap() * factor);
-            let scanner = &mut meta["scanner"];
-            for key in ["DSO", "DSD"] {
-                scale(&mut scanner[key]);
-            }
-            for key in ["sDetector", "sVoxel", "offOrigin", "offDetector"] {
-                scanner[key].as_array_mut().unwrap().iter_mut().for_each(scale);
-            }
-            fs::write(&file, meta.to_string()).unwrap();
-        };
-        save(1.0);
-        let back = read_r2(&path).unwrap();
-        assert_eq!(back.train.unit.name, "r2");
-        near(&back.train.geometry, &g);
-        save(0.001);
-        let back = read_r2(&path).unwrap();
-        assert_eq!(back.train.unit, Unit::default());
-        near(&back.train.geometry, &g);
-        // Neither ratio: the values are used unchanged.
-        save(100.0);
-        let back = read_r2(&path).unwrap();
-        assert_eq!(back.train.unit.name, "r2");
-        near(&back.train.geometry, &g.scaled(0.1));
+        changed(&path, &|meta| drop(meta.as_object_mut().unwrap().remove("unit")));
+        let back = read(&path, true).unwrap();
+        assert_eq!((back.train.unit, &back.train.provenance["unit_from"]), (s.unit, &json!("volume and projections")));
+        is_geometry(&back.train.geometry, &s.geometry);
     }
 
     #[test]
     fn what_is_written_comes_back() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("r2");
-        let train = scan();
-        let (_, test) = train.split(&[1, 4]).unwrap();
-        let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
-        write_r2(&path, &train, Some(&test), Some(&volume)).unwrap();
-        let back = read_r2(&path).unwrap();
-        near(&back.train.geometry, &train.geometry);
-        near(&back.test.as_ref().unwrap().geometry, &test.geometry);
-        assert_eq!(back.train.unit, train.unit);
-        assert_eq!(back.train.projections, train.projections);
-        assert_eq!(back.test.unwrap().projections, test.projections);
-        assert_eq!(back.volume.unwrap().data, volume.data);
+        data_set_comes_back(&path, &|p, s, test, v| write_r2(p, s, test, v), &read);
         // Lengths are written in the scan's own unit, centimetres here.
-        let meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(path.join(META)).unwrap()).unwrap();
+        let meta: Value = text::read(&path.join(META)).unwrap();
         assert!((meta["scanner"]["DSO"].as_f64().unwrap() - 50.0).abs() < 1e-9);
-        // Overwritten, without volume and test views.
-        write_r2(&path, &train, None, None).unwrap();
-        let back = read_r2(&path).unwrap();
-        assert!(back.test.is_none() && back.volume.is_none());
         fs::write(path.join("mine.txt"), "").unwrap();
-        assert!(write_r2(&path, &train, None, None).unwrap_err().to_string().contains("mine.txt"));
-        let mut odd = train.clone();
-        odd.geometry.views[0].source[2] += 1.0;
-        says(write_r2(dir.path().join("odd"), &odd, None, None), &["circle"]);
+        says(write_r2(&path, &scan(), None, None), &["mine.txt"]);
     }
 
     #[test]
@@ -430,40 +349,34 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("r2");
         write_r2(&path, &scan(), None, None).unwrap();
-        let file = path.join(META);
-        let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
-        assert_eq!(others(&meta), Vec::<String>::new());
-        meta["scanner"]["rotDetector"] = json!([0, 0.01, 0]);
-        meta["scanner"]["COR"] = json!(0);
-        meta["scanner"]["possion_noise"] = json!(1e4);
-        meta["proj_train"][3]["offDetector"] = json!([1, 0]);
-        assert_eq!(others(&meta), ["scanner.rotDetector = [0,0.01,0]", "proj_train[3].offDetector"]);
-        // A backslash separates folders: the file was made on Windows.
-        for (i, frame) in meta["proj_train"].as_array_mut().unwrap().iter_mut().enumerate() {
-            frame["file_path"] = json!(format!("proj_train\\proj_train_{i:04}.npy"));
-        }
-        fs::write(&file, meta.to_string()).unwrap();
-        assert_eq!(read_r2(&path).unwrap().train.projections, scan().projections);
+        let found = || others(&text::read(&path.join(META)).unwrap());
+        assert_eq!(found(), Vec::<String>::new());
+        changed(&path, &|meta| {
+            meta["scanner"]["rotDetector"] = json!([0, 0.01, 0]);
+            meta["scanner"]["COR"] = json!(0);
+            meta["scanner"]["possion_noise"] = json!(1e4);
+            meta["proj_train"][3]["offDetector"] = json!([1, 0]);
+            // A backslash separates folders: the file was made on Windows.
+            for (i, frame) in meta["proj_train"].as_array_mut().unwrap().iter_mut().enumerate() {
+                frame["file_path"] = json!(format!("proj_train\\proj_train_{i:04}.npy"));
+            }
+        });
+        assert_eq!(found(), ["scanner.rotDetector = [0,0.01,0]", "proj_train[3].offDetector"]);
+        assert_eq!(read(&path, true).unwrap().train.projections, scan().projections);
     }
 
     #[test]
     fn lying_descriptions_are_refused_in_words() {
-        let refused = |change: &dyn Fn(&mut serde_json::Value), words: &[&str]| {
+        let refused = |lie: &dyn Fn(&mut Value), words: &[&str]| {
             let dir = tempfile::tempdir().unwrap();
             let path = dir.path().join("r2");
             write_r2(&path, &scan(), None, None).unwrap();
-            let file = path.join(META);
-            let mut meta: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
-            change(&mut meta);
-            fs::write(&file, serde_json::to_string_pretty(&meta).unwrap()).unwrap();
-            says(read_r2(&path), words);
+            changed(&path, lie);
+            says(read(&path, true), words);
         };
-        refused(&|m| m["scanner"]["DSO"] = json!("far"), &[".json:47:", "scanner.DSO", "far"]);
-        refused(&|m| m["scanner"]["nDetector"] = json!([4, 7]), &["proj_train_0000.npy", "[4, 6]", "[4, 7]"]);
         refused(&|m| m["scanner"]["nVoxel"] = json!([1u64 << 40, 1u64 << 40, 1]), &["volume.shape"]);
         refused(&|m| m["scanner"]["sVoxel"] = json!(null), &["scanner.sVoxel", "nothing"]);
         refused(&|m| m["scanner"]["dVoxel"] = json!([9, 9, 9]), &["scanner.dVoxel", "sVoxel"]);
-        refused(&|m| m["proj_train"][2]["file_path"] = json!("..\\x.npy"), &["proj_train[2].file_path", "inside"]);
         refused(&|m| m["vol"] = json!("vol_gt.npy"), &["vol", "vol_gt.npy"]);
         refused(&|m| m["unit"]["mm"] = json!(0), &["unit.mm"]);
     }

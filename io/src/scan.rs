@@ -39,8 +39,8 @@ pub(crate) enum ScanFile {
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Stored> {
     let scan = match find(path.as_ref())? {
         ScanFile::Own(file) => scan_folder::read(&file),
-        ScanFile::R2(folder) => r2::read_train(&folder).map(|r| r.train),
-        ScanFile::Naf(file) => naf::read_train(&file),
+        ScanFile::R2(folder) => r2::read(&folder, false).map(|r| r.train),
+        ScanFile::Naf(file) => naf::read(&file, false).map(|r| r.train),
         ScanFile::Scanner(file) => return scanner::read_scanner(&file, None, None),
     };
     scan.map(Stored::Scan)
@@ -63,8 +63,7 @@ impl Parts {
 /// Reads a scan and the `parts` that its file or folder holds. Some formats give the volume unasked.
 pub fn read_data_set(path: impl AsRef<Path>, parts: Parts) -> Result<DataSet<Stored>> {
     let DataSet { train, test, volume } = match find(path.as_ref())? {
-        ScanFile::R2(folder) if parts.tests => r2::read_r2(&folder)?,
-        ScanFile::R2(folder) => r2::read_train(&folder)?,
+        ScanFile::R2(folder) => r2::read(&folder, parts.tests)?,
         ScanFile::Naf(file) if parts.tests || parts.volume => naf::read(&file, parts.tests)?,
         _ => {
             let volume = if parts.volume { read_truth(&path)? } else { None };
@@ -100,13 +99,12 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
         if pickle::is_pickle(path)? {
             return Ok(ScanFile::Naf(path.to_path_buf()));
         }
-        if scanner::Vendor::of(path).is_some() {
+        if scanner::is_vendors(path) {
             return Ok(ScanFile::Scanner(path.to_path_buf()));
         }
-        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         return match (path.file_name().and_then(|n| n.to_str()), path.extension().and_then(|e| e.to_str())) {
             (Some("scan.toml" | "scan.json"), _) => Ok(ScanFile::Own(path.to_path_buf())),
-            (Some(r2::META), _) => Ok(ScanFile::R2(folder.to_path_buf())),
+            (Some(r2::META), _) => Ok(ScanFile::R2(scan_folder::folder_of(path).to_path_buf())),
             (_, Some("toml" | "json")) => match format_of(path).as_deref() {
                 Some(scan_folder::FORMAT) => Ok(ScanFile::Own(path.to_path_buf())),
                 // The description's reader reports what is missing.
@@ -129,22 +127,5 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
             foreign::refuse_folder(path)?;
             Err(Error::invalid(place, "scan", "none of the files that describe one", understood))
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::testing::says;
-
-    #[test]
-    fn a_refusal_lists_the_files_of_a_scan() {
-        let dir = tempfile::tempdir().unwrap();
-        says(read_scan(dir.path()), &["scan.toml", "scan.json", "meta_data.json"]);
-        says(read_scan(dir.path().join("none")), &["none"]);
-        std::fs::write(dir.path().join("scan.toml"), "").unwrap();
-        std::fs::write(dir.path().join("scan.json"), "").unwrap();
-        assert!(read_scan(dir.path()).unwrap_err().to_string().contains("both"));
-        assert!(read_truth(dir.path()).unwrap_err().to_string().contains("both"));
     }
 }

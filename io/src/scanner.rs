@@ -43,7 +43,7 @@
 //! `[cil]` has the `file` that CIL wrote. All lengths are mm; angles are degrees, as their keys say.
 //!
 //! In an HDF5 file, `scan.h5:/PATH` names a data set; `scan.h5` alone means the projections, open beam, dark field or
-//! angles that DXchange, NXtomo or CIL keep there. A vendor's description may replace this file; see [`Vendor`].
+//! angles that DXchange, NXtomo or CIL keep there. A vendor's description may replace this file; see [`vendor`].
 
 mod cil;
 mod differences;
@@ -59,7 +59,7 @@ mod xim;
 mod xtekct;
 
 pub(crate) use pixels::Pixels;
-pub(crate) use vendor::Vendor;
+pub(crate) use vendor::{MOST_VIEWS, is_vendors};
 
 use crate::hdf5::ScanPart;
 use crate::rtk::read_rtk_geometry;
@@ -73,7 +73,7 @@ use conefield_core::orbit::{Beam, CircularOrbit};
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis};
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 use vendor::Response;
@@ -188,8 +188,8 @@ struct Description {
 impl Description {
     /// Reads the description `path`, a vendor's or conefield's own.
     fn read(path: &Path) -> Result<Self> {
-        if let Some(vendor) = Vendor::of(path) {
-            return vendor.description(path);
+        if let Some(reader) = vendor::reader(path) {
+            return reader(path);
         }
         refuse_images(path)?;
         described(path, FORMAT, VERSION)
@@ -228,10 +228,9 @@ struct Uv {
     v: f64,
 }
 
-#[derive(Deserialize, Clone, Copy, Default, PartialEq, Serialize)]
+#[derive(Deserialize, Clone, Copy, PartialEq)]
 #[serde(rename_all = "lowercase")]
 enum Direction {
-    #[default]
     Counterclockwise,
     Clockwise,
 }
@@ -287,18 +286,12 @@ struct Cil {
     file: String,
 }
 
-#[derive(Deserialize)]
+#[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields, default)]
 struct LayoutTable {
-    axes: Vec<StackAxis>,
+    axes: Option<Vec<StackAxis>>,
     flip_rows: bool,
     flip_columns: bool,
-}
-
-impl Default for LayoutTable {
-    fn default() -> Self {
-        Self { axes: vec![StackAxis::View, StackAxis::Row, StackAxis::Column], flip_rows: false, flip_columns: false }
-    }
 }
 
 #[derive(Deserialize, Clone, Copy, Default, PartialEq)]
@@ -317,9 +310,8 @@ enum I0Text {
 }
 
 #[derive(Deserialize, Default)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 struct ValuesTable {
-    #[serde(default)]
     kind: ValueKind,
     i0: Option<I0Text>,
     floor: Option<f64>,
@@ -426,13 +418,14 @@ fn straightened(place: &str, mut geometry: Geometry, mut projections: Array3<f32
 
 fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
     let all = [StackAxis::View, StackAxis::Row, StackAxis::Column];
-    let lacked: Vec<StackAxis> = all.into_iter().filter(|a| !table.axes.contains(a)).collect();
+    let stated = table.axes.as_deref().unwrap_or(&all);
+    let lacked: Vec<StackAxis> = all.into_iter().filter(|a| !stated.contains(a)).collect();
     // Files of images that lack the views are stacked along the first axis.
-    let all = if lacked == [StackAxis::View] { [&lacked, &table.axes[..]] } else { [&table.axes[..], &lacked] };
-    let axes = <[StackAxis; 3]>::try_from(all.concat()).ok();
+    let whole = if lacked == [StackAxis::View] { [&lacked, stated] } else { [stated, &lacked] };
+    let axes = <[StackAxis; 3]>::try_from(whole.concat()).ok();
     let Some(axes) = axes.filter(|_| lacked.len() < 2) else {
         let expected = "each of \"view\", \"row\" and \"column\" once, or two of them";
-        return Err(Error::invalid(place, "layout.axes", format!("{:?}", table.axes), expected));
+        return Err(Error::invalid(place, "layout.axes", format!("{stated:?}"), expected));
     };
     let lacked = lacked.first().copied().unwrap_or(StackAxis::View);
     Ok(StackLayout { axes, lacked, flip_rows: table.flip_rows, flip_columns: table.flip_columns })
@@ -475,83 +468,72 @@ fn open_beam(place: &str, d: &Description, i0: Option<I0>, floor: Option<f64>) -
 }
 
 fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Vec<View>> {
-    let volume = &d.volume;
-    let fits = |field: &str, n: usize| {
-        let expected = format!("{count}, one for each view in the projections");
-        ensure(n == count, place, field, format!("{n} of them"), expected)
-    };
-    if let Some(views) = &d.views {
-        fits("views", views.len())?;
-        return Ok(views.clone());
-    }
-    match (&d.circle, &d.vectors, &d.rtk, &d.cil) {
-        (Some(c), None, None, None) => {
-            let angles = angles(folder, place, c, count)?;
-            fits("circle.angles_deg", angles.len())?;
-            let distances = distances(place, c)?;
-            lengths(place, "circle", c.pixel, c.offset)?;
-            let (pixel, offset) = ([c.pixel.v, c.pixel.u], [c.offset.v, c.offset.u]);
-            let tilt = [("u", c.tilt_deg.u), ("v", c.tilt_deg.v), ("normal", c.tilt_deg.normal)];
-            for (axis, x) in tilt {
-                let fits = x.is_finite() && x.abs() < 90.0;
-                ensure(fits, place, &format!("circle.tilt_deg.{axis}"), x, "degrees between -90 and 90")?;
-            }
-            let tilt = tilt.map(|(_, x)| Radians(x.to_radians()));
-            let orbit = match distances {
-                Some([dso, dsd]) => CircularOrbit { dso, dsd, pixel, offset, angles },
-                None => CircularOrbit::parallel(volume, pixel, offset, angles),
-            };
-            Ok(orbit.views().into_iter().map(|v| v.tilted(tilt)).collect())
-        }
-        (None, Some(v), None, None) => {
-            let (field, rows) = match (&v.cone_vec, &v.parallel_vec) {
-                (Some(rows), None) => ("vectors.cone_vec", rows),
-                (None, Some(rows)) => ("vectors.parallel_vec", rows),
-                (found, _) => {
-                    let found = if found.is_some() { "both" } else { "nothing" };
-                    return Err(Error::invalid(place, "vectors", found, "one of cone_vec and parallel_vec"));
-                }
-            };
-            let read;
-            let rows = match rows {
-                Numbers::List(rows) => rows,
-                Numbers::File(name) => {
-                    read = table::read(folder, place, field, name, VECTOR)?;
-                    &read
-                }
-            };
-            let view = |(i, n): (usize, &Vec<f64>)| {
-                let field = format!("{field}[{i}]");
-                ensure(n.len() == VECTOR, place, &field, format!("{} numbers", n.len()), format!("{VECTOR}"))?;
-                let part = |k: usize| [n[k], n[k + 1], n[k + 2]];
-                let view = View { source: part(0), detector: part(3), u: part(6), v: part(9) };
-                if v.cone_vec.is_some() {
-                    return Ok(view);
-                }
-                let long = norm(view.source);
-                let expected = "a direction: three finite numbers, not all 0";
-                ensure(long.is_finite() && long > 0.0, place, &field, format!("{:?}", view.source), expected)?;
-                Ok(view.parallel(view.source.map(|x| x / long), volume))
-            };
-            let views = rows.iter().enumerate().map(view).collect::<Result<Vec<_>>>()?;
-            fits(field, views.len())?;
-            Ok(views)
-        }
-        (None, None, Some(r), None) => {
+    let (field, views) = match (&d.views, &d.circle, &d.vectors, &d.rtk, &d.cil) {
+        (Some(views), ..) => ("views", views.clone()),
+        (_, Some(c), None, None, None) => ("circle.angles_deg", circle(folder, place, c, &d.volume, count)?),
+        (_, None, Some(v), None, None) => vectors(folder, place, v, &d.volume)?,
+        (_, None, None, Some(r), None) => {
             lengths(place, "rtk", r.pixel, r.offset)?;
             let file = folder::inside(folder, place, "rtk.file", &r.file)?;
-            let views = read_rtk_geometry(file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?;
-            fits("rtk.file", views.len())?;
-            Ok(views)
+            ("rtk.file", read_rtk_geometry(file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?)
         }
-        (None, None, None, Some(c)) => {
-            let views = cil::views(&folder::inside(folder, place, "cil.file", &c.file)?)?;
-            fits("cil.file", views.len())?;
-            Ok(views)
+        (_, None, None, None, Some(c)) => {
+            ("cil.file", cil::views(&folder::inside(folder, place, "cil.file", &c.file)?)?)
         }
-        (None, None, None, None) => Err(Error::invalid(place, "circle", "nothing", GEOMETRIES)),
-        _ => Err(Error::invalid(place, "circle", "several geometries", GEOMETRIES)),
+        (_, None, None, None, None) => return Err(Error::invalid(place, "circle", "nothing", GEOMETRIES)),
+        _ => return Err(Error::invalid(place, "circle", "several geometries", GEOMETRIES)),
+    };
+    let expected = format!("{count}, one for each view in the projections");
+    ensure(views.len() == count, place, field, format!("{} of them", views.len()), expected)?;
+    Ok(views)
+}
+
+fn circle(folder: &Path, place: &str, c: &Circle, volume: &VoxelGrid, count: usize) -> Result<Vec<View>> {
+    let angles = angles(folder, place, c, count)?;
+    let distances = distances(place, c)?;
+    lengths(place, "circle", c.pixel, c.offset)?;
+    let (pixel, offset) = ([c.pixel.v, c.pixel.u], [c.offset.v, c.offset.u]);
+    let tilt = [("u", c.tilt_deg.u), ("v", c.tilt_deg.v), ("normal", c.tilt_deg.normal)];
+    for (axis, x) in tilt {
+        let fits = x.is_finite() && x.abs() < 90.0;
+        ensure(fits, place, &format!("circle.tilt_deg.{axis}"), x, "degrees between -90 and 90")?;
     }
+    let tilt = tilt.map(|(_, x)| Radians(x.to_radians()));
+    let orbit = match distances {
+        Some([dso, dsd]) => CircularOrbit { dso, dsd, pixel, offset, angles },
+        None => CircularOrbit::parallel(volume, pixel, offset, angles),
+    };
+    Ok(orbit.views().into_iter().map(|v| v.tilted(tilt)).collect())
+}
+
+/// The field that has them, and the views of ASTRA's vectors.
+fn vectors(folder: &Path, place: &str, v: &Vectors, volume: &VoxelGrid) -> Result<(&'static str, Vec<View>)> {
+    let (field, rows) = match (&v.cone_vec, &v.parallel_vec) {
+        (Some(rows), None) => ("vectors.cone_vec", rows),
+        (None, Some(rows)) => ("vectors.parallel_vec", rows),
+        (found, _) => {
+            let found = if found.is_some() { "both" } else { "nothing" };
+            return Err(Error::invalid(place, "vectors", found, "one of cone_vec and parallel_vec"));
+        }
+    };
+    let rows = match rows {
+        Numbers::List(rows) => rows.clone(),
+        Numbers::File(name) => table::read(folder, place, field, name, VECTOR)?,
+    };
+    let view = |(i, n): (usize, &Vec<f64>)| {
+        let field = format!("{field}[{i}]");
+        ensure(n.len() == VECTOR, place, &field, format!("{} numbers", n.len()), format!("{VECTOR}"))?;
+        let part = |k: usize| [n[k], n[k + 1], n[k + 2]];
+        let view = View { source: part(0), detector: part(3), u: part(6), v: part(9) };
+        if v.cone_vec.is_some() {
+            return Ok(view);
+        }
+        let long = norm(view.source);
+        let expected = "a direction: three finite numbers, not all 0";
+        ensure(long.is_finite() && long > 0.0, place, &field, format!("{:?}", view.source), expected)?;
+        Ok(view.parallel(view.source.map(|x| x / long), volume))
+    };
+    Ok((field, rows.iter().enumerate().map(view).collect::<Result<_>>()?))
 }
 
 /// DSO and DSD of a cone beam; `None` for a parallel one.

@@ -1,8 +1,9 @@
 //! Helpers shared by the tests of several modules.
 
-use crate::{I0, OpenBeam, Stored, is_volume, read_volume, volume_voxels, write_volume};
+use crate::{DataSet, I0, OpenBeam, Stored, is_volume, rays, read_volume, volume_voxels, write_volume};
 use conefield_core::Result;
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
+use conefield_core::orbit::CircularOrbit;
 use conefield_core::scan::{Scan, Unit, Volume};
 use ndarray::Array3;
 use std::io::Write;
@@ -22,11 +23,50 @@ pub(crate) fn says_just<T>(result: Result<T>, dir: &Path, words: &str) {
     assert_eq!(e.to_string().replace(&format!("{}/", dir.display()), ""), words);
 }
 
+/// Fails unless the scan that `description` describes is refused with just `words` about the `file` beside or below it,
+/// once `change` has damaged that. The file is as it was afterwards.
+pub(crate) fn damage_is_refused(description: &Path, file: &str, change: &dyn Fn(&mut Vec<u8>), words: &str) {
+    let dir = description.parent().unwrap();
+    let whole = std::fs::read(dir.join(file)).unwrap();
+    let mut bytes = whole.clone();
+    change(&mut bytes);
+    assert_ne!(bytes, whole, "{words}");
+    std::fs::write(dir.join(file), bytes).unwrap();
+    says_just(read_scanner(description, None), dir, &format!("{file}: {words}"));
+    std::fs::write(dir.join(file), whole).unwrap();
+}
+
+/// A change that puts `to` in place of `from`.
+pub(crate) fn replaced<'a>(from: &'a str, to: &'a str) -> impl Fn(&mut Vec<u8>) + 'a {
+    move |bytes| *bytes = std::str::from_utf8(bytes).unwrap().replace(from, to).into_bytes()
+}
+
 /// Fails unless source, detector, u and v are `want`, to a billionth.
 pub(crate) fn is_view(found: &View, want: [[f64; 3]; 4]) {
     for (found, want) in [found.source, found.detector, found.u, found.v].into_iter().zip(want) {
         assert!((0..3).all(|k| (found[k] - want[k]).abs() < 1e-9), "{found:?} is not {want:?}");
     }
+}
+
+/// Fails unless there are as many views, and each is that of `want`, to a billionth.
+pub(crate) fn are_views(found: &[View], want: &[View]) {
+    assert_eq!(found.len(), want.len());
+    found.iter().zip(want).for_each(|(found, w)| is_view(found, [w.source, w.detector, w.u, w.v]));
+}
+
+/// Fails unless detector and grid are those of `want`, and the views are, to a billionth.
+pub(crate) fn is_geometry(found: &Geometry, want: &Geometry) {
+    assert_eq!((found.detector, found.volume.shape), (want.detector, want.volume.shape));
+    are_views(&found.views, &want.views);
+    let (a, b) = (&found.volume, &want.volume);
+    let mut pairs = a.spacing.iter().chain(&a.center).zip(b.spacing.iter().chain(&b.center));
+    assert!(pairs.all(|(a, b)| (a - b).abs() < 1e-12), "{a:?} is not {b:?}");
+}
+
+/// Fails unless the line integral at view, row and column is `want`, to a millionth.
+pub(crate) fn is_integral(scan: &Scan, at: [usize; 3], want: f64) {
+    let found = f64::from(scan.projections[at]);
+    assert!((found - want).abs() < 1e-6, "{at:?}: {found} is not {want}");
 }
 
 /// Writes a 16-bit TIFF with the pixels that `f` gives for row and column.
@@ -64,21 +104,28 @@ pub(crate) fn data(name: &str) -> Option<PathBuf> {
     None
 }
 
-/// The scan `path`; counts are converted by the bare formula.
+/// The scan `path`, whose size is known before; counts are converted by the bare formula.
 pub(crate) fn read_scan(path: impl AsRef<Path>) -> Result<Scan> {
-    crate::read_scan(path).and_then(line_integrals)
+    let path = path.as_ref();
+    crate::read_scan(path).and_then(|stored| line_integrals(path, stored))
 }
 
 /// The same for a scanner's description.
 pub(crate) fn read_scanner(path: impl AsRef<Path>, i0: Option<I0>) -> Result<Scan> {
-    crate::read_scanner(path, i0, None).and_then(line_integrals)
+    let path = path.as_ref();
+    crate::read_scanner(path, i0, None).and_then(|stored| line_integrals(path, stored))
 }
 
-fn line_integrals(stored: Stored) -> Result<Scan> {
+fn line_integrals(path: &Path, stored: Stored) -> Result<Scan> {
+    let pixels = crate::scan_size(path)?.pixels;
     let mut counts = match stored {
-        Stored::Scan(scan) => return Ok(scan),
+        Stored::Scan(scan) => {
+            assert_eq!(scan.projections.len() as u64, pixels);
+            return Ok(scan);
+        }
         Stored::Counts(counts) => counts,
     };
+    assert_eq!(counts.values.len() as u64, pixels);
     let mut a = std::mem::take(&mut counts.values);
     a.indexed_iter_mut().for_each(|((_, row, column), x)| {
         let dark = counts.conversion.dark.as_ref().map_or(0.0, |d| d[[row, column]]);
@@ -150,4 +197,47 @@ pub(crate) fn scan() -> Scan {
         unit: Unit { name: "cm".into(), mm: 10.0 },
         provenance: serde_json::json!({"from": "a test", "noise": {"photons": 10000, "sigma": 0.5}}),
     }
+}
+
+/// A scan that matches its volume, with another offset than that of [`scan`].
+pub(crate) fn consistent(unit: Unit) -> (Scan, Volume) {
+    let mut s = Scan { unit, ..scan() };
+    let mut orbit = CircularOrbit::fit(&s.geometry.views).unwrap();
+    orbit.offset = [0.25, -1.5];
+    s.geometry.views = orbit.views();
+    let data = Array3::from_shape_fn((5, 6, 7), |(x, y, z)| 0.01 + 0.002 * (x + y * z) as f32);
+    let (g, mm) = (&s.geometry, s.unit.mm);
+    s.projections.indexed_iter_mut().for_each(|((view, row, column), p)| {
+        *p = (rays::integral(&data, &g.volume, &g.ray(view, row, column)) / mm) as f32;
+    });
+    let grid = s.geometry.volume;
+    (s, Volume { data, grid, affine: None })
+}
+
+/// Writes views, test views and a volume.
+type WriteDataSet<'a> = &'a dyn Fn(&Path, &Scan, Option<&Scan>, Option<&Volume>) -> Result<()>;
+
+/// Fails unless `read` gives back what `write` writes to `path`: views, test views and a volume, and then views alone in
+/// their place. Neither a scan that is no circle nor a volume of another shape is written.
+pub(crate) fn data_set_comes_back(path: &Path, write: WriteDataSet, read: &dyn Fn(&Path, bool) -> Result<DataSet>) {
+    let train = scan();
+    let (_, test) = train.split(&[1, 4]).unwrap();
+    let volume = Volume { data: Array3::from_elem((5, 6, 7), 0.5), grid: train.geometry.volume, affine: None };
+    write(path, &train, Some(&test), Some(&volume)).unwrap();
+    let back = read(path, true).unwrap();
+    for (found, want) in [(&back.train, &train), (back.test.as_ref().unwrap(), &test)] {
+        is_geometry(&found.geometry, &want.geometry);
+        assert_eq!((&found.unit, &found.projections), (&want.unit, &want.projections));
+        assert_eq!(found.provenance["unit_from"], "the file");
+    }
+    assert_eq!(back.volume.unwrap().data, volume.data);
+    assert!(read(path, false).unwrap().test.is_none());
+    write(path, &train, None, None).unwrap();
+    let back = read(path, true).unwrap();
+    assert!(back.test.is_none() && back.volume.is_none() && crate::read_truth(path).unwrap().is_none());
+    let mut odd = train.clone();
+    odd.geometry.views[0].source[2] += 1.0;
+    says(write(path, &odd, None, None), &["circle"]);
+    let small = Volume::centered(Array3::ones((2, 2, 2)), [1.0; 3]);
+    says(write(path, &train, None, Some(&small)), &["shape of the volume", "[2, 2, 2]", "[5, 6, 7]"]);
 }

@@ -1,9 +1,12 @@
 //! Finds the unit of a file that does not name it, from its numbers.
 
+use crate::DataSet;
 use crate::rays::Agreement;
 use conefield_core::Result;
 use conefield_core::error::ensure;
-use conefield_core::scan::Unit;
+use conefield_core::scan::{Scan, Unit, Volume};
+use ndarray::Array3;
+use serde_json::json;
 
 /// Source of the unit if the file names it.
 pub(crate) const SAID: &str = "the file";
@@ -15,6 +18,27 @@ pub(crate) struct Units {
     pub length_mm: f64,
     /// How the unit was found, in words, for the scan's provenance.
     pub found: &'static str,
+}
+
+impl Units {
+    /// Gives the scans this unit, says in their provenance how it was found, and checks them; `data` is the volume on
+    /// their grid.
+    pub fn data_set(
+        self,
+        place: &str,
+        mut train: Scan,
+        mut test: Option<Scan>,
+        data: Option<Array3<f32>>,
+    ) -> Result<DataSet> {
+        for s in [Some(&mut train), test.as_mut()].into_iter().flatten() {
+            s.geometry = s.geometry.scaled(self.length_mm);
+            s.unit = self.unit.clone();
+            s.provenance["unit_from"] = json!(self.found);
+            s.validate(place)?;
+        }
+        let volume = data.map(|data| Volume { data, grid: train.geometry.volume, affine: None });
+        Ok(DataSet { train, test, volume })
+    }
 }
 
 /// A possible unit of a file's numbers.

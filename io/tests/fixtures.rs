@@ -1,9 +1,9 @@
 //! Tests the conventions of NAF's file and R2-Gaussian's folder with files that `fixtures/make.py` writes without this
 //! program: closed-form integrals through ellipsoids, in pickles of NumPy 1 and 2 and in `.npy` files.
 
-use conefield_core::geometry::Vec3;
+use conefield_core::geometry::{Vec3, dot, norm, sub};
 use conefield_core::scan::{Scan, Unit, Volume};
-use conefield_io::{DataSet, Stored, read_naf, read_r2, read_scan, read_truth};
+use conefield_io::{DataSet, Parts, Stored, read_data_set, read_scan, read_truth};
 use std::path::{Path, PathBuf};
 
 /// Centre, half axes, rotation about z, attenuation, as in `make.py`.
@@ -17,6 +17,12 @@ fn file(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
 }
 
+fn data_set(name: &str) -> DataSet {
+    let DataSet { train, test, volume } = read_data_set(file(name), Parts::ALL).unwrap();
+    let Stored::Scan(train) = train else { panic!("{name}: counts") };
+    DataSet { train, test, volume }
+}
+
 /// Transforms to the frame in which ellipsoid `e` is the unit ball.
 fn turned(p: Vec3, e: usize) -> Vec3 {
     let (_, half, turn, _) = ELLIPSOIDS[e];
@@ -24,20 +30,12 @@ fn turned(p: Vec3, e: usize) -> Vec3 {
     [(c * p[0] + s * p[1]) / half[0], (c * p[1] - s * p[0]) / half[1], p[2] / half[2]]
 }
 
-fn dot(a: Vec3, b: Vec3) -> f64 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
-}
-
-fn less(a: Vec3, b: Vec3) -> Vec3 {
-    std::array::from_fn(|k| a[k] - b[k])
-}
-
 /// The integral along the line through `from` and `to`.
 fn integral(from: Vec3, to: Vec3) -> f64 {
-    let way = less(to, from);
-    let way = way.map(|x| x / dot(way, way).sqrt());
+    let way = sub(to, from);
+    let way = way.map(|x| x / norm(way));
     let chord = |e: usize| {
-        let (o, d) = (turned(less(from, ELLIPSOIDS[e].0), e), turned(way, e));
+        let (o, d) = (turned(sub(from, ELLIPSOIDS[e].0), e), turned(way, e));
         let (a, b, k) = (dot(d, d), dot(o, d), dot(o, o) - 1.0);
         2.0 * (b * b - a * k).max(0.0).sqrt() / a
     };
@@ -73,7 +71,7 @@ fn volume_is_right(volume: &Volume, what: &str) {
                 ([x, y, z][k] as f64 + (at[k] as f64 + 0.5) / 6.0 - n / 2.0) * volume.grid.spacing[k]
             });
             let inside = |e: &usize| {
-                let q = turned(less(p, ELLIPSOIDS[*e].0), *e);
+                let q = turned(sub(p, ELLIPSOIDS[*e].0), *e);
                 dot(q, q) <= 1.0
             };
             mean += (0..3).filter(inside).map(|e| ELLIPSOIDS[e].3).sum::<f64>() / 216.0;
@@ -97,10 +95,12 @@ fn data_is_right(data: &DataSet, what: &str) {
 #[test]
 fn nafs_pickle_is_read_as_it_is_meant() {
     for name in ["ellipsoids_numpy1.pickle", "ellipsoids_numpy2.pickle"] {
-        let data = read_naf(file(name)).unwrap();
+        let data = data_set(name);
         data_is_right(&data, name);
         let found = data.train.provenance["unit_from"].as_str().unwrap();
         assert!(found.contains("1/mm"), "{found}");
+        // [v, u], as TIGRE has it.
+        assert_eq!(data.train.provenance.get("offset_from"), None);
     }
     // The two differ because NumPy 2 renamed its modules.
     let bytes = |name: &str| std::fs::read(file(name)).unwrap();
@@ -110,7 +110,7 @@ fn nafs_pickle_is_read_as_it_is_meant() {
 
 #[test]
 fn r2s_folder_is_read_as_it_is_meant() {
-    let data = read_r2(file("ellipsoids_r2")).unwrap();
+    let data = data_set("ellipsoids_r2");
     data_is_right(&data, "ellipsoids_r2");
     let found = data.train.provenance["unit_from"].as_str().unwrap();
     assert!(found.contains("lengths in m"), "{found}");
@@ -119,7 +119,7 @@ fn r2s_folder_is_read_as_it_is_meant() {
 /// Verifies that the comparison can fail.
 #[test]
 fn another_convention_is_found_out() {
-    let data = read_r2(file("ellipsoids_r2")).unwrap();
+    let data = data_set("ellipsoids_r2");
     let fails = |change: &dyn Fn(&mut Scan)| {
         let mut scan = data.train.clone();
         change(&mut scan);

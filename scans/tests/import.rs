@@ -3,7 +3,7 @@
 use conefield_core::scan::Scan;
 use conefield_io::I0;
 use conefield_scans::diagnosis::check_line_integrals;
-use conefield_scans::{ImportOptions, import};
+use conefield_scans::{ImportOptions, import, read_scan};
 use ndarray::{Array3, Axis};
 use std::path::{Path, PathBuf};
 
@@ -56,7 +56,7 @@ fn counts_through_flat_and_dark_are_the_line_integrals_within_the_noise() {
     let imported = read(ELLIPSOIDS, None);
     // The counts are of every other view.
     let every_other: Vec<usize> = (0..25).map(|i| 2 * i).collect();
-    let truth = conefield_io::read_r2(exact).unwrap().train.projections.select(Axis(0), &every_other);
+    let truth = read_scan(exact).unwrap().projections.select(Axis(0), &every_other);
     let found = &imported.scan.projections;
     // Counting N photons leaves the line integral with a standard deviation of 1/√N: 0.0069 in the open beam of
     // 20 890 counts, more behind the object. In units of that the residual must be 1.

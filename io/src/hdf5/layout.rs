@@ -5,18 +5,12 @@ use conefield_core::Result;
 use hdf5_reader::Dataset;
 
 /// What a name in a file refers to.
-pub(super) enum Found {
-    /// A plain data set.
-    Data(Box<Dataset>),
-    /// A scan.
-    Layout(Layout),
-}
-
-/// A scan in a file.
 pub(super) enum Layout {
-    /// Data Exchange: `data`, `data_white`, `data_dark` and `theta` in the group `exchange`.
+    /// A plain data set.
+    Plain(Box<Dataset>),
+    /// A scan of Data Exchange: `data`, `data_white`, `data_dark` and `theta` in the group `exchange`.
     Exchange(String),
-    /// Frames of all kinds in one data set, distinguished by an image key (0 projection, 1 open beam, 2 dark, 3
+    /// A scan with frames of all kinds in one data set, distinguished by an image key (0 projection, 1 open beam, 2 dark, 3
     /// unusable).
     Keyed {
         frames: String,
@@ -41,8 +35,11 @@ const KEYED: &[(&str, &[&str], &[&str])] = &[
 const MOST_GROUPS: usize = 1000;
 
 impl Layout {
-    /// The layout in the group `name`; without a name, the only layout in the file.
+    /// The data set `name`, or the scan in the group `name`; without a name, the only scan in the file.
     pub fn find(file: &Container, name: Option<&str>) -> Result<Self> {
+        if let Some(data) = name.and_then(|n| file.data(n)) {
+            return Ok(Self::Plain(Box::new(data)));
+        }
         let groups = match name {
             Some(group) => vec![group.trim_matches('/').to_owned()],
             None => file.root_groups(),
@@ -76,6 +73,7 @@ impl Layout {
     /// The data set with the frames of `part`, and which of them belong to it.
     pub fn frames(&self, file: &Container, part: ScanPart) -> Result<(Dataset, Option<Vec<bool>>)> {
         match self {
+            Self::Plain(data) => Ok((*data.clone(), None)),
             Self::Exchange(group) => {
                 let name = match part {
                     ScanPart::Projections => "data",
@@ -110,9 +108,10 @@ impl Layout {
         }
     }
 
-    /// The angles of all frames, with the frames' image keys.
+    /// The angles of all frames, with the frames' image keys; the numbers of a plain data set.
     pub fn angles(&self, file: &Container) -> Result<(Dataset, Option<Vec<i64>>)> {
         match self {
+            Self::Plain(data) => Ok((*data.clone(), None)),
             Self::Exchange(group) => Ok((file.needed(&format!("{group}/theta"))?, None)),
             Self::Keyed { angles, .. } => {
                 let data = match angles.iter().find_map(|a| file.data(a)) {

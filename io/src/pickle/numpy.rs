@@ -18,36 +18,32 @@ pub(super) enum Global {
     Encode,
 }
 
+/// The names, as NumPy 1 has them.
+const NAMES: [(&str, Global); 6] = [
+    ("numpy.ndarray", Global::Ndarray),
+    ("numpy.dtype", Global::Dtype),
+    ("numpy.core.multiarray._reconstruct", Global::Reconstruct),
+    ("numpy.core.multiarray.scalar", Global::Scalar),
+    ("numpy.core.numeric._frombuffer", Global::FromBuffer),
+    ("_codecs.encode", Global::Encode),
+];
+
 impl Global {
     pub fn find(module: &str, name: &str) -> Result<Self, Refusal> {
         // NumPy 2 renamed its core.
-        let part = module.strip_prefix("numpy.core.").or_else(|| module.strip_prefix("numpy._core."));
-        match (module, part, name) {
-            ("numpy", _, "ndarray") => Ok(Self::Ndarray),
-            ("numpy", _, "dtype") => Ok(Self::Dtype),
-            (_, Some("multiarray"), "_reconstruct") => Ok(Self::Reconstruct),
-            (_, Some("multiarray"), "scalar") => Ok(Self::Scalar),
-            (_, Some("numeric"), "_frombuffer") => Ok(Self::FromBuffer),
-            ("_codecs", _, "encode") => Ok(Self::Encode),
-            _ => {
-                let shown = |t: &str| t.chars().take(60).flat_map(char::escape_debug).collect::<String>();
-                Err(Refusal::new(
-                    format!("the name {}.{}", shown(module), shown(name)),
-                    "data only: the names that NumPy's arrays, dtypes and numbers need",
-                ))
-            }
-        }
+        let whole = match module.strip_prefix("numpy._core.") {
+            Some(part) => format!("numpy.core.{part}.{name}"),
+            None => format!("{module}.{name}"),
+        };
+        NAMES.iter().find(|(known, _)| *known == whole).map(|(_, global)| *global).ok_or_else(|| {
+            let shown = |t: &str| t.chars().take(60).flat_map(char::escape_debug).collect::<String>();
+            let expected = "data only: the names that NumPy's arrays, dtypes and numbers need";
+            Refusal::new(format!("the name {}.{}", shown(module), shown(name)), expected)
+        })
     }
 
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Reconstruct => "numpy.core.multiarray._reconstruct",
-            Self::Ndarray => "numpy.ndarray",
-            Self::Dtype => "numpy.dtype",
-            Self::Scalar => "numpy.core.multiarray.scalar",
-            Self::FromBuffer => "numpy.core.numeric._frombuffer",
-            Self::Encode => "_codecs.encode",
-        }
+        NAMES.iter().find(|(_, global)| *global == self).map_or("unknown", |(name, _)| name)
     }
 }
 
@@ -96,10 +92,10 @@ impl Dtype {
 pub(super) struct Array<'a> {
     dtype: Dtype,
     /// Lengths in storage order, slowest first.
-    stored: Vec<usize>,
+    pub stored: Vec<usize>,
     /// Axis `k` of the array is axis `axes[k]` of the storage.
-    axes: Vec<usize>,
-    count: usize,
+    pub axes: Vec<usize>,
+    pub count: usize,
     data: Value<'a>,
 }
 
@@ -108,25 +104,9 @@ impl<'a> Array<'a> {
         self.axes.iter().map(|&a| self.stored[a]).collect()
     }
 
-    pub fn stored(&self) -> &[usize] {
-        &self.stored
-    }
-
-    pub fn axes(&self) -> &[usize] {
-        &self.axes
-    }
-
-    pub fn count(&self) -> usize {
-        self.count
-    }
-
-    /// The numbers as `f32`, in storage order; `None` if they do not fit in memory.
-    pub fn floats(&self, heap: &Heap<'a>) -> Option<Vec<f32>> {
-        let mut out = Vec::new();
-        out.try_reserve_exact(self.count).ok()?;
-        let raw = heap.bytes(self.data).unwrap_or_default();
-        self.dtype.number.singles(self.dtype.order, raw, &mut out);
-        Some(out)
+    /// Appends the numbers as `f32`, in storage order.
+    pub fn singles(&self, heap: &Heap<'a>, out: &mut Vec<f32>) {
+        self.dtype.number.singles(self.dtype.order, heap.bytes(self.data).unwrap_or_default(), out);
     }
 
     /// The numbers in storage order.

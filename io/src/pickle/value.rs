@@ -6,8 +6,8 @@
 use super::numpy::{Array, Dtype, Global};
 use crate::memory;
 use conefield_core::finite::stray;
-use conefield_core::{Error, Result, allowance};
-use ndarray::{ArrayD, Dimension, IxDyn};
+use conefield_core::{Error, Result};
+use ndarray::{ArrayD, Dimension};
 
 /// Deeper nesting cannot be a data set.
 const DEEPEST: usize = 32;
@@ -244,7 +244,7 @@ impl<'p, 'a> Item<'p, 'a> {
     pub fn number(&self) -> Result<f64> {
         let x = match self.numeric(self.value) {
             Some(x) => Some(x),
-            None => self.array().filter(|a| a.count() == 1).and_then(|a| a.numbers(&self.pickle.heap).first().copied()),
+            None => self.array().filter(|a| a.count == 1).and_then(|a| a.numbers(&self.pickle.heap).first().copied()),
         };
         match x {
             Some(x) if x.is_finite() => Ok(x),
@@ -262,9 +262,7 @@ impl<'p, 'a> Item<'p, 'a> {
         };
         let numbers = numbers.ok_or_else(|| self.other("a list or an array of numbers"))?;
         match numbers.iter().position(|x| !x.is_finite()) {
-            Some(i) => {
-                Err(Error::invalid(&self.pickle.place, format!("{}[{i}]", self.key()), numbers[i], "a finite number"))
-            }
+            Some(i) => Err(self.invalid_at(format!("{}[{i}]", self.key()), numbers[i], "a finite number")),
             None => Ok(numbers),
         }
     }
@@ -274,7 +272,7 @@ impl<'p, 'a> Item<'p, 'a> {
         let expected = format!("{N} numbers, {axes}");
         let count = match (self.pickle.heap.items(self.value), self.array()) {
             (Some(items), _) => items.len(),
-            (_, Some(a)) => a.count(),
+            (_, Some(a)) => a.count,
             _ => return Err(self.other(expected)),
         };
         if count != N {
@@ -290,16 +288,14 @@ impl<'p, 'a> Item<'p, 'a> {
         if array.shape() != shape {
             return Err(self.other(expected()));
         }
-        allowance::numbers(&self.pickle.place, self.key(), array.count())?;
-        let values = array.floats(&self.pickle.heap);
-        let values = values.ok_or_else(|| self.invalid(format!("{} values", array.count()), "what fits in memory"))?;
-        let values = ArrayD::from_shape_vec(IxDyn(array.stored()), values).map_err(|e| self.invalid(e, expected()))?;
-        let values = values.permuted_axes(IxDyn(array.axes()));
+        let mut values = Vec::new();
+        memory::grow(&mut values, array.count, array.count, &self.pickle.place, self.key())?;
+        array.singles(&self.pickle.heap, &mut values);
+        let values = ArrayD::from_shape_vec(&array.stored[..], values).map_err(|e| self.invalid(e, expected()))?;
+        let values = values.permuted_axes(&array.axes[..]);
         let values = memory::in_order(&self.pickle.place, self.key(), values)?;
         match stray(&values) {
-            Some((at, x)) => {
-                Err(Error::invalid(&self.pickle.place, format!("{}{:?}", self.key(), at.slice()), x, "a finite number"))
-            }
+            Some((at, x)) => Err(self.invalid_at(format!("{}{:?}", self.key(), at.slice()), x, "a finite number")),
             None => Ok(values),
         }
     }

@@ -8,18 +8,16 @@
 //! Distances and the detector's size are fixed: 1000 and 1536 mm, 409.6 mm. The counts of XVI are 65536 less the number
 //! stored, and the open beam is 65536; 0 and 65535 are pixels without a count, which RTK takes for air.
 
+use super::Description;
 use super::keys::Keys;
-use super::vendor::{Open, Response, VendorScan, field_of_view};
+use super::vendor::{Open, Response};
 use crate::folder;
 use crate::input::{Input, LONGEST_TEXT};
 use crate::number::{ByteOrder, Number};
-use crate::rtk::Projection;
 use crate::scan_folder::folder_of;
-use crate::stack::Names;
 use crate::text::{self, read_foreign};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
-use ndarray::Array3;
 use std::path::Path;
 
 /// The type of the file, 0x7000, and the length of its header.
@@ -68,16 +66,14 @@ pub(super) fn shape(path: &Path) -> Result<[usize; 3]> {
     open(path).map(|(shape, _)| shape)
 }
 
-/// The numbers as stored.
-pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
+/// Shape and numbers as stored.
+pub(super) fn read(path: &Path) -> Result<([usize; 3], Vec<f32>)> {
     let (shape, mut input) = open(path)?;
-    let count = shape.iter().product();
-    let values = input.singles("pixels", count, Number::U16, ByteOrder::Little)?;
-    Array3::from_shape_vec(shape, values).map_err(|e| input.invalid("pixels", e, "as many as the header says"))
+    Ok((shape, input.singles("pixels", shape.iter().product(), Number::U16, ByteOrder::Little)?))
 }
 
 /// The scan that `_Frames.xml` at `path` describes.
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
+pub(super) fn scan(path: &Path) -> Result<Description> {
     let text = read_foreign(path, LONGEST_TEXT)?;
     let place = path.display().to_string();
     let document = text::xml(&place, &text, "Elekta's _Frames.xml")?;
@@ -86,32 +82,22 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
     let first = images.first().ok_or_else(|| Error::invalid(&place, "images", "none", "*.his beside the file"))?;
     let [_, rows, columns] = shape(&folder::inside(folder, &place, "images", first)?)?;
     let pixel = [SIDE / rows as f64, SIDE / columns as f64];
-    let (mut views, mut aside) = (Vec::new(), 0.0f64);
+    let mut stands = Vec::new();
     for frame in document.descendants().filter(|n| n.tag_name().name() == "Frame") {
-        let keys = Keys::xml(format!("{place}: frame {}", views.len() + 1), frame);
+        let keys = Keys::below(format!("{place}: frame {}", stands.len() + 1), frame);
         let detector = [-keys.number("UCentre")?, -keys.number("VCentre")?];
-        aside = aside.max(detector[0].abs());
-        let gantry = keys.number("GantryAngle")?;
-        views.push(Projection { sid: SID, sdd: SDD, gantry, detector, ..Projection::default() }.view(pixel, [0.0; 2]));
+        stands.push((keys.number("GantryAngle")?, detector));
     }
     let expected = format!("{}, one for each image (are frames or images missing?)", images.len());
-    ensure(views.len() == images.len(), &place, "frames", views.len(), expected)?;
-    let mut remarks = Vec::new();
-    let at_axis = pixel.map(|x| x * SID / SDD);
-    Ok(VendorScan {
-        volume: field_of_view(&place, [rows, columns], at_axis, aside * SID / SDD, &mut remarks)?,
-        views,
-        detector: [rows, columns],
-        projections: Names::Many(images),
-        open: Open::Number(I0.into()),
-        response: Response::Inverted,
-        remarks,
-    })
+    ensure(stands.len() == images.len(), &place, "frames", stands.len(), expected)?;
+    let (size, open) = ([rows, columns], Open::Number(I0.into()));
+    let scan = Description::on_gantry(&place, images, open, [SID, SDD], size, pixel, &stands, vec![])?;
+    Ok(Description { response: Response::Inverted, ..scan })
 }
 
 #[cfg(test)]
 mod tests {
-    use crate::testing::{is_view, read_scan, read_scanner, says_just};
+    use crate::testing::{damage_is_refused, is_integral, is_view, read_scan, read_scanner, replaced, says_just};
     use std::fmt::Write;
     use std::fs;
     use std::path::PathBuf;
@@ -132,12 +118,12 @@ mod tests {
         words.into_iter().chain(pixels).flat_map(u16::to_le_bytes).collect()
     }
 
-    fn written(frames: &[(f64, f64, f64)]) -> (tempfile::TempDir, PathBuf) {
+    fn written() -> (tempfile::TempDir, PathBuf) {
         let dir = tempfile::tempdir().unwrap();
         let mut text =
             "\u{feff}<?xml version=\"1.0\" encoding=\"utf-8\"?>\n<ProjectionSet><Image><kV>120</kV></Image><Frames>\n"
                 .to_owned();
-        for (i, (angle, u, v)) in frames.iter().enumerate() {
+        for (i, (angle, u, v)) in FRAMES.iter().enumerate() {
             fs::write(dir.path().join(format!("{:05}.1.3.46.his", i + 1)), image(i)).unwrap();
             writeln!(
                 text,
@@ -155,13 +141,12 @@ mod tests {
 
     #[test]
     fn a_scan_of_xvi_is_read() {
-        let (_dir, path) = written(&FRAMES);
+        let (_dir, path) = written();
         let scan = read_scan(&path).unwrap();
         assert_eq!(scan.projections.dim(), (3, 8, 8));
         for (i, row, column) in [(0, 1, 0), (1, 7, 3), (2, 2, 6)] {
-            let want = (65536.0 / (65536.0 - f64::from(pixel(i, row, column)))).ln();
-            let found = f64::from(scan.projections[[i, row, column]]);
-            assert!((found - want).abs() < 1e-5, "{i} {row} {column}: {found} {want}");
+            let counts = 65536.0 - f64::from(pixel(i, row, column));
+            is_integral(&scan, [i, row, column], (65536.0 / counts).ln());
         }
         // 0 is a pixel without a count: air.
         assert!(scan.projections[[0, 0, 0]].abs() < 1e-4);
@@ -173,30 +158,16 @@ mod tests {
         is_view(&views[2], [[0.0, -1000.0, 0.0], [-115.5, 536.0, 0.0], [p, 0.0, 0.0], [0.0, 0.0, p]]);
         // 409.6 and twice 115.5 mm wide, seen at the axis with pixels of 33.3 mm.
         assert_eq!(scan.geometry.volume.shape, [13, 13, 8]);
-        assert_eq!(crate::scan_size(&path).unwrap().pixels, 192);
     }
 
     #[test]
     fn hostile_files_are_refused_in_words() {
-        let refused = |change: &dyn Fn(&mut Vec<u8>), words: &str| {
-            let (dir, path) = written(&FRAMES);
-            let file = dir.path().join("00001.1.3.46.his");
-            let mut bytes = fs::read(&file).unwrap();
-            change(&mut bytes);
-            fs::write(&file, bytes).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), &format!("00001.1.3.46.his: {words}"));
-        };
+        let (dir, path) = written();
+        let refused =
+            |change: &dyn Fn(&mut Vec<u8>), words: &str| damage_is_refused(&path, "00001.1.3.46.his", change, words);
         let set = |at: usize, x: u16| move |b: &mut Vec<u8>| b[at..at + 2].copy_from_slice(&x.to_le_bytes());
         refused(&|b| b.truncate(60), "header: found the end of the file after 60 bytes, expected 68 bytes");
         refused(&set(0, 0x7100), "format: found [00, 71, 44, 00] at the start, expected 00 70 44 00");
-        refused(
-            &|b| b.truncate(200),
-            "pixels: found 100 bytes of data in the file, expected 128 bytes (64 values of 2 bytes, as the header says)",
-        );
-        refused(
-            &|b| b.push(0),
-            "pixels: found 129 bytes of data in the file, expected 128 bytes (64 values of 2 bytes, as the header says)",
-        );
         refused(&set(16, 0), "columns: found 1 to 0, expected a last one after the first");
         refused(
             &set(16, 65535),
@@ -210,30 +181,20 @@ mod tests {
             "header of the image: found the end of the file after 160 bytes, expected 60000 bytes",
         );
         for (from, to, words) in [
-            ("<UCentre>114</UCentre>", "", "_Frames.xml: frame 2: UCentre: found nothing, expected a number"),
-            (
-                "<GantryAngle>90<",
-                "<GantryAngle>NaN<",
-                "_Frames.xml: frame 2: GantryAngle: found \"NaN\", expected a number",
-            ),
+            ("<UCentre>114</UCentre>", "", "frame 2: UCentre: found nothing, expected a number"),
+            ("<GantryAngle>90<", "<GantryAngle>NaN<", "frame 2: GantryAngle: found \"NaN\", expected a number"),
             (
                 "</Frames>",
                 "<Frame><GantryAngle>1</GantryAngle><UCentre>0</UCentre><VCentre>0</VCentre></Frame></Frames>",
-                "_Frames.xml: frames: found 4, expected 3, one for each image (are frames or images missing?)",
+                "frames: found 4, expected 3, one for each image (are frames or images missing?)",
             ),
         ] {
-            let (dir, path) = written(&FRAMES);
-            let text = fs::read_to_string(&path).unwrap();
-            assert!(text.contains(from), "{from}");
-            fs::write(&path, text.replace(from, to)).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), words);
+            damage_is_refused(&path, "_Frames.xml", &replaced(from, to), words);
         }
-        let (dir, path) = written(&[(0.0, 0.0, 0.0)]);
-        fs::remove_file(dir.path().join("00001.1.3.46.his")).unwrap();
-        says_just(
-            read_scanner(&path, None),
-            dir.path(),
-            "_Frames.xml: images: found none, expected *.his beside the file",
-        );
+        for i in 1..=3 {
+            fs::remove_file(dir.path().join(format!("{i:05}.1.3.46.his"))).unwrap();
+        }
+        let words = "_Frames.xml: images: found none, expected *.his beside the file";
+        says_just(read_scanner(&path, None), dir.path(), words);
     }
 }

@@ -1,9 +1,11 @@
 //! Keys and values of vendors' texts: INI files and the leaves of XML elements.
 
-use crate::text::shortened;
+use crate::input::LONGEST_TEXT;
+use crate::text::{self, read_foreign, shortened};
 use conefield_core::{Error, Result};
 use roxmltree::Node;
 use std::collections::HashMap;
+use std::path::Path;
 
 /// The keys of all sections or elements of a text, in small and capital letters alike, with the file's name.
 pub(super) struct Keys {
@@ -13,10 +15,11 @@ pub(super) struct Keys {
 }
 
 impl Keys {
-    /// The lines `key=value` of `text`. A second value of one of the `known` keys is an error; of the others, which
-    /// later sections may use for other devices, the first one counts.
-    pub fn ini(place: String, text: &str, known: &[&str]) -> Result<Self> {
-        let mut keys = Self { place, all: HashMap::new() };
+    /// The lines `key=value` of the file `path`. A second value of one of the `known` keys is an error; of the others,
+    /// which later sections may use for other devices, the first one counts.
+    pub fn ini(path: &Path, known: &[&str]) -> Result<Self> {
+        let text = read_foreign(path, LONGEST_TEXT)?;
+        let mut keys = Self { place: path.display().to_string(), all: HashMap::new() };
         for (i, line) in text.lines().enumerate() {
             let Some((key, value)) = line.split_once('=') else { continue };
             let (key, value) = (key.trim(), value.trim());
@@ -29,8 +32,16 @@ impl Keys {
         Ok(keys)
     }
 
+    /// The elements of the XML in the file `path`, in which `expected` should be; see [`Self::below`].
+    pub fn xml(path: &Path, expected: &str) -> Result<Self> {
+        let text = read_foreign(path, LONGEST_TEXT)?;
+        let place = path.display().to_string();
+        let document = text::xml(&place, &text, expected)?;
+        Ok(Self::below(place, document.root_element()))
+    }
+
     /// The elements below `node` that hold text only; of elements with one name the first counts.
-    pub fn xml(place: String, node: Node) -> Self {
+    pub fn below(place: String, node: Node) -> Self {
         let mut keys = Self { place, all: HashMap::new() };
         for leaf in node.descendants().filter(|n| n.is_element() && !n.children().any(|c| c.is_element())) {
             keys.add(leaf.tag_name().name(), leaf.text().unwrap_or_default().trim());

@@ -9,19 +9,15 @@
 //! the shifts are RTK's own: columns run along its x, rows up. The image says nothing of the open beam; RTK's number for
 //! this detector is taken.
 
-use super::differences;
 use super::keys::Keys;
-use super::vendor::{Open, Response, VendorScan, field_of_view};
+use super::vendor::Open;
+use super::{Description, differences};
 use crate::folder;
-use crate::input::{Input, LONGEST_TEXT};
+use crate::input::Input;
 use crate::number::{ByteOrder, Number};
-use crate::rtk::Projection;
 use crate::scan_folder::folder_of;
-use crate::stack::Names;
-use crate::text::{self, read_foreign};
+use conefield_core::Result;
 use conefield_core::error::ensure;
-use conefield_core::{Error, Result};
-use ndarray::Array3;
 use std::path::Path;
 
 /// The start of both formats, and of others that are not read.
@@ -88,38 +84,29 @@ pub(super) fn head(path: &Path) -> Result<Head> {
     open(path).map(|(head, _)| head)
 }
 
-/// The image `path`.
-pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
+/// Shape and numbers of the image `path`.
+pub(super) fn read(path: &Path) -> Result<([usize; 3], Vec<f32>)> {
     let (Head { size: [rows, columns], compressed, .. }, mut input) = open(path)?;
-    let place = input.place();
-    let values = if compressed {
-        input.skip((HND_HEADER - HNC_HEADER) as u64, "header")?;
-        let left = usize::try_from(input.left().unwrap_or(0)).unwrap_or(usize::MAX);
-        let table = rows.saturating_sub(1).saturating_mul(columns) / 4;
-        let expected = format!("at most the {left} left in the file");
-        ensure(
-            table <= left,
-            &place,
-            "lookup table",
-            format!("{table} bytes, for {rows} x {columns} pixels"),
-            expected,
-        )?;
-        let codes = input.exactly(table, "lookup table")?;
-        let packed = input.exactly(left - table, "pixels")?;
-        differences::unpack(&place, [rows, columns], &codes, &packed)?
-    } else {
-        input.singles("pixels", rows.saturating_mul(columns), Number::U16, ByteOrder::Little)?
-    };
-    Array3::from_shape_vec((1, rows, columns), values)
-        .map_err(|e| Error::invalid(place, "pixels", e, "as many as rows and columns say"))
+    let shape = [1, rows, columns];
+    if !compressed {
+        let count = rows.saturating_mul(columns);
+        return Ok((shape, input.singles("pixels", count, Number::U16, ByteOrder::Little)?));
+    }
+    input.skip((HND_HEADER - HNC_HEADER) as u64, "header")?;
+    let left = usize::try_from(input.left().unwrap_or(0)).unwrap_or(usize::MAX);
+    let table = rows.saturating_sub(1).saturating_mul(columns) / 4;
+    let (found, expected) =
+        (format!("{table} bytes, for {rows} x {columns} pixels"), format!("at most the {left} left in the file"));
+    ensure(table <= left, &input.place(), "lookup table", found, expected)?;
+    let codes = input.exactly(table, "lookup table")?;
+    let packed = input.exactly(left - table, "pixels")?;
+    Ok((shape, differences::unpack(&input.place(), [rows, columns], &codes, &packed)?))
 }
 
 /// The scan that the text `path` describes.
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
-    let text = read_foreign(path, LONGEST_TEXT)?;
-    let place = path.display().to_string();
-    let document = text::xml(&place, &text, "Varian's ProjectionInfo.xml")?;
-    let keys = Keys::xml(place.clone(), document.root_element());
+pub(super) fn scan(path: &Path) -> Result<Description> {
+    let keys = Keys::xml(path, "Varian's ProjectionInfo.xml")?;
+    let place = keys.place();
     let [sid, sdd] = [keys.length("CalibratedSAD")?, keys.length("CalibratedSID")?];
     let half = match keys.text("FanType") {
         Some(fan) if fan.eq_ignore_ascii_case("HalfFan") => keys.number("DetectorPosLat")?,
@@ -130,34 +117,23 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
     let folder = folder_of(path);
     let images = folder::below(folder, DEPTH, &["hnd", "hnc"])?;
     let heads: Vec<Head> =
-        images.iter().map(|n| head(&folder::inside(folder, &place, "images", n)?)).collect::<Result<_>>()?;
+        images.iter().map(|n| head(&folder::inside(folder, place, "images", n)?)).collect::<Result<_>>()?;
     let expected = "*.hnd or *.hnc beside the file or in a folder there";
-    let first = heads.first().ok_or_else(|| Error::invalid(&place, "images", "none", expected))?;
+    let first = heads.first().ok_or_else(|| keys.invalid("images", "none", expected))?;
     for (field, x) in [("pixel height", first.pixel[0]), ("pixel width", first.pixel[1])] {
         ensure(x > 0.0, &images[0], field, x, "a length above 0")?;
     }
-    let view = |h: &Head| {
-        Projection { sid, sdd, gantry: h.angle, detector, ..Projection::default() }.view(first.pixel, [0.0; 2])
-    };
-    let at_axis = first.pixel.map(|x| x * sid / sdd);
-    let mut remarks =
-        vec![format!("the files do not state the open beam; {I0} counts are taken, as RTK does (--i0 sets others)")];
-    Ok(VendorScan {
-        views: heads.iter().map(view).collect(),
-        detector: first.size,
-        open: Open::Number(I0),
-        response: Response::Counts,
-        volume: field_of_view(&place, first.size, at_axis, detector[0] * sid / sdd, &mut remarks)?,
-        projections: Names::Many(images),
-        remarks,
-    })
+    let stands: Vec<_> = heads.iter().map(|h| (h.angle, detector)).collect();
+    let remark = format!("the files do not state the open beam; {I0} counts are taken, as RTK does (--i0 sets others)");
+    let (open, size, pixel) = (Open::Number(I0), first.size, first.pixel);
+    Description::on_gantry(place, images, open, [sid, sdd], size, pixel, &stands, vec![remark])
 }
 
 #[cfg(test)]
 mod tests {
     use super::differences::tests::pack;
     use super::*;
-    use crate::testing::{is_view, read_scan, read_scanner, says_just};
+    use crate::testing::{damage_is_refused, is_integral, is_view, read_scan, read_scanner, replaced, says_just};
     use std::fs;
     use std::path::PathBuf;
 
@@ -214,17 +190,14 @@ mod tests {
             let scan = read_scan(&path).unwrap();
             assert_eq!(scan.projections.dim(), (3, 5, 4));
             for (i, row, column) in [(0, 0, 0), (1, 4, 3), (2, 2, 3), (2, 3, 1)] {
-                let want = (139_000.0 / f64::from(pixel(i, row, column))).ln();
                 // The file's first row is the lowest.
-                let found = f64::from(scan.projections[[i, 4 - row, column]]);
-                assert!((found - want).abs() < 1e-6, "{i} {row} {column}: {found} {want}");
+                is_integral(&scan, [i, 4 - row, column], (139_000.0 / f64::from(pixel(i, row, column))).ln());
             }
             // Half fan: 1.5 - 148.5 mm along u; 2 mm down.
             let views = &scan.geometry.views;
             is_view(&views[0], [[1000.0, 0.0, 0.0], [-500.0, -147.0, -2.0], [0.0, 0.4, 0.0], [0.0, 0.0, -0.5]]);
             is_view(&views[1], [[0.0, 1000.0, 0.0], [147.0, -500.0, -2.0], [-0.4, 0.0, 0.0], [0.0, 0.0, -0.5]]);
             is_view(&views[2], [[0.0, -1000.0, 0.0], [-147.0, 500.0, -2.0], [0.4, 0.0, 0.0], [0.0, 0.0, -0.5]]);
-            assert_eq!(crate::scan_size(&path).unwrap().pixels, 60);
             fs::write(&path, INFO.replace("HalfFan", "FullFan")).unwrap();
             let full = &read_scan(&path).unwrap().geometry;
             is_view(&full.views[0], [[1000.0, 0.0, 0.0], [-500.0, 1.5, -2.0], [0.0, 0.4, 0.0], [0.0, 0.0, -0.5]]);
@@ -234,48 +207,28 @@ mod tests {
 
     #[test]
     fn hostile_files_are_refused_in_words() {
-        let refused = |compressed: bool, change: &dyn Fn(&mut Vec<u8>), words: &str| {
-            let (dir, path) = written(compressed);
-            let name = if compressed { "Scan0/Proj_00001.hnd" } else { "Scan0/Proj_00001.hnc" };
-            let mut bytes = fs::read(dir.path().join(name)).unwrap();
-            change(&mut bytes);
-            fs::write(dir.path().join(name), bytes).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), &format!("{name}: {words}"));
+        let [(dir, hnd), (_dir, hnc)] = [true, false].map(written);
+        let refused = |change: &dyn Fn(&mut Vec<u8>), words: &str| {
+            damage_is_refused(&hnd, "Scan0/Proj_00001.hnd", change, words);
         };
         let set = |at: usize, x: u32| move |b: &mut Vec<u8>| b[at..at + 4].copy_from_slice(&x.to_le_bytes());
-        for compressed in [true, false] {
-            refused(
-                compressed,
-                &|b| b.truncate(100),
-                "header: found the end of the file after 100 bytes, expected 512 bytes",
-            );
-            refused(
-                compressed,
-                &|b| b[19..22].copy_from_slice(b"HNA"),
-                "format: found VARIAN_VA_INTERNAL_HNA_1.0, expected VARIAN_VA_INTERNAL_HND or VARIAN_VA_INTERNAL_HNC",
-            );
-            let angle = |b: &mut Vec<u8>| b[ANGLE..ANGLE + 8].copy_from_slice(&f64::INFINITY.to_le_bytes());
-            refused(compressed, &angle, "projection angle: found inf, expected a number");
-        }
+        refused(&|b| b.truncate(100), "header: found the end of the file after 100 bytes, expected 512 bytes");
         refused(
-            true,
+            &|b| b[19..22].copy_from_slice(b"HNA"),
+            "format: found VARIAN_VA_INTERNAL_HNA_1.0, expected VARIAN_VA_INTERNAL_HND or VARIAN_VA_INTERNAL_HNC",
+        );
+        let angle = |b: &mut Vec<u8>| b[ANGLE..ANGLE + 8].copy_from_slice(&f64::INFINITY.to_le_bytes());
+        refused(&angle, "projection angle: found inf, expected a number");
+        refused(
             &set(ROWS, u32::MAX),
             "lookup table: found 4294967294 bytes, for 4294967295 x 4 pixels, expected at most the 51 left in the file",
         );
-        refused(true, &set(ROWS, 1), "size: found 1 x 4 pixels, expected at least two rows of a pixel");
-        refused(true, &set(ROWS, 6), "pixels: found the end after 19 of 24, expected a difference for each");
-        refused(true, &|b| b.truncate(1030), "pixels: found 2 bytes, expected at least 35 for 5 x 4 pixels");
-        refused(
-            false,
-            &set(COLUMNS, 5),
-            "pixels: found 40 bytes of data in the file, expected 50 bytes (25 values of 2 bytes, as the header says)",
-        );
-        refused(
-            false,
-            &set(COLUMNS, u32::MAX),
-            "pixels: found 40 bytes of data in the file, expected 42949672950 bytes (21474836475 values of 2 bytes, as the \
-             header says)",
-        );
+        refused(&set(ROWS, 1), "size: found 1 x 4 pixels, expected at least two rows of a pixel");
+        refused(&set(ROWS, 6), "pixels: found the end after 19 of 24, expected a difference for each");
+        refused(&|b| b.truncate(1030), "pixels: found 2 bytes, expected at least 35 for 5 x 4 pixels");
+        let words = "pixels: found 40 bytes of data in the file, expected 42949672950 bytes (21474836475 values of 2 bytes, \
+                     as the header says)";
+        damage_is_refused(&hnc, "Scan0/Proj_00001.hnc", &set(COLUMNS, u32::MAX), words);
         for (from, to, words) in [
             (
                 "<CalibratedSAD>1000.0</CalibratedSAD>",
@@ -291,15 +244,11 @@ mod tests {
                 "XML: found the root node was opened but never closed, expected Varian's ProjectionInfo.xml",
             ),
         ] {
-            assert!(INFO.contains(from), "{from}");
-            let (dir, path) = written(true);
-            fs::write(&path, INFO.replace(from, to)).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), &format!("ProjectionInfo.xml: {words}"));
+            damage_is_refused(&hnd, "ProjectionInfo.xml", &replaced(from, to), words);
         }
-        let (dir, path) = written(true);
         fs::remove_dir_all(dir.path().join("Scan0")).unwrap();
         let words =
             "ProjectionInfo.xml: images: found none, expected *.hnd or *.hnc beside the file or in a folder there";
-        says_just(read_scanner(&path, None), dir.path(), words);
+        says_just(read_scanner(&hnd, None), dir.path(), words);
     }
 }

@@ -2,7 +2,7 @@
 
 use super::{his, obi, txrm, xim};
 use crate::hdf5::ScanPart;
-use conefield_core::Result;
+use conefield_core::{Error, Result};
 use ndarray::Array3;
 use std::path::Path;
 
@@ -40,11 +40,13 @@ impl Pixels {
 
     /// The numbers of `part`, `[view, row, column]`; a file without parts holds projections or a field of its own.
     pub fn read(self, path: &Path, part: ScanPart) -> Result<Array3<f32>> {
-        match self {
-            Self::Xim => xim::read(path),
-            Self::Obi => obi::read(path),
-            Self::His => his::read(path),
-            Self::Txrm => txrm::read(path, part),
-        }
+        let (shape, values) = match self {
+            Self::Xim => xim::read(path)?,
+            Self::Obi => obi::read(path)?,
+            Self::His => his::read(path)?,
+            Self::Txrm => return txrm::read(path, part),
+        };
+        Array3::from_shape_vec(shape, values)
+            .map_err(|e| Error::invalid(path.display().to_string(), "pixels", e, "as many as the header says"))
     }
 }

@@ -13,13 +13,13 @@
 //!
 //! `Reference Intensity` is the count to which the scanner scales its open beam (`Flat Field Correction=ON`).
 
+use super::Description;
 use super::keys::Keys;
-use super::vendor::{MOST_PIXELS, MOST_VIEWS, Open, Response, VendorScan, field_of_view};
+use super::vendor::{MOST_PIXELS, MOST_VIEWS, Open, field_of_view};
 use crate::folder;
-use crate::input::LONGEST_TEXT;
 use crate::scan_folder::folder_of;
 use crate::stack::Names;
-use crate::text::{read_foreign, shortened, unread};
+use crate::text::{shortened, unread};
 use conefield_core::orbit::CircularOrbit;
 use conefield_core::{Error, Result};
 use std::path::Path;
@@ -50,9 +50,8 @@ const KNOWN: &[&str] = &[
     FILES, ROWS, COLUMNS, PIXEL, OBJECT, CAMERA, STEP, DIRECTION, AXIS, POSTALIGNMENT, REFERENCE, TRAJECTORY, POSITIONS,
 ];
 
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
-    let text = read_foreign(path, LONGEST_TEXT)?;
-    let keys = Keys::ini(path.display().to_string(), &text, KNOWN)?;
+pub(super) fn scan(path: &Path) -> Result<Description> {
+    let keys = Keys::ini(path, KNOWN)?;
     if let Some(found) = keys.text(TRAJECTORY).filter(|t| !t.eq_ignore_ascii_case("round")) {
         let what = format!("{}: {TRAJECTORY} {}", keys.place(), shortened(found));
         return Err(Error::unsupported(what, "only circles are read (ROUND)"));
@@ -89,15 +88,10 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
         Some(_) => Open::Number(keys.length(REFERENCE)?),
         None => Open::Air,
     };
-    Ok(VendorScan {
-        views: CircularOrbit { dso, dsd, pixel: [pixel; 2], offset, angles }.views(),
-        detector: [rows, columns],
-        projections,
-        open,
-        response: Response::Counts,
-        volume: field_of_view(keys.place(), [rows, columns], [at_axis; 2], offset[1] * dso / dsd, &mut remarks)?,
-        remarks,
-    })
+    let views = CircularOrbit { dso, dsd, pixel: [pixel; 2], offset, angles }.views();
+    let aside = offset[1] * dso / dsd;
+    let volume = field_of_view(keys.place(), [rows, columns], [at_axis; 2], aside, &mut remarks)?;
+    Ok(Description::of_vendor(projections, open, views, [rows, columns], volume, remarks))
 }
 
 /// The images, numbered from 0, before the first that completes a turn, and their number. They begin with the prefix in
@@ -131,7 +125,9 @@ fn projections(keys: &Keys, path: &Path, step: f64, remarks: &mut Vec<String>) -
 
 #[cfg(test)]
 mod tests {
-    use crate::testing::{is_view, read_scan, read_scanner, says_just, tiff16};
+    use crate::testing::{
+        damage_is_refused, is_integral, is_view, read_scan, read_scanner, replaced, says, says_just, tiff16,
+    };
     use conefield_core::orbit::CircularOrbit;
     use std::fs;
     use std::path::PathBuf;
@@ -165,8 +161,7 @@ mod tests {
         let scan = read_scan(&path).unwrap();
         assert_eq!(scan.projections.dim(), (4, 4, 6));
         for (i, row, column) in [(0, 0, 0), (3, 1, 5), (2, 3, 2)] {
-            let want = (60_000.0 / f32::from(count(i, row, column))).ln();
-            assert!((scan.projections[[i, row, column]] - want).abs() < 1e-6, "{i} {row} {column}");
+            is_integral(&scan, [i, row, column], (60_000.0 / f64::from(count(i, row, column))).ln());
         }
         // The pixel is 0.04 mm on the detector; its middle, row 2, is one row below the optical axis.
         let views = &scan.geometry.views;
@@ -175,7 +170,6 @@ mod tests {
         // Shifted by 1.5 pixels, the views see a disc that is 3 pixels wider.
         let grid = scan.geometry.volume;
         assert_eq!((grid.shape, grid.spacing), ([9, 9, 4], [0.01; 3]));
-        assert_eq!(crate::scan_size(&path).unwrap().pixels, 96);
     }
 
     #[test]
@@ -198,64 +192,53 @@ mod tests {
 
     #[test]
     fn what_is_missing_or_wrong_is_named() {
+        let (dir, path) = written(TEXT);
         for (from, to, words) in [
-            (
-                "Camera to Source (mm)=200.0",
-                "",
-                "bone_~00.log: Camera to Source (mm): found nothing, expected a number",
-            ),
+            ("Camera to Source (mm)=200.0", "", "Camera to Source (mm): found nothing, expected a number"),
             (
                 "Camera to Source (mm)=200.0",
                 "Camera to Source (mm)=20",
-                "bone_~00.log: Camera to Source (mm): found 20, expected more than the 50 of Object to Source (mm)",
+                "Camera to Source (mm): found 20, expected more than the 50 of Object to Source (mm)",
             ),
-            ("(um)=10.0", "(um)=NaN", "bone_~00.log: Image Pixel Size (um): found \"NaN\", expected a number"),
-            ("(deg)=90.0", "(deg)=-1", "bone_~00.log: Rotation Step (deg): found -1, expected a number above 0"),
-            ("=CC", "=left", "bone_~00.log: Rotation Direction: found \"left\", expected CC or CW"),
-            ("=ROUND", "=HELICAL", "bone_~00.log: Scanning Trajectory \"HELICAL\": only circles are read (ROUND)"),
+            ("(um)=10.0", "(um)=NaN", "Image Pixel Size (um): found \"NaN\", expected a number"),
+            ("(deg)=90.0", "(deg)=-1", "Rotation Step (deg): found -1, expected a number above 0"),
+            ("=CC", "=left", "Rotation Direction: found \"left\", expected CC or CW"),
+            ("=ROUND", "=HELICAL", "Scanning Trajectory \"HELICAL\": only circles are read (ROUND)"),
             (
                 "=ROUND",
                 "=ROUND\r\nNumber Of Horizontal Offset Positions=2",
-                "bone_~00.log: Number Of Horizontal Offset Positions above 1: join the images of the camera's positions \
+                "Number Of Horizontal Offset Positions above 1: join the images of the camera's positions \
                  to one scan first",
             ),
             (
                 "Files=  5",
                 "Files=  1e15",
-                "bone_~00.log: Number of Files: found 1000000000000000, expected a whole number from 1 to 1000000",
+                "Number of Files: found 1000000000000000, expected a whole number from 1 to 1000000",
             ),
             (
                 "Rows= 4",
                 "Rows= 3",
-                "bone_~00.log: files.projections: found 4 x 6, expected 3 x 6 (rows x columns), as the detector has",
+                "files.projections: found 4 x 6, expected 3 x 6 (rows x columns), as the detector has",
             ),
             (
                 "(mm)=50.000",
                 "(mm)=50\r\nObject to Source (mm)=60",
-                "bone_~00.log: line 11: Object to Source (mm): found a second value, 60, expected one value",
+                "line 11: Object to Source (mm): found a second value, 60, expected one value",
             ),
         ] {
-            assert!(TEXT.contains(from), "{from}");
-            let (dir, path) = written(&TEXT.replace(from, to));
-            says_just(read_scanner(&path, None), dir.path(), words);
+            damage_is_refused(&path, "bone_~00.log", &replaced(from, to), words);
         }
         let text = TEXT.replace("=ROUND", "=ROUND\r\nImage crop origin X=0\r\nImage Rotation=-0.0380");
-        let (_dir, path) = written(&text);
+        fs::write(&path, text).unwrap();
         let found = super::scan(&path).unwrap().remarks;
         assert_eq!(found[0], "not read, though they may change the geometry: Image Rotation = -0.0380");
         assert_eq!(found[1], "images that repeat a full turn are not read: 1");
-        let (dir, path) = written(TEXT);
+        fs::write(&path, TEXT).unwrap();
         fs::remove_file(dir.path().join("bone_~0000000002.tif")).unwrap();
         let words = "bone_~00.log: images: found none, expected image 2 of the 4, such as bone_~0000000002.tif";
         says_just(read_scanner(&path, None), dir.path(), words);
         // Another program's log is no scan.
         fs::write(&path, "Object to Source=5").unwrap();
-        says_just(
-            read_scan(&path),
-            dir.path(),
-            "bone_~00.log: scan: found a file of another kind, expected a folder with scan.toml or scan.json (conefield), \
-             scanner.toml (a scanner's images) or meta_data.json (R2-Gaussian), a pickle (NAF) or a vendor's file \
-             (.xtekct, .log, .xml, .txrm)",
-        );
+        says(read_scan(&path), &["bone_~00.log: scan", "a file of another kind"]);
     }
 }

@@ -55,11 +55,8 @@ fn tip(d: Vec3, p: Vec3) -> Vec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::is_view;
     use conefield_core::geometry::{Millimetres, Radians};
-
-    fn near(a: Vec3, b: Vec3) {
-        assert!((0..3).all(|k| (a[k] - b[k]).abs() < 1e-9), "{a:?} {b:?}");
-    }
 
     #[test]
     fn an_upright_axis_gives_a_circle_and_a_tipped_one_keeps_lengths() {
@@ -76,16 +73,13 @@ mod tests {
             // The source starts at -90 degrees.
             let angle = Radians(f64::to_radians(turn - 90.0));
             let want = View::circular(angle, mm(500.0), mm(800.0), [mm(1.5), mm(2.0)], [mm(0.0), mm(0.0)]);
-            near(view.source, want.source);
-            near(view.detector, want.detector);
-            near(view.u, want.u);
-            near(view.v, want.v);
+            is_view(&view, [want.source, want.detector, want.u, want.v]);
         }
         for direction in [[0.1, -0.2, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]] {
             let axis = [3.0, 1.0, -2.0];
             let tipped = TurningObject { axis, axis_direction: direction, ..rest };
             let d = direction.map(|x| x / norm(direction));
-            near(tip(d, d), [0.0, 0.0, 1.0]);
+            assert!(norm(sub(tip(d, d), [0.0, 0.0, 1.0])) < 1e-9);
             let view = tipped.views([40.0].into_iter())[0];
             // Lengths, and the distance from the axis to the central ray, do not change.
             let away = |p: Vec3, q: Vec3| norm(sub(p, q));

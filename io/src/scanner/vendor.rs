@@ -1,8 +1,9 @@
 //! The files with which vendors describe a scan, and what they give in common: views, the names of the images, the open
-//! beam and a volume.
+//! beam and a volume, as a [`Description`].
 
 use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, his, obi, skyscan, txrm, xim, xtekct};
 use crate::input::LONGEST_TEXT;
+use crate::rtk::Projection;
 use crate::stack::Names;
 use crate::text::read_foreign;
 use conefield_core::Result;
@@ -10,8 +11,9 @@ use conefield_core::geometry::{View, VoxelGrid};
 use ndarray::{Array3, Axis};
 use std::path::Path;
 
-/// Most views of a description: a circle in steps of about one second of arc.
-pub(super) const MOST_VIEWS: usize = 1_000_000;
+/// Most views of a description: a circle in steps of about one second of arc. A larger number is a typing error and
+/// would only fill memory.
+pub(crate) const MOST_VIEWS: usize = 1_000_000;
 
 /// Most rows or columns of a detector.
 pub(super) const MOST_PIXELS: usize = 1_000_000;
@@ -20,61 +22,33 @@ pub(super) const MOST_PIXELS: usize = 1_000_000;
 /// may not fit in memory.
 const MOST_VOXELS: f64 = 512.0;
 
-/// A vendor's description of a scan.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Vendor {
-    Nikon,
-    SkyScan,
-    /// Varian's XIM.
-    TrueBeam,
-    /// Varian's HND and HNC.
-    Obi,
-    Elekta,
-    Zeiss,
+/// What reads a vendor's description of a scan, in the terms of `scanner.toml`.
+type Reader = fn(&Path) -> Result<Description>;
+
+/// The vendors' descriptions by extension, with words that only such a file holds where others use the extension too.
+const READERS: [(&str, &str, Reader); 6] = [
+    ("xtekct", "", xtekct::scan),
+    ("txrm", "", txrm::scan),
+    ("log", skyscan::MARK, skyscan::scan),
+    ("xml", xim::MARK, xim::scan),
+    ("xml", obi::MARK, obi::scan),
+    ("xml", his::MARK, his::scan),
+];
+
+/// The reader of the vendor that describes a scan in the file `path`.
+pub(super) fn reader(path: &Path) -> Option<Reader> {
+    let extension = path.extension()?.to_string_lossy().to_lowercase();
+    let mut readers = READERS.iter().filter(|(end, ..)| *end == extension).peekable();
+    let text = match readers.peek()? {
+        (_, "", _) => String::new(),
+        _ => read_foreign(path, LONGEST_TEXT).ok()?,
+    };
+    readers.find(|(_, mark, _)| text.contains(mark)).map(|(.., reader)| *reader)
 }
 
-impl Vendor {
-    /// The vendor that describes a scan in the file `path`, by its extension and, where others use that too, by words
-    /// in it.
-    pub fn of(path: &Path) -> Option<Self> {
-        let extension = path.extension()?.to_string_lossy().to_lowercase();
-        let marks: &[(&str, Self)] = match &extension[..] {
-            "xtekct" => return Some(Self::Nikon),
-            "txrm" => return Some(Self::Zeiss),
-            "log" => &[(skyscan::MARK, Self::SkyScan)],
-            "xml" => &[(xim::MARK, Self::TrueBeam), (obi::MARK, Self::Obi), (his::MARK, Self::Elekta)],
-            _ => return None,
-        };
-        let text = read_foreign(path, LONGEST_TEXT).ok()?;
-        marks.iter().find(|(words, _)| text.contains(words)).map(|(_, vendor)| *vendor)
-    }
-
-    /// The scan as a description in the terms of `scanner.toml`.
-    pub(super) fn description(self, path: &Path) -> Result<Description> {
-        match self {
-            Self::Nikon => xtekct::scan(path),
-            Self::SkyScan => skyscan::scan(path),
-            Self::TrueBeam => xim::scan(path),
-            Self::Obi => obi::scan(path),
-            Self::Elekta => his::scan(path),
-            Self::Zeiss => txrm::scan(path),
-        }
-        .map(Description::from)
-    }
-}
-
-/// What a vendor's files say of a scan.
-pub(super) struct VendorScan {
-    /// One for each image.
-    pub views: Vec<View>,
-    /// Rows and columns of the detector.
-    pub detector: [usize; 2],
-    pub projections: Names,
-    pub open: Open,
-    pub response: Response,
-    pub volume: VoxelGrid,
-    /// Warnings for the user.
-    pub remarks: Vec<String>,
+/// Whether the file `path` is a vendor's description of a scan.
+pub(crate) fn is_vendors(path: &Path) -> bool {
+    reader(path).is_some()
 }
 
 /// The open beam.
@@ -109,9 +83,18 @@ impl Response {
     }
 }
 
-impl From<VendorScan> for Description {
-    fn from(scan: VendorScan) -> Self {
-        let (flat, i0) = match scan.open {
+impl Description {
+    /// A vendor's scan of the images `projections` with a view each, on a detector of so many rows and columns. `remarks`
+    /// are warnings for the user.
+    pub fn of_vendor(
+        projections: Names,
+        open: Open,
+        views: Vec<View>,
+        detector: [usize; 2],
+        volume: VoxelGrid,
+        remarks: Vec<String>,
+    ) -> Self {
+        let (flat, i0) = match open {
             Open::Flat(names) => (Some(names), None),
             Open::Number(n) => (None, Some(I0Text::Number(n))),
             Open::Air => (None, Some(I0Text::Word("air".into()))),
@@ -119,19 +102,42 @@ impl From<VendorScan> for Description {
         Self {
             _format: String::new(),
             _version: 0,
-            files: Files { projections: scan.projections, flat, dark: None },
+            files: Files { projections, flat, dark: None },
             circle: None,
             vectors: None,
             rtk: None,
             cil: None,
             layout: LayoutTable::default(),
             values: ValuesTable { kind: ValueKind::Counts, i0, ..ValuesTable::default() },
-            volume: scan.volume,
-            views: Some(scan.views),
-            detector: Some(scan.detector),
-            response: scan.response,
-            remarks: scan.remarks,
+            volume,
+            views: Some(views),
+            detector: Some(detector),
+            response: Response::Counts,
+            remarks,
         }
+    }
+
+    /// The same for `images` of an imager on a gantry, in RTK's terms: the distances from the source to the axis and the
+    /// detector, the size of a pixel along v and u, and for each image the gantry's angle and the detector's shift along
+    /// columns and rows. Lengths are mm, angles degrees. The files state no volume.
+    pub fn on_gantry(
+        place: &str,
+        images: Vec<String>,
+        open: Open,
+        [sid, sdd]: [f64; 2],
+        detector: [usize; 2],
+        pixel: [f64; 2],
+        stands: &[(f64, [f64; 2])],
+        mut remarks: Vec<String>,
+    ) -> Result<Self> {
+        let view = |&(gantry, detector): &(f64, [f64; 2])| {
+            Projection { sid, sdd, gantry, detector, ..Projection::default() }.view(pixel, [0.0; 2])
+        };
+        let aside = stands.iter().map(|(_, shift)| shift[0].abs()).fold(0.0, f64::max);
+        let at_axis = pixel.map(|x| x * sid / sdd);
+        let volume = field_of_view(place, detector, at_axis, aside * sid / sdd, &mut remarks)?;
+        let views = stands.iter().map(view).collect();
+        Ok(Self::of_vendor(Names::Many(images), open, views, detector, volume, remarks))
     }
 }
 

@@ -13,19 +13,16 @@
 //! The chamber before the patient, `KVNormChamber`, measures the beam of each image: counts are brought to that of the
 //! open beam.
 
-use super::differences;
 use super::keys::Keys;
-use super::vendor::{Open, Response, VendorScan, field_of_view};
+use super::vendor::{Open, Response};
+use super::{Description, differences};
 use crate::folder;
-use crate::input::{Input, LONGEST_TEXT};
+use crate::input::Input;
 use crate::number::{ByteOrder, Number};
-use crate::rtk::Projection;
 use crate::scan_folder::folder_of;
 use crate::stack::Names;
-use crate::text::{self, read_foreign};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
-use ndarray::Array3;
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -68,15 +65,8 @@ impl Head {
     }
 }
 
-/// An open file after its header.
-struct Opened {
-    input: Input,
-    size: [usize; 2],
-    bytes: usize,
-    compressed: bool,
-}
-
-fn open(path: &Path) -> Result<Opened> {
+/// The file after its header, rows and columns, and the bytes of a pixel if they are not compressed.
+fn open(path: &Path) -> Result<(Input, [usize; 2], Option<usize>)> {
     let mut input = Input::open_plain(path)?;
     let found = input.take(8)?;
     if !found.starts_with(MAGIC) {
@@ -90,7 +80,7 @@ fn open(path: &Path) -> Result<Opened> {
         integer(&mut input, "bytes per pixel")?,
         integer(&mut input, "compression")?,
     ];
-    Ok(Opened { input, size: [rows, columns], bytes, compressed: compressed != 0 })
+    Ok((input, [rows, columns], (compressed == 0).then_some(bytes)))
 }
 
 /// The next 32-bit integer, which is not negative.
@@ -112,7 +102,8 @@ fn length(input: &mut Input, field: &str) -> Result<usize> {
 
 /// Size and properties of the image `path`.
 pub(super) fn head(path: &Path) -> Result<Head> {
-    let Opened { mut input, size, compressed, .. } = open(path)?;
+    let (mut input, size, bytes) = open(path)?;
+    let compressed = bytes.is_none();
     if compressed {
         let table = length(&mut input, "lookup table")?;
         input.skip(table as u64, "lookup table")?;
@@ -152,39 +143,34 @@ pub(super) fn head(path: &Path) -> Result<Head> {
     Ok(Head { place: input.place(), size, numbers })
 }
 
-/// The image `path`.
-pub(super) fn read(path: &Path) -> Result<Array3<f32>> {
-    let Opened { mut input, size: [rows, columns], bytes, compressed } = open(path)?;
-    let place = input.place();
-    let values = if compressed {
+/// Shape and numbers of the image `path`.
+pub(super) fn read(path: &Path) -> Result<([usize; 3], Vec<f32>)> {
+    let (mut input, [rows, columns], bytes) = open(path)?;
+    let shape = [1, rows, columns];
+    let Some(bytes) = bytes else {
         let length_of_table = length(&mut input, "lookup table")?;
         let table = input.exactly(length_of_table, "lookup table")?;
         let length_of_pixels = length(&mut input, "pixels")?;
         let packed = input.exactly(length_of_pixels, "pixels")?;
-        differences::unpack(&place, [rows, columns], &table, &packed)?
-    } else {
-        let number = match bytes {
-            1 => Number::U8,
-            2 => Number::U16,
-            4 => Number::I32,
-            _ => return Err(input.invalid("bytes per pixel", bytes, "1, 2 or 4")),
-        };
-        let count = rows.saturating_mul(columns);
-        let found = length(&mut input, "pixels")?;
-        let expected = format!("{} for {rows} x {columns} pixels", count.saturating_mul(bytes));
-        ensure(found == count.saturating_mul(bytes), &place, "pixels", format!("{found} bytes"), expected)?;
-        input.part(found as u64).singles("pixels", count, number, ByteOrder::Little)?
+        return Ok((shape, differences::unpack(&input.place(), [rows, columns], &table, &packed)?));
     };
-    Array3::from_shape_vec((1, rows, columns), values)
-        .map_err(|e| Error::invalid(place, "pixels", e, "as many as rows and columns say"))
+    let number = match bytes {
+        1 => Number::U8,
+        2 => Number::U16,
+        4 => Number::I32,
+        _ => return Err(input.invalid("bytes per pixel", bytes, "1, 2 or 4")),
+    };
+    let count = rows.saturating_mul(columns);
+    let (found, wanted) = (length(&mut input, "pixels")?, count.saturating_mul(bytes));
+    let expected = format!("{wanted} for {rows} x {columns} pixels");
+    ensure(found == wanted, &input.place(), "pixels", format!("{found} bytes"), expected)?;
+    Ok((shape, input.part(found as u64).singles("pixels", count, number, ByteOrder::Little)?))
 }
 
 /// The scan that the `Scan.xml` at `path` describes.
-pub(super) fn scan(path: &Path) -> Result<VendorScan> {
-    let text = read_foreign(path, LONGEST_TEXT)?;
-    let place = path.display().to_string();
-    let document = text::xml(&place, &text, "Varian's Scan.xml")?;
-    let keys = Keys::xml(place.clone(), document.root_element());
+pub(super) fn scan(path: &Path) -> Result<Description> {
+    let keys = Keys::xml(path, "Varian's Scan.xml")?;
+    let place = keys.place();
     let [sid, sdd] = [keys.length("SAD")?, keys.length("SID")?];
     let bow_tie = keys.text("Bowtie").is_some_and(|b| !b.eq_ignore_ascii_case("none"));
     let folder = folder_of(path);
@@ -201,7 +187,7 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
     };
     let flats: Vec<String> = all.iter().filter(air).cloned().collect();
     let heads = |names: &[String]| -> Result<Vec<Head>> {
-        names.iter().map(|n| head(&folder::inside(folder, &place, "images", n)?)).collect()
+        names.iter().map(|n| head(&folder::inside(folder, place, "images", n)?)).collect()
     };
     let (found, open) = (heads(&images)?, heads(&flats)?);
     let mut remarks = Vec::new();
@@ -209,17 +195,14 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
     let (images, found): (Vec<String>, Vec<Head>) =
         images.into_iter().zip(found).filter(|(_, h)| h.size.iter().all(|n| *n > 0)).unzip();
     let first = found.first().ok_or_else(|| {
-        Error::invalid(&place, "images", "none", "Proj_*.xim with pixels beside Scan.xml or below Acquisitions")
+        keys.invalid("images", "none", "Proj_*.xim with pixels beside Scan.xml or below Acquisitions")
     })?;
     let pixel = [first.length("PixelHeight")?, first.length("PixelWidth")?];
-    let mut aside = 0.0f64;
-    let mut view = |h: &Head| -> Result<_> {
+    let stand = |h: &Head| -> Result<_> {
         let detector = [10.0 * h.number("KVDetectorLat")?, 10.0 * h.number("KVDetectorLng")?];
-        aside = aside.max(detector[0].abs());
-        let gantry = 180.0 - h.number("KVSourceRtn")?;
-        Ok(Projection { sid, sdd, gantry, detector, ..Projection::default() }.view(pixel, [0.0; 2]))
+        Ok((180.0 - h.number("KVSourceRtn")?, detector))
     };
-    let views = found.iter().map(&mut view).collect::<Result<Vec<_>>>()?;
+    let stands = found.iter().map(stand).collect::<Result<Vec<_>>>()?;
     let (open, response) = if open.is_empty() {
         remarks.push("no open beam in Calibrations/Air-*: it is estimated from the border of each view".to_owned());
         (Open::Air, Response::Counts)
@@ -228,16 +211,8 @@ pub(super) fn scan(path: &Path) -> Result<VendorScan> {
         let factor = |h: &Head| h.length(CHAMBER).map(|c| (beam / c) as f32);
         (Open::Flat(Names::Many(flats)), Response::Factors(found.iter().map(factor).collect::<Result<_>>()?))
     };
-    let at_axis = pixel.map(|x| x * sid / sdd);
-    Ok(VendorScan {
-        volume: field_of_view(&place, first.size, at_axis, aside * sid / sdd, &mut remarks)?,
-        views,
-        detector: first.size,
-        projections: Names::Many(images),
-        open,
-        response,
-        remarks,
-    })
+    let scan = Description::on_gantry(place, images, open, [sid, sdd], first.size, pixel, &stands, remarks)?;
+    Ok(Description { response, ..scan })
 }
 
 /// The name of the file at a relative path, in small letters.
@@ -248,9 +223,9 @@ fn name_of(path: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::differences::tests::pack;
-    use crate::testing::{is_view, read_scan, read_scanner, says_just};
+    use crate::testing::{damage_is_refused, is_integral, is_view, read_scan, read_scanner, replaced, says_just};
     use std::fs;
-    use std::path::{Path, PathBuf};
+    use std::path::PathBuf;
 
     const SIZE: [usize; 2] = [4, 6];
 
@@ -337,8 +312,7 @@ mod tests {
         for (i, row, column) in [(0, 0, 0), (1, 3, 5), (2, 2, 3)] {
             let air = 0.5 * f64::from(pixel(9, row, column) + pixel(19, row, column));
             let counts = f64::from(pixel(i, row, column)) * 1000.0 / [500.0, 250.0, 500.0][i];
-            let found = f64::from(scan.projections[[i, 3 - row, column]]);
-            assert!((found - (air / counts).ln()).abs() < 1e-6, "{i} {row} {column}: {found}");
+            is_integral(&scan, [i, 3 - row, column], (air / counts).ln());
         }
         // The gantry stands at 180 degrees less the source's angle; the detector is shifted by -160 mm along u, 5 mm up.
         let views = &scan.geometry.views;
@@ -352,7 +326,6 @@ mod tests {
         let wide = (6.0 * 0.4 + 320.0) / 1.5;
         assert_eq!(grid.shape, [512, 512, 3]);
         assert!((grid.spacing[0] - wide / 512.0).abs() < 1e-9, "{grid:?}");
-        assert_eq!(crate::scan_size(&path).unwrap().pixels, 72);
     }
 
     #[test]
@@ -361,7 +334,7 @@ mod tests {
         fs::write(&path, SCAN.replace("Half Bowtie", "None")).unwrap();
         let scan = read_scan(&path).unwrap();
         let want = f64::from(pixel(50, 3, 0)) / (f64::from(pixel(0, 3, 0)) / 500.0);
-        assert!((f64::from(scan.projections[[0, 0, 0]]) - want.ln()).abs() < 1e-6);
+        is_integral(&scan, [0, 0, 0], want.ln());
         fs::remove_dir_all(dir.path().join("Calibrations")).unwrap();
         let crate::Stored::Counts(counts) = crate::read_scan(&path).unwrap() else { panic!("no counts") };
         assert_eq!(counts.conversion.open, crate::OpenBeam::Air);
@@ -378,21 +351,14 @@ mod tests {
                     [values]\ni0 = 100000\n[volume]\nshape = [6, 6, 4]\nspacing = [1.0, 1.0, 1.0]\n";
         fs::write(dir.path().join("scanner.toml"), text).unwrap();
         let scan = read_scan(dir.path()).unwrap();
-        let want = (100_000.0 / f64::from(pixel(2, 1, 4))).ln();
-        assert!((f64::from(scan.projections[[2, 1, 4]]) - want).abs() < 1e-6);
+        is_integral(&scan, [2, 1, 4], (100_000.0 / f64::from(pixel(2, 1, 4))).ln());
     }
 
     #[test]
     fn hostile_files_are_refused_in_words() {
+        let (_dir, path) = written();
         let first = "Acquisitions/733061622/Proj_00001.xim";
-        let refused = |change: &dyn Fn(&mut Vec<u8>), words: &str| {
-            let (dir, path) = written();
-            let file = dir.path().join(first);
-            let mut bytes = fs::read(&file).unwrap();
-            change(&mut bytes);
-            fs::write(&file, bytes).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), &format!("{first}: {words}"));
-        };
+        let refused = |change: &dyn Fn(&mut Vec<u8>), words: &str| damage_is_refused(&path, first, change, words);
         let set = |at: usize, x: i32| move |b: &mut Vec<u8>| b[at..at + 4].copy_from_slice(&int(x));
         refused(&|b| b.truncate(20), "bits per pixel: found the end of the file after 0 bytes, expected 4 bytes");
         refused(&|b| b.truncate(5), "format: found [56, 4d, 53, 2e, 58] at the start, expected VMS.XI");
@@ -410,67 +376,36 @@ mod tests {
         refused(&|b| b[36] = 0xff, "lookup table: found the code 3, expected 0, 1 or 2 for one, two or four bytes");
         refused(&|b| b[36..40].fill(0xaa), "pixels: found the end after 14 of 24, expected a difference for each");
         refused(&|b| b.truncate(150), "List: found the end of the file after 1 bytes, expected 4 bytes");
-        let name = |b: &[u8], name: &[u8]| b.windows(name.len()).position(|w| w == name).unwrap();
-        refused(
-            &|b| {
-                let at = name(b, b"KVSourceRtn");
-                b[at] = b'X';
-            },
-            "KVSourceRtn: found nothing, expected a number among the properties",
-        );
-        refused(
-            &|b| {
-                let at = name(b, b"KVSourceRtn") + 15;
-                b[at..at + 8].copy_from_slice(&f64::NAN.to_le_bytes());
-            },
-            "KVSourceRtn: found NaN, expected a number among the properties",
-        );
-        refused(
-            &|b| {
-                let at = name(b, b"PixelWidth") + 14;
-                b[at..at + 8].copy_from_slice(&0f64.to_le_bytes());
-            },
-            "PixelWidth: found 0, expected a length above 0",
-        );
-        refused(
-            &|b| {
-                let at = name(b, b"Name") + 4;
-                b[at] = 3;
-            },
-            "type of Name: found 3, expected 0, 1, 2, 4 or 5",
-        );
-        // The third image is not compressed.
-        let (dir, path) = written();
-        let third = dir.path().join(first.replace("00001", "00003"));
-        let mut bytes = fs::read(&third).unwrap();
-        bytes[24..28].copy_from_slice(&int(3));
-        fs::write(&third, bytes).unwrap();
-        let words = format!("{}: bytes per pixel: found 3, expected 1, 2 or 4", first.replace("00001", "00003"));
-        says_just(read_scanner(&path, None), dir.path(), &words);
+        // Other bytes behind the name of a property and `skip` more.
+        let behind = |name: &'static str, skip: usize, bytes: &'static [u8]| {
+            move |b: &mut Vec<u8>| {
+                let at = b.windows(name.len()).position(|w| w == name.as_bytes()).unwrap() + name.len() + skip;
+                b[at..at + bytes.len()].copy_from_slice(bytes);
+            }
+        };
+        let expected = "expected a number among the properties";
+        refused(&behind("KVSourceRt", 0, b"X"), &format!("KVSourceRtn: found nothing, {expected}"));
+        refused(&behind("KVSourceRtn", 4, &[0xff; 8]), &format!("KVSourceRtn: found NaN, {expected}"));
+        refused(&behind("PixelWidth", 4, &[0; 8]), "PixelWidth: found 0, expected a length above 0");
+        refused(&behind("Name", 0, &[3]), "type of Name: found 3, expected 0, 1, 2, 4 or 5");
+        let third = &first.replace("00001", "00003");
+        // It is not compressed.
+        damage_is_refused(&path, third, &set(24, 3), "bytes per pixel: found 3, expected 1, 2 or 4");
     }
 
     #[test]
     fn a_text_without_distances_or_images_is_refused() {
-        for (from, to, words) in [
-            ("<SAD>1000</SAD>", "", "Scan.xml: SAD: found nothing, expected a number"),
-            ("1500", "-1500", "Scan.xml: SID: found -1500, expected a number above 0"),
-            ("1500", "far", "Scan.xml: SID: found \"far\", expected a number"),
-        ] {
-            let (dir, path) = written();
-            fs::write(&path, SCAN.replace(from, to)).unwrap();
-            says_just(read_scanner(&path, None), dir.path(), words);
-        }
         let (dir, path) = written();
+        for (from, to, words) in [
+            ("<SAD>1000</SAD>", "", "SAD: found nothing, expected a number"),
+            ("1500", "-1500", "SID: found -1500, expected a number above 0"),
+            ("1500", "far", "SID: found \"far\", expected a number"),
+        ] {
+            damage_is_refused(&path, "Scan.xml", &replaced(from, to), words);
+        }
         fs::remove_dir_all(dir.path().join("Acquisitions")).unwrap();
         let words =
             "Scan.xml: images: found none, expected Proj_*.xim with pixels beside Scan.xml or below Acquisitions";
         says_just(read_scanner(&path, None), dir.path(), words);
-        says_just(
-            crate::read_scan(dir.path().join("Calibrations/AIR-Half-Bowtie-125KV/Current/Filter.xim")),
-            dir.path(),
-            "Calibrations/AIR-Half-Bowtie-125KV/Current/Filter.xim: Varian's XIM, an image of a scan: not read alone: name \
-             the Scan.xml of its scan, or describe the images in a scanner.toml (docs/guide/formats.md)",
-        );
-        assert!(Path::new(&path).is_file());
     }
 }
