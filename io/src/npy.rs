@@ -33,15 +33,10 @@ pub(crate) fn read(path: &Path, axes: &[&str]) -> Result<ArrayD<f32>> {
 
 /// Reads the rest after `start`, the bytes (at most eight) read from `input` to recognize the format.
 pub(crate) fn read_from(input: &mut Input, start: Vec<u8>, axes: &[&str]) -> Result<ArrayD<f32>> {
-    read_one_of(input, start, &[axes])
+    read_counts(input, start, &[axes]).map(|(array, _)| array)
 }
 
-/// Like [`read_from`], for an array with any of several sets of axes.
-pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
-    read_counts(input, start, sets).map(|(array, _)| array)
-}
-
-/// Like [`read_one_of`], with the type of the numbers in the file.
+/// Like [`read_from`], for an array with any of several sets of axes, with the type of the numbers in the file.
 pub(crate) fn read_counts(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<(ArrayD<f32>, Number)> {
     let header = read_header(input, start)?;
     array(input, &header, sets)
@@ -54,17 +49,17 @@ pub(crate) fn array(input: &mut Input, header: &Header, sets: &[&[&str]]) -> Res
         each.join(" or ")
     };
     if !sets.iter().any(|axes| header.shape.len() == axes.len()) {
-        return Err(input.invalid("shape", shape_text(&header.shape), expected()));
+        return Err(input.invalid("shape", format!("{:?}", header.shape), expected()));
     }
     if header.shape.contains(&0) {
-        return Err(input.invalid("shape", shape_text(&header.shape), "at least one element along every axis"));
+        return Err(input.invalid("shape", format!("{:?}", header.shape), "at least one element along every axis"));
     }
     let count = header
         .shape
         .iter()
         .try_fold(1usize, |n, &s| n.checked_mul(s))
         .filter(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize))
-        .ok_or_else(|| input.invalid("shape", shape_text(&header.shape), "a size that can be addressed"))?;
+        .ok_or_else(|| input.invalid("shape", format!("{:?}", header.shape), "a size that can be addressed"))?;
     let values = input.singles("data", count, header.number, header.order)?;
     let array = ArrayD::from_shape_vec(IxDyn(&header.shape).set_f(header.fortran), values)
         .map_err(|e| input.invalid("shape", e, expected()))?;
@@ -87,7 +82,7 @@ pub(crate) fn exact(input: &mut Input, header: &Header) -> Result<(Vec<usize>, V
     let count = header.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
     let fits = count.filter(|n| (1..=2).contains(&header.shape.len()) && *n > 0 && *n < 1 << 32);
     let count = fits.ok_or_else(|| {
-        input.invalid("shape", shape_text(&header.shape), "one or two axes with at least one element along each")
+        input.invalid("shape", format!("{:?}", header.shape), "one or two axes with at least one element along each")
     })?;
     let values = input.doubles("data", count, header.number, header.order)?;
     let values = match (header.fortran, &header.shape[..]) {
@@ -148,10 +143,11 @@ fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
         return Err(input.invalid("magic", format!("{:02x?}", &magic[..6]), "93 4e 55 4d 50 59 (\\x93NUMPY)"));
     }
     let length = match magic[6] {
-        1 => fill(input, 2)?.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize),
-        2 | 3 => fill(input, 4)?.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize),
+        1 => fill(input, 2)?,
+        2 | 3 => fill(input, 4)?,
         v => return Err(input.invalid("version", v, "1, 2 or 3")),
     };
+    let length = length.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize);
     if length > LONGEST_HEADER {
         return Err(input.invalid("header length", length, format!("at most {LONGEST_HEADER} bytes")));
     }
@@ -210,10 +206,6 @@ pub(crate) fn element(descr: &str) -> Option<(Number, ByteOrder)> {
         _ => return None,
     };
     Some((number, order))
-}
-
-fn shape_text(shape: &[usize]) -> String {
-    format!("{shape:?}")
 }
 
 /// The three kinds of value in a header.

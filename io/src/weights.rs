@@ -148,23 +148,11 @@ mod tests {
     }
 
     #[test]
-    fn hostile_files_are_refused_in_words() {
+    fn bytes_after_the_last_tensor_are_refused() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.safetensors");
         sample(&path);
-        let good = fs::read(&path).unwrap();
-        let refused = |bytes: &[u8], words: &[&str]| {
-            fs::write(&path, bytes).unwrap();
-            says(read_weights(&path), &[&["a.safetensors"], words].concat());
-        };
-        refused(&[good.as_slice(), &[0]].concat(), &["header"]);
-        for dtype in ["F64", "BF16"] {
-            let bytes = if dtype == "F64" { 8 } else { 2 };
-            let mut text =
-                format!("{{\"w\":{{\"dtype\":\"{dtype}\",\"shape\":[4],\"data_offsets\":[0,{}]}}}}", 4 * bytes);
-            text.push_str(&" ".repeat(text.len().next_multiple_of(8) - text.len()));
-            let raw = [&(text.len() as u64).to_le_bytes(), text.as_bytes(), &vec![0; 4 * bytes]].concat();
-            refused(&raw, &["tensor w", dtype, "F32"]);
-        }
+        fs::write(&path, [fs::read(&path).unwrap(), vec![0]].concat()).unwrap();
+        says(read_weights(&path), &["a.safetensors", "header"]);
     }
 }
