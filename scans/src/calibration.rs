@@ -26,9 +26,10 @@ mod search;
 
 pub use direction::{Directions, directions};
 pub use jitter::{Jitter, jitter};
-pub use parameters::{Correction, Parameter, turns};
+pub use parameters::{Correction, Parameter};
 pub use search::Watch;
 
+use crate::provenance;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, View, norm};
@@ -50,18 +51,8 @@ const COARSEST: usize = 32;
 const FOLDS: usize = 2;
 /// A parameter is wrong if its change exceeds this many standard deviations.
 const CLEAR: f64 = 3.0;
-/// A parameter is not determined if its deviation exceeds this number of pixels of the finest level, or if its
-/// sensitivity is below these limits.
+/// A parameter is not determined if its deviation exceeds this number of pixels of the finest level.
 const VAGUE: f64 = 1.0;
-const FLAT: f64 = 0.03;
-const FLAT_PAIRS: f64 = 0.01;
-/// The voxel positions shift the minimum of the error by about this many pixels of a level. The views do not show this
-/// shift, so it is part of every deviation. For pairs of views, the sampling of the object by pixels has the same
-/// effect.
-const INEXACT: f64 = 0.02;
-/// The same if the object is cut off at the sides, also on a half-fan scan: the reconstruction is wrong there.
-const INEXACT_CUT: f64 = 0.1;
-const INEXACT_PAIRS: f64 = 0.1;
 /// Pairs of views are compared on pixels finer by this factor, at little cost; the largest number of Newton's steps.
 const FINER: usize = 2;
 const ROUNDS: usize = 6;
@@ -162,12 +153,8 @@ impl Calibration {
                 (f.parameter.to_string(), json!({ "change": f.change, "uncertainty": f.uncertainty, "unit": f.unit }))
             })
             .collect();
-        let calibrated = json!({ "from": source, "corrected": corrected, "held_out": self.held_out });
-        match &mut scan.provenance {
-            Value::Object(map) => drop(map.insert("calibrated".into(), calibrated)),
-            Value::Null => scan.provenance = json!({ "calibrated": calibrated }),
-            other => scan.provenance = json!({ "value": other.take(), "calibrated": calibrated }),
-        }
+        *provenance::entry(scan, "calibrated") =
+            json!({ "from": source, "corrected": corrected, "held_out": self.held_out });
     }
 
     /// The result as JSON, with those of [`directions`] and [`jitter()`].
@@ -202,12 +189,8 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
         Parameter::Rotation if scan.geometry.detector[0] < ROWS => Some(ROWS_REASON),
         _ => None,
     };
-    let mut open: Vec<Found> = vec![];
-    for &parameter in &asked {
-        open.extend(
-            reason(&parameter).map(|reason| undetermined(parameter, reason, PREDICTION, &first.geometry, scan)),
-        );
-    }
+    let open = |p: &Parameter| Some(undetermined(*p, reason(p)?, PREDICTION, &first.geometry, scan));
+    let open: Vec<Found> = asked.iter().filter_map(open).collect();
     asked.retain(|p| reason(p).is_none());
     let mut pairs = if paired.is_empty() { None } else { Some(Consistency::new(scan, FINER * finest, &at)?) };
     let work = planned(&first, &widths, &asked, settings.curves)
@@ -362,12 +345,8 @@ fn compare_pairs(
         Parameter::Tilt if on_a_circle(&geometry.views) => Some(CIRCLE_REASON),
         _ => None,
     };
-    let mut found: Vec<Found> = vec![];
-    for &parameter in asked {
-        if let Some(reason) = reason(&parameter) {
-            found.push(undetermined(parameter, reason, PAIRS, geometry, scan));
-        }
-    }
+    let open = |p: &Parameter| Some(undetermined(*p, reason(p)?, PAIRS, geometry, scan));
+    let mut found: Vec<Found> = asked.iter().filter_map(open).collect();
     let active: Vec<Parameter> = asked.iter().copied().filter(|p| reason(p).is_none()).collect();
     let findings = |place: &Place| -> Vec<Found> {
         let all = place.active.iter().zip(&place.evidence);
@@ -422,7 +401,7 @@ fn settle<F>(
 /// The same for a fit to held-out views. Shared rays judge the result, if the sources are on a circle.
 fn settled(fine: &Search<'_>, fit: Fit, scan: &Scan, opposite: Option<&Opposite>) -> Result<(Vec<Found>, Fit)> {
     let geometry = &fine.level.geometry;
-    let limits = if fine.level.cut { Limits { inexact: INEXACT_CUT, ..PREDICTION } } else { PREDICTION };
+    let limits = if fine.level.cut { PREDICTION_CUT } else { PREDICTION };
     let findings = |fit: &Fit| -> Vec<Found> {
         let of = |(&p, evidence): (&Parameter, Evidence)| match opposite {
             Some(opposite) => judged(p, evidence, limits, opposite, fit, geometry, scan),
@@ -450,7 +429,7 @@ fn judged(
     let beyond = (opinion.change.abs() - opinion.deviation).max(0.0);
     let evidence = Evidence { deviation: evidence.deviation.hypot(beyond), ..evidence };
     let found = finding(parameter, fit.correction.get(parameter), evidence, limits, geometry, scan);
-    let asked = parameter == Parameter::OffsetU || limits.inexact > INEXACT;
+    let asked = parameter == Parameter::OffsetU || limits.inexact > PREDICTION.inexact;
     if found.verdict == Verdict::Corrected && asked && !opinion.better {
         return undetermined(parameter, OPPOSITE_REASON, limits, geometry, scan);
     }
@@ -463,15 +442,20 @@ fn undetermined(parameter: Parameter, reason: &'static str, limits: Limits, geom
     Found { reason: Some(reason), ..finding(parameter, 0.0, evidence, limits, geometry, scan) }
 }
 
-/// Limits of a criterion: the least sensitivity, and the part of every deviation in pixels.
+/// Limits of a criterion.
 #[derive(Clone, Copy)]
 struct Limits {
+    /// Sensitivity below which a parameter is not determined.
     flat: f64,
+    /// Pixels of a level by which the voxel positions, or for pairs of views the sampling of the object by pixels, shift
+    /// the minimum of the error. The views do not show this shift, so it is part of every deviation.
     inexact: f64,
 }
 
-const PREDICTION: Limits = Limits { flat: FLAT, inexact: INEXACT };
-const PAIRS: Limits = Limits { flat: FLAT_PAIRS, inexact: INEXACT_PAIRS };
+const PREDICTION: Limits = Limits { flat: 0.03, inexact: 0.02 };
+/// If the object is cut off at the sides, also on a half-fan scan: the reconstruction is wrong there.
+const PREDICTION_CUT: Limits = Limits { inexact: 0.1, ..PREDICTION };
+const PAIRS: Limits = Limits { flat: 0.01, inexact: 0.1 };
 
 /// The result for a parameter with this value; `geometry` is the level's.
 fn finding(

@@ -12,6 +12,7 @@
 use crate::calibration::criterion::Level;
 use crate::calibration::search::{LONGEST, Meter, SMALL};
 use crate::calibration::{FEWEST, Verdict, Watch, widths};
+use crate::provenance;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Vec3, View, dot, norm, sub};
@@ -19,7 +20,7 @@ use conefield_core::matrix::inverse;
 use conefield_core::scan::Scan;
 use ndarray::{ArrayView2, Zip};
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::json;
 use std::sync::Mutex;
 
 /// Rounds of prediction and comparison at each level.
@@ -59,12 +60,7 @@ impl Jitter {
         }
         scan.geometry.views = shifted(&scan.geometry.views, &self.shifts);
         let [v, u] = self.pixels;
-        let note = json!({ "rms_pixels": { "v": v, "u": u }, "held_out": self.held_out });
-        match &mut scan.provenance {
-            Value::Object(map) => drop(map.insert("jitter".into(), note)),
-            Value::Null => scan.provenance = json!({ "jitter": note }),
-            other => scan.provenance = json!({ "value": other.take(), "jitter": note }),
-        }
+        *provenance::entry(scan, "jitter") = json!({ "rms_pixels": { "v": v, "u": u }, "held_out": self.held_out });
     }
 }
 
@@ -266,18 +262,8 @@ fn motion(view: &View, center: Vec3) -> [[f64; 2]; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::calibration::consistency::tests::scan;
+    use crate::calibration::consistency::tests::{Silent, scan};
     use conefield_backend_cpu::Cpu;
-
-    struct Silent;
-
-    impl Watch for Silent {
-        fn cancelled(&self) -> bool {
-            false
-        }
-
-        fn progress(&self, _: f64) {}
-    }
 
     /// Shifts along v and u for each view, mm, without the part that is a motion of the object.
     fn irregular(scan: &Scan, size: f64) -> Vec<[f64; 2]> {
