@@ -68,10 +68,13 @@ impl DicomTemplate {
     }
 }
 
-/// Refuses a slice with more rows or columns than a 16-bit number says, before the voxels are computed.
+/// Refuses a slice with more rows or columns than a 16-bit number says, or more bytes than a 32-bit one, before the
+/// voxels are computed.
 pub(crate) fn check_shape(place: &str, [x, y, _]: [usize; 3]) -> Result<()> {
     let expected = "at most 65535 voxels along x and y, the limit of DICOM";
-    ensure(x.max(y) <= 65535, place, "shape", format!("{x} x {y}"), expected)
+    ensure(x.max(y) <= 65535, place, "shape", format!("{x} x {y}"), expected)?;
+    let expected = "less than 4 GiB of 16-bit voxels in a slice, the limit of DICOM";
+    ensure(2 * (x as u64) * (y as u64) < u64::from(u32::MAX), place, "shape", format!("{x} x {y}"), expected)
 }
 
 /// Whether a series of this module may have a file of this name.
