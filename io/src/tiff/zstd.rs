@@ -18,8 +18,8 @@ pub(super) const ZSTD: u32 = 50_000;
 /// Largest window of Zstandard's own encoder.
 const WINDOW: u64 = 8 << 20;
 
-/// Largest side of a tile whose page is smaller.
-const LARGEST_TILE: u32 = 1 << 12;
+/// Most bytes of all tiles per byte of their page, or of a mebibyte if the page is smaller: tiles extend beyond it.
+const PADDED: u64 = 64;
 
 /// Value of the Predictor tag: differences of floats, whose highest byte comes first in either byte order.
 const OF_FLOATS: u32 = 3;
@@ -31,12 +31,14 @@ pub(super) fn read(place: &str, decoder: &mut Pages, page: &Page, out: &mut Vec<
     let tiled = decoder.get_chunk_type() == ChunkType::Tile;
     let (width, height) = decoder.chunk_dimensions();
     let [offsets, sizes] = pieces(place, decoder)?;
-    if tiled && (width > columns.max(LARGEST_TILE) || height > rows.max(LARGEST_TILE)) {
+    let bytes = usize::from(page.sample.bits / 8);
+    let all = offsets.len() as u64 * bytes as u64;
+    let all = all.saturating_mul(u64::from(width)).saturating_mul(u64::from(height));
+    if tiled && all > PADDED.saturating_mul(page.bytes.max(1 << 20)) {
         let found = format!("{} strips or tiles of {height} x {width} pixels", offsets.len());
         return Err(Error::invalid(place, "StripOffsets", found, "those that make up the page"));
     }
     let predictor = decoder.find_tag_unsigned::<u32>(Tag::Predictor).map_err(broken)?.unwrap_or(1);
-    let bytes = usize::from(page.sample.bits / 8);
     // The file in memory has the byte order of the machine.
     let turned = predictor != OF_FLOATS && decoder.byte_order() != ByteOrder::native();
     let mut plain = Cursor::new(Vec::with_capacity(usize::try_from(page.bytes).unwrap_or(0)));
@@ -44,8 +46,9 @@ pub(super) fn read(place: &str, decoder: &mut Pages, page: &Page, out: &mut Vec<
     let mut directory = encoder.image_directory().map_err(broken)?;
     let (mut starts, mut lengths) = (vec![], vec![]);
     for (i, (&at, &size)) in offsets.iter().zip(&sizes).enumerate() {
-        // The last strip ends with the page; a tile extends beyond it.
-        let height = if tiled { height } else { height.min(rows - i as u32 * height) };
+        // The last strip ends with the page; a tile extends beyond it. A damaged directory may have more of them.
+        let left = rows.saturating_sub((i as u32).saturating_mul(height));
+        let height = if tiled { height } else { height.min(left) };
         let packed = stored(place, decoder.inner(), at, size)?;
         let mut raw = unpacked(place, &packed, height as usize * width as usize * bytes)?;
         if turned {
