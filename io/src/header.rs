@@ -61,6 +61,18 @@ impl Header {
         }
         Input::open_plain(&folder::inside(parent(path), &self.place, field, name)?)
     }
+
+    /// Skips as many bytes of `data` as the entry `field` says in `text`. Where `last` is known, −1 stands for all but
+    /// the last so many.
+    pub fn skip(&self, data: &mut Input, (field, text): (&str, &str), last: Option<u64>, expected: &str) -> Result<()> {
+        let left = data.left();
+        let count = match (text.parse::<i64>(), left.zip(last)) {
+            (Ok(-1), Some((left, last))) => left.saturating_sub(last),
+            (Ok(n), _) if n >= 0 && left.is_none_or(|left| n.unsigned_abs() <= left) => n.unsigned_abs(),
+            _ => return Err(self.invalid(field, shortened(text), expected)),
+        };
+        data.skip(count, field)
+    }
 }
 
 /// Finite numbers, if all of these are.

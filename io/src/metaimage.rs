@@ -221,7 +221,12 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
     let count = grid.len().unwrap_or(0);
 
     let mut data = open_data(&header, path, input)?;
-    skip_header(&header, &mut data, compressed, count as u64 * number.bytes() as u64)?;
+    if let Some(text) = header.text("HeaderSize")? {
+        let last = (!compressed).then_some(count as u64 * number.bytes() as u64);
+        let left = data.left().unwrap_or(0);
+        let expected = format!("a number of bytes up to {left}, or -1 if the data is not compressed");
+        header.skip(&mut data, ("HeaderSize", text), last, &expected)?;
+    }
     if compressed {
         let left = data.left().unwrap_or(0);
         let said = header.text("CompressedDataSize")?;
@@ -243,21 +248,6 @@ fn open_data(header: &Header, path: &Path, header_file: Input) -> Result<Input> 
         return Ok(header_file);
     }
     header.data_file(path, DATA_FILE, name, "LOCAL or one file (write the volume into one file first)")
-}
-
-/// Skips the data file's own header before the voxels; a size of −1 means that the voxels are its last bytes.
-fn skip_header(header: &Header, data: &mut Input, compressed: bool, want: u64) -> Result<()> {
-    let Some(text) = header.text("HeaderSize")? else { return Ok(()) };
-    let left = data.left().unwrap_or(0);
-    let skip = match text.parse::<i64>() {
-        Ok(-1) if !compressed => left.saturating_sub(want),
-        Ok(n) if u64::try_from(n).is_ok_and(|n| n <= left) => n.unsigned_abs(),
-        _ => {
-            let expected = format!("a number of bytes up to {left}, or -1 if the data is not compressed");
-            return Err(header.invalid("HeaderSize", shortened(text), &expected));
-        }
-    };
-    data.skip(skip, "HeaderSize")
 }
 
 /// Writes `voxels` as `f32`, compressed, in one file.

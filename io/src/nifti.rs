@@ -337,24 +337,32 @@ mod tests {
         assert_eq!(read_volume(&f.1).unwrap().data, volume().data);
     }
 
+    /// The header of 2×1×1 voxels without an orientation: type and bits of a number, `pixdim`, slope and intercept.
+    fn header(big_endian: bool, [code, bits]: [i16; 2], pixdim: [f32; 4], scaling: [f32; 2]) -> Vec<u8> {
+        let mut b = vec![0u8; 352];
+        let mut put = |at: usize, little: &[u8]| {
+            let field = &mut b[at..at + little.len()];
+            field.copy_from_slice(little);
+            if big_endian {
+                field.reverse();
+            }
+        };
+        put(0, &348i32.to_le_bytes());
+        for (i, x) in [4i16, 2, 1, 1, 1].into_iter().enumerate() {
+            put(40 + 2 * i, &x.to_le_bytes());
+        }
+        put(70, &code.to_le_bytes());
+        put(72, &bits.to_le_bytes());
+        pixdim.into_iter().enumerate().for_each(|(i, x)| put(76 + 4 * i, &x.to_le_bytes()));
+        scaling.into_iter().enumerate().for_each(|(i, x)| put(112 + 4 * i, &x.to_le_bytes()));
+        b[344..348].copy_from_slice(b"n+1\0");
+        b
+    }
+
     #[test]
     fn integers_scale_and_swap() {
-        // Big-endian int16 with slope and intercept, 2×1×1.
-        let mut b = vec![0u8; 352];
-        let mut put = |at: usize, x: &[u8]| b[at..at + x.len()].copy_from_slice(x);
-        put(0, &348i32.to_be_bytes());
-        for (i, d) in [4i16, 2, 1, 1, 1, 1, 1, 1].iter().enumerate() {
-            put(40 + 2 * i, &d.to_be_bytes());
-        }
-        put(70, &4i16.to_be_bytes());
-        put(72, &16i16.to_be_bytes());
-        for (i, p) in [1.0f32, 2.0, -3.0, 4.0].iter().enumerate() {
-            put(76 + 4 * i, &p.to_be_bytes());
-        }
-        put(112, &0.5f32.to_be_bytes());
-        put(116, &(-1.0f32).to_be_bytes());
-        put(123, &[3]);
-        put(344, b"n+1\0");
+        let mut b = header(true, [4, 16], [1.0, 2.0, -3.0, 4.0], [0.5, -1.0]);
+        b[123] = 3;
         b.extend([(-4i16).to_be_bytes(), 6i16.to_be_bytes()].concat());
         let v = read_volume(&file("a.nii", &[&b]).1).unwrap();
         assert_eq!(v.data.as_slice().unwrap(), [-3.0, 2.0]);
@@ -396,26 +404,7 @@ mod tests {
         for (number, values, bytes) in two_of_each() {
             let code = codes.iter().find(|(n, _)| *n == number).unwrap().1;
             for (big, bytes) in [false, true].into_iter().zip(bytes) {
-                let mut b = vec![0u8; 352];
-                let mut put = |at: usize, little: &[u8]| {
-                    let field = &mut b[at..at + little.len()];
-                    field.copy_from_slice(little);
-                    if big {
-                        field.reverse();
-                    }
-                };
-                put(0, &348i32.to_le_bytes());
-                for (i, d) in [3i16, 2, 1, 1].iter().enumerate() {
-                    put(40 + 2 * i, &d.to_le_bytes());
-                }
-                put(70, &code.to_le_bytes());
-                put(72, &(8 * number.bytes() as i16).to_le_bytes());
-                for i in 0..4 {
-                    put(76 + 4 * i, &1f32.to_le_bytes());
-                }
-                put(112, &0.5f32.to_le_bytes());
-                put(116, &(-8f32).to_le_bytes());
-                b[344..348].copy_from_slice(b"n+1\0");
+                let b = header(big, [code, 8 * number.bytes() as i16], [1.0; 4], [0.5, -8.0]);
                 let found = read_volume(&file("a.nii", &[&b, &bytes]).1).unwrap().data;
                 assert_eq!(found.as_slice().unwrap(), values.map(|x| (0.5 * x - 8.0) as f32), "{number:?}, big {big}");
             }

@@ -226,21 +226,25 @@ impl Python<'_> {
         Some(())
     }
 
-    fn dict(&mut self, mut entry: impl FnMut(&str, Literal) -> Option<()>) -> Option<()> {
-        self.eat("{")?;
-        loop {
-            if self.eat("}").is_some() {
-                return self.rest.trim().is_empty().then_some(());
-            }
-            let key = self.text()?;
-            self.eat(":")?;
-            let value = self.value()?;
-            entry(&key, value)?;
+    /// Items up to `close`, separated by commas.
+    fn items(&mut self, close: &str, item: &mut dyn FnMut(&mut Self) -> Option<()>) -> Option<()> {
+        while self.eat(close).is_none() {
+            item(self)?;
             if self.eat(",").is_none() {
-                self.eat("}")?;
-                return self.rest.trim().is_empty().then_some(());
+                return self.eat(close);
             }
         }
+        Some(())
+    }
+
+    fn dict(&mut self, mut entry: impl FnMut(&str, Literal) -> Option<()>) -> Option<()> {
+        self.eat("{")?;
+        self.items("}", &mut |parser| {
+            let key = parser.text()?;
+            parser.eat(":")?;
+            entry(&key, parser.value()?)
+        })?;
+        self.rest.trim().is_empty().then_some(())
     }
 
     fn text(&mut self) -> Option<String> {
@@ -263,21 +267,16 @@ impl Python<'_> {
             return self.text().map(Literal::Text);
         }
         let mut shape = Vec::new();
-        loop {
-            if self.eat(")").is_some() {
-                return Some(Literal::Tuple(shape));
-            }
-            self.rest = self.rest.trim_start();
-            let end = self.rest.find(|c: char| !c.is_ascii_digit())?;
-            shape.push(self.rest[..end].parse().ok()?);
-            self.rest = &self.rest[end..];
+        self.items(")", &mut |parser| {
+            parser.rest = parser.rest.trim_start();
+            let end = parser.rest.find(|c: char| !c.is_ascii_digit())?;
+            shape.push(parser.rest[..end].parse().ok()?);
+            parser.rest = &parser.rest[end..];
             // Python 2's suffix of long integers.
-            let _ = self.eat("L");
-            if self.eat(",").is_none() {
-                self.eat(")")?;
-                return Some(Literal::Tuple(shape));
-            }
-        }
+            let _ = parser.eat("L");
+            Some(())
+        })?;
+        Some(Literal::Tuple(shape))
     }
 }
 

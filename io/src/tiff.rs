@@ -56,17 +56,18 @@ pub(crate) struct Stack {
 /// Converts 8 to 64 bits per pixel, integers or floats, to `f32`. Refuses other colour types, sizes that the file
 /// cannot hold, values that are not finite and damaged files, and a file that holds more images than are found.
 pub(crate) fn read(path: &Path) -> Result<Stack> {
-    stack(path, |_| Ok(())).map(|(stack, _)| stack)
+    let (values, images) = stack(path, |_| ())?;
+    Ok(Stack { values, numbers: images.sample.to_string() })
 }
 
-/// Like [`read`]; `first` gets the decoder at the first page.
-fn stack(path: &Path, first: impl FnOnce(&mut Pages) -> Result<()>) -> Result<(Stack, Images)> {
+/// The values as in [`read`]; `first` gets the decoder at the first page.
+fn stack(path: &Path, first: impl FnOnce(&mut Pages)) -> Result<(Array3<f32>, Images)> {
     let place = path.display().to_string();
     let mut values = Vec::<f32>::new();
     let mut first = Some(first);
     let images = images(path, |decoder, page| {
         if let Some(first) = first.take() {
-            first(decoder)?;
+            first(decoder);
         }
         let count = usize::try_from(page.pixels).unwrap_or(usize::MAX);
         memory::grow(&mut values, count, usize::MAX, &place, "pages")?;
@@ -104,7 +105,7 @@ fn stack(path: &Path, first: impl FnOnce(&mut Pages) -> Result<()>) -> Result<(S
         Some(((p, r, c), x)) => {
             Err(Error::invalid(place, format!("page {p}, row {r}, column {c}"), x, "a finite number"))
         }
-        None => Ok((Stack { values: all, numbers: images.sample.to_string() }, images)),
+        None => Ok((all, images)),
     }
 }
 

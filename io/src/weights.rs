@@ -3,6 +3,7 @@
 //! The `safetensors` crate reads. This module writes: it streams, and it orders the metadata, so that the same weights
 //! give the same bytes.
 
+use crate::input::read_bytes;
 use crate::{number, write_atomic};
 use conefield_core::arena::Weights;
 use conefield_core::{Error, Result, allowance, files};
@@ -64,27 +65,21 @@ pub fn write_weights(
 pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
     let path = path.as_ref();
     let place = path.display().to_string();
-    let io = |e| Error::io(path, e);
     let (mut file, size) = files::open(path)?;
     if size < 8 {
         return Err(Error::invalid(place, "header length", format!("{size} bytes"), "a safetensors file"));
     }
     let mut length = [0u8; 8];
-    file.read_exact(&mut length).map_err(io)?;
+    file.read_exact(&mut length).map_err(|e| Error::io(path, e))?;
     let header = u64::from_le_bytes(length);
     if header > (size - 8).min(LONGEST_HEADER) {
         let expected = format!("at most {} in a file of {size} bytes", (size - 8).min(LONGEST_HEADER));
         return Err(Error::invalid(place, "header length", header, expected));
     }
-    let mut raw = Vec::new();
-    let too_large = || Error::invalid(&place, "file size", format!("{size} bytes"), "a file that fits in memory");
-    let whole = usize::try_from(size).map_err(|_| too_large())?;
     // The values are briefly in memory twice, as file and as tensors; a parsed header is larger than its text.
     let words = header.saturating_mul(HEADER_WORDS);
     allowance::memory(&place, "file size", size.saturating_mul(2).saturating_add(words))?;
-    raw.try_reserve_exact(whole).map_err(|_| too_large())?;
-    raw.extend(length);
-    file.take(size - 8).read_to_end(&mut raw).map_err(io)?;
+    let raw = read_bytes(path)?;
     let broken = |e| Error::invalid(&place, "header", e, "a whole safetensors file");
     let (_, info) = SafeTensors::read_metadata(&raw).map_err(broken)?;
     let notes = info.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect();

@@ -230,7 +230,10 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
     if packed {
         data = data.gunzip();
     }
-    skip_bytes(&header, &mut data, count as u64 * number.bytes() as u64)?;
+    if let Some(entry) = header.first(&["byte skip", "byteskip"])? {
+        let last = count as u64 * number.bytes() as u64;
+        header.skip(&mut data, entry, Some(last), "a number of bytes within the file, or -1 if the data is raw")?;
+    }
     let values = data.singles("data", count, number, order)?;
     file_order::read(&data.place(), grid, affine, values)
 }
@@ -253,21 +256,6 @@ fn skip_lines(header: &Header, data: &mut Input) -> Result<()> {
         }
     }
     Ok(())
-}
-
-/// Skips bytes before the voxels, in the decompressed data; −1 means that the voxels are the last bytes of a plain
-/// file.
-fn skip_bytes(header: &Header, data: &mut Input, want: u64) -> Result<()> {
-    let Some((field, text)) = header.first(&["byte skip", "byteskip"])? else { return Ok(()) };
-    let skip = match (text.parse::<i64>(), data.left()) {
-        (Ok(-1), Some(left)) => left.saturating_sub(want),
-        (Ok(n), left) if n >= 0 && left.is_none_or(|left| n.unsigned_abs() <= left) => n.unsigned_abs(),
-        _ => {
-            let expected = "a number of bytes within the file, or -1 if the data is raw";
-            return Err(header.invalid(field, shortened(text), expected));
-        }
-    };
-    data.skip(skip, field)
 }
 
 #[cfg(test)]

@@ -24,11 +24,7 @@ pub(super) const AFFINE: &str = "affine";
 pub(crate) fn read_volume(path: &Path) -> Result<Volume> {
     let place = path.display().to_string();
     let mut text = StackText::default();
-    let (stack, images) = stack(path, |decoder| {
-        text = StackText::of(decoder);
-        Ok(())
-    })?;
-    let pages = stack.values;
+    let (pages, images) = stack(path, |decoder| text = StackText::of(decoder))?;
     let (slices, rows, columns) = pages.dim();
     if let Some(n) = images.claim.map(|c| c.volumes).filter(|n| *n > 1) {
         let found = format!("{n} channels or points in time");
@@ -68,18 +64,15 @@ pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
             if z == 0 {
                 text = StackText::of(decoder);
             }
-            Ok(())
         })?;
-        let slice = slice.values;
-        let numbers = *sample.get_or_insert(images.sample);
-        if images.sample != numbers {
-            let expected = format!("{numbers}, as in {}", names[0]);
-            return Err(Error::invalid(path.display().to_string(), "numbers", images.sample, expected));
-        }
         let (pages, rows, columns) = slice.dim();
         let invalid = |field: &str, found: String, expected: String| {
             Err(Error::invalid(path.display().to_string(), field, found, expected))
         };
+        let numbers = *sample.get_or_insert(images.sample);
+        if images.sample != numbers {
+            return invalid("numbers", images.sample.to_string(), format!("{numbers}, as in {}", names[0]));
+        }
         if pages != 1 {
             return invalid("pages", pages.to_string(), "1: one slice per file, or all slices in one file".into());
         }
