@@ -320,8 +320,6 @@ fn voxels(scan: &Scan, s: &Survey, warn: Warn) {
         true => format!("a shape of {:?} gives voxels of that size", fitting.map(|n| n as usize)),
         false => "check that the pixel size is in mm, and that dso and dsd are not swapped".into(),
     };
-    match fine {
-        true => warn(WarningKind::VoxelSize, found, format!("finer than the detector resolves; {shape}")),
-        false => warn(WarningKind::VoxelSize, found, format!("details that the detector resolves are lost; {shape}")),
-    }
+    let why = if fine { "finer than the detector resolves" } else { "details that the detector resolves are lost" };
+    warn(WarningKind::VoxelSize, found, format!("{why}; {shape}"));
 }
