@@ -166,8 +166,8 @@ pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
 }
 
 /// Writes voxels like [`write_volume`], slab by slab. At most 16 MiB of them (or one row) are in memory at once, for
-/// `.mha` also 32 MiB of compressed data, whose rest goes to an unnamed file next to it. For `.zarr` it is eight chunks
-/// of 1 MiB per level; for `.dicom` a slice and up to 32 MiB of 32-bit floats, whose rest goes to an unnamed file.
+/// `.mha` also 32 MiB of compressed data, whose rest goes to an unnamed file next to it. For `.zarr` it is a chunk of
+/// 1 MiB per level and a few more; for `.dicom` a slice and up to 32 MiB of 32-bit floats, whose rest goes to an unnamed file.
 pub fn write_voxels(path: impl AsRef<Path>, voxels: &mut dyn Voxels) -> Result<()> {
     write_voxels_of(path, voxels, None)
 }
