@@ -11,7 +11,7 @@
 use crate::calibration::CLEAR;
 use crate::calibration::consistency::Consistency;
 use crate::calibration::parameters::{Correction, Parameter};
-use crate::calibration::search::{Evidence, Meter, REACH, shortened, solved};
+use crate::calibration::search::{Evidence, Meter, REACH, advance, solved};
 use conefield_core::Result;
 use conefield_core::parallel;
 
@@ -64,14 +64,11 @@ impl Newton<'_> {
             let around = self.around(active, &units, &here)?;
             evidence = self.evidence(&around, &units);
             let Some(step) = around.step(None) else { break };
-            let before: f64 = here.1.iter().sum();
-            let better = |there: &Correction| {
+            let better = |before: &Vec<f64>, there: &Correction| {
                 let found = self.misfits(there)?;
-                Ok((found.iter().sum::<f64>() < before).then_some(found))
+                Ok((found.iter().sum::<f64>() < before.iter().sum::<f64>()).then_some(found))
             };
-            let Some((there, found, last)) = shortened(active, &units, here.0, &step, better)? else { break };
-            here = (there, found);
-            if last {
+            if advance(active, &units, &mut here, &step, better)? {
                 break;
             }
         }

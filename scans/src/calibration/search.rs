@@ -136,13 +136,11 @@ impl Search<'_> {
             slopes = self.slopes(active, &units, here.0)?;
             let normal = Normal::of(&slopes, &here.1);
             let Some(step) = solved(normal.matrix, &normal.gradient) else { break };
-            let better = |there: &Correction| {
+            let better = |before: &Prediction, there: &Correction| {
                 let found = self.predict(there)?;
-                Ok((found.error < here.1.error).then_some(found))
+                Ok((found.error < before.error).then_some(found))
             };
-            let Some((there, found, last)) = shortened(active, &units, here.0, &step, better)? else { break };
-            here = (there, found);
-            if last {
+            if advance(active, &units, &mut here, &step, better)? {
                 break;
             }
         }
@@ -242,26 +240,27 @@ pub(crate) fn solved(matrix: Vec<Vec<f64>>, gradient: &[f64]) -> Option<Vec<f64>
     Some(inverse(damped(matrix))?.iter().map(|row| -inner(row, gradient)).collect())
 }
 
-/// The first of ever shorter parts of `step` from `here` that is `better`, with what this has found there and whether
-/// the part is too small for a further step; `None` if none is. `units` are pixels of the parameters `active`.
-pub(crate) fn shortened<T>(
+/// Moves `here` by the first of ever shorter parts of `step` that is `better` than what has been found there; stays if
+/// none is. Returns whether this is the last step. `units` are pixels of the parameters `active`.
+pub(crate) fn advance<T>(
     active: &[Parameter],
     units: &[f64],
-    here: Correction,
+    here: &mut (Correction, T),
     step: &[f64],
-    better: impl Fn(&Correction) -> Result<Option<T>>,
-) -> Result<Option<(Correction, T, bool)>> {
+    better: impl Fn(&T, &Correction) -> Result<Option<T>>,
+) -> Result<bool> {
     let longest = step.iter().fold(0.0f64, |m, s| m.max(s.abs()));
     let mut share = (LONGEST / longest.max(1e-12)).min(1.0);
     for _ in 0..=CUTS {
         let moves = active.iter().zip(units).zip(step);
-        let there = moves.fold(here, |c, ((&p, unit), s)| c.with(p, c.get(p) + share * s * unit));
-        if let Some(found) = better(&there)? {
-            return Ok(Some((there, found, share * longest < SMALL)));
+        let there = moves.fold(here.0, |c, ((&p, unit), s)| c.with(p, c.get(p) + share * s * unit));
+        if let Some(found) = better(&here.1, &there)? {
+            *here = (there, found);
+            return Ok(share * longest < SMALL);
         }
         share /= 3.0;
     }
-    Ok(None)
+    Ok(true)
 }
 
 /// Adds a small number to the diagonal: a parameter that the views do not determine then keeps its value.

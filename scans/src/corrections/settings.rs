@@ -76,8 +76,11 @@ mod tests {
     fn names_settings_and_words_are_read() {
         let c = Corrections::parse(&["rings", "flux"]).unwrap();
         assert_eq!((c.rings, c.flux.is_some(), c.pixels), (Some(Rings::default()), true, None));
-        for order in [["rings.window=21", "rings.method=sorting"], ["rings.method = \"sorting\"", "rings.window = 21"]]
-        {
+        for order in [
+            ["rings.window=21", "rings.method=sorting"],
+            ["rings.method = \"sorting\"", "rings.window = 21"],
+            ["rings={ window = 21 }", "rings={ method = 'sorting' }"],
+        ] {
             let c = Corrections::parse(&order).unwrap();
             assert_eq!(c.rings, Some(Rings { window: 21, method: RingMethod::Sorting }));
         }
