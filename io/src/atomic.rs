@@ -87,6 +87,18 @@ fn begin<T>(
     }
 }
 
+/// The name of an unfinished file or folder, and its permissions: without them it would be private to its owner, unlike
+/// the user's other files.
+fn temporary(mode: u32) -> tempfile::Builder<'static, 'static> {
+    let mut options = tempfile::Builder::new();
+    options.prefix(UNFINISHED[0]).suffix(UNFINISHED[1]);
+    #[cfg(unix)]
+    options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(mode));
+    #[cfg(not(unix))]
+    let _ = mode;
+    options
+}
+
 /// Writes a file through `fill`: into a temporary file in the same folder, which is flushed, synced and renamed.
 ///
 /// If `fill` or the system fails, an earlier file of that name stays unchanged and the temporary file is removed.
@@ -98,20 +110,15 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
     if path.is_dir() {
         return Err(Error::invalid(path.display().to_string(), "file", "a folder", "a name for a file"));
     }
-    let mut options = tempfile::Builder::new();
-    options.prefix(UNFINISHED[0]).suffix(UNFINISHED[1]);
-    // Without this the file would be private to its owner, unlike the user's other files.
-    #[cfg(unix)]
-    options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666));
-    let (file, _lock, _noted) =
-        begin(&folder, || options.tempfile_in(&folder), |f| f.path()).map_err(|e| at(without_path(e)))?;
+    let made = begin(folder, || temporary(0o666).tempfile_in(folder), |f| f.path());
+    let (file, _lock, _noted) = made.map_err(|e| at(without_path(e)))?;
     // Writes to the file itself: errors of its guard would name the temporary path.
     let mut writer = BufWriter::with_capacity(1 << 20, file.as_file());
     fill(&mut writer)?;
     writer.into_inner().map_err(|e| at(e.into_error()))?;
     file.as_file().sync_all().map_err(at)?;
     file.persist(path).map_err(|e| at(e.error))?;
-    sync_folder(&folder);
+    sync_folder(folder);
     Ok(())
 }
 
@@ -132,12 +139,8 @@ pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) ->
         return Err(Error::invalid(folder.display().to_string(), "folder", "no name of its own", "a folder to create"));
     }
     lease::put_back_missing(folder)?;
-    let mut options = tempfile::Builder::new();
-    options.prefix(UNFINISHED[0]).suffix(UNFINISHED[1]);
-    #[cfg(unix)]
-    options.permissions(<fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o777));
-    let (new, _lock, _noted) =
-        begin(&beside, || options.tempdir_in(&beside), |d| d.path()).map_err(|e| at(without_path(e)))?;
+    let made = begin(beside, || temporary(0o777).tempdir_in(beside), |d| d.path());
+    let (new, _lock, _noted) = made.map_err(|e| at(without_path(e)))?;
     fill(new.path()).map_err(|e| renamed(e, new.path(), folder))?;
     sync_folder(new.path());
     if folder.symlink_metadata().is_err() {
@@ -150,7 +153,7 @@ pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) ->
         lease::replace_in_two_steps(new.path(), folder)?;
         let _ = new.keep();
     }
-    sync_folder(&beside);
+    sync_folder(beside);
     Ok(())
 }
 
@@ -198,11 +201,8 @@ fn without_path(e: std::io::Error) -> std::io::Error {
 }
 
 /// The folder that holds `path`.
-pub(crate) fn parent(path: &Path) -> PathBuf {
-    match path.parent() {
-        Some(p) if !p.as_os_str().is_empty() => p.to_path_buf(),
-        _ => PathBuf::from("."),
-    }
+pub(crate) fn parent(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Syncs the folder, so that a rename survives a power cut where the system supports that. The data is already synced.

@@ -45,12 +45,12 @@ pub(crate) fn is_series(folder: &Path) -> bool {
 /// units in a CT), padding as well. The affine is RAS, in mm; `grid.center` is `[0, 0, 0]`.
 pub(crate) fn read(folder: &Path) -> Result<Volume> {
     let place = folder.display().to_string();
-    assemble(&place, slices(folder)?, Slice::values)
+    assemble(&place, slices(folder)?, &Slice::values)
 }
 
 /// Number of voxels that [`read`] returns, from the headers of the slices.
 pub(crate) fn voxels(folder: &Path) -> Result<u64> {
-    Ok(slices(folder)?.iter().map(|s| s.rows as u64 * s.columns as u64).sum())
+    Ok(slices(folder)?.iter().map(|s| s.format.count() as u64).sum())
 }
 
 /// The slices of the one series of `folder`, without their values.
@@ -99,7 +99,7 @@ fn is_dicom(path: &Path) -> Result<bool> {
     Ok(is_header(&head))
 }
 
-fn assemble(place: &str, mut slices: Vec<Slice>, values: impl Fn(&Slice) -> Result<Vec<f32>>) -> Result<Volume> {
+fn assemble(place: &str, mut slices: Vec<Slice>, values: &dyn Fn(&Slice) -> Result<Vec<f32>>) -> Result<Volume> {
     for other in &slices[1..] {
         other.must_fit(&slices[0])?;
     }
@@ -121,7 +121,7 @@ fn assemble(place: &str, mut slices: Vec<Slice>, values: impl Fn(&Slice) -> Resu
     let spacing = [first.spacing[1], first.spacing[0], step];
     let steps = [row.map(|x| x * spacing[0]), column.map(|x| x * spacing[1]), normal.map(|x| x * spacing[2])];
     let lps = affine::from_columns(steps, first.position);
-    let grid = VoxelGrid { shape: [first.columns, first.rows, slices.len()], spacing, center: [0.0; 3] };
+    let grid = VoxelGrid { shape: [first.format.columns, first.format.rows, slices.len()], spacing, center: [0.0; 3] };
     grid.validate(place)?;
     if !affine::is_regular(&lps) {
         return Err(Error::invalid(place, "ImagePositionPatient", format!("{lps:?}"), "three independent voxel axes"));
@@ -131,7 +131,7 @@ fn assemble(place: &str, mut slices: Vec<Slice>, values: impl Fn(&Slice) -> Resu
     for (z, slice) in slices.iter().enumerate() {
         let values = values(slice)?;
         let mut plane = data.slice_mut(s![.., .., z]);
-        for (y, row) in values.chunks_exact(slice.columns).enumerate() {
+        for (y, row) in values.chunks_exact(slice.format.columns).enumerate() {
             for (x, value) in row.iter().enumerate() {
                 plane[[x, y]] = *value;
             }

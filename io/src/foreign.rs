@@ -21,36 +21,29 @@ const HIS: &str = "name the _Frames.xml of its scan, or describe the images in a
 const ZEISS: &str = "a scan of Zeiss is read from its .txrm, and a volume from TIFF files; describe other projections in \
                      a scanner.toml (docs/guide/formats.md)";
 
-/// First bytes of a file, the format's name and what to do.
-const FORMATS: &[(&[u8], &str, &str)] = &[
-    (b"VARIAN_VA_INTERNAL_HND", "Varian's HND, an image of a scan: not read alone", OBI),
-    (b"VARIAN_VA_INTERNAL_HNC", "Varian's HNC, an image of a scan: not read alone", OBI),
-    (b"VMS.XI", "Varian's XIM, an image of a scan: not read alone", XIM),
+/// First bytes of a file, extension of a file that no first bytes identify (either may be empty: it identifies none), the
+/// format's name and what to do.
+const FORMATS: &[(&[u8], &str, &str, &str)] = &[
+    (b"VARIAN_VA_INTERNAL_HND", "hnd", "Varian's HND, an image of a scan: not read alone", OBI),
+    (b"VARIAN_VA_INTERNAL_HNC", "hnc", "Varian's HNC, an image of a scan: not read alone", OBI),
+    (b"VMS.XI", "xim", "Varian's XIM, an image of a scan: not read alone", XIM),
     // Type 0x7000, a header of 68 bytes, whose image part has another 32.
-    (b"\x00\x70\x44\x00", "HIS, an image of a scan: not read alone", HIS),
-    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "an OLE file such as Zeiss' TXM: not read here", ZEISS),
-    (b"MATLAB ", "MATLAB's MAT file: not read", MAT),
-    (b"SIMPLE  =", "FITS: not read", EXPORT),
-    (b"\x89PNG\r\n", "PNG: not read", EXPORT),
-    (b"\xff\xd8\xff", "JPEG: not read", EXPORT),
-    (b"ncaa", "VFF: not read", EXPORT),
-];
-
-/// Extensions of these formats, for files that no mark identifies.
-const EXTENSIONS: &[(&str, &str, &str)] = &[
-    ("hnd", "Varian's HND, an image of a scan: not read alone", OBI),
-    ("hnc", "Varian's HNC, an image of a scan: not read alone", OBI),
-    ("xim", "Varian's XIM, an image of a scan: not read alone", XIM),
-    ("his", "HIS, an image of a scan: not read alone", HIS),
-    ("txm", "Zeiss' TXM, a volume: not read", ZEISS),
+    (b"\x00\x70\x44\x00", "his", "HIS, an image of a scan: not read alone", HIS),
+    (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "", "an OLE file such as Zeiss' TXM: not read here", ZEISS),
+    (b"MATLAB ", "", "MATLAB's MAT file: not read", MAT),
+    (b"SIMPLE  =", "", "FITS: not read", EXPORT),
+    (b"\x89PNG\r\n", "", "PNG: not read", EXPORT),
+    (b"\xff\xd8\xff", "", "JPEG: not read", EXPORT),
+    (b"ncaa", "", "VFF: not read", EXPORT),
+    (b"", "txm", "Zeiss' TXM, a volume: not read", ZEISS),
 ];
 
 /// The name of the format of `path`, which starts with `head`, and what to do.
 fn format(path: &Path, head: &[u8]) -> Option<(&'static str, &'static str)> {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
-    let marked = FORMATS.iter().find(|(mark, ..)| head.starts_with(mark)).map(|(_, name, way)| (*name, *way));
-    let named = || EXTENSIONS.iter().find(|(end, ..)| *end == extension).map(|(_, name, way)| (*name, *way));
-    marked.or_else(named)
+    let marked = FORMATS.iter().find(|(mark, ..)| !mark.is_empty() && head.starts_with(mark));
+    let named = || FORMATS.iter().find(|(_, end, ..)| !end.is_empty() && *end == extension);
+    marked.or_else(named).map(|(.., name, way)| (*name, *way))
 }
 
 /// Refuses the file `path`, which starts with `head`, if its format is one of these. To be called where no reader has
@@ -71,9 +64,7 @@ pub(crate) fn refuse_file(path: &Path) -> Result<()> {
 
 /// Refuses a folder in which no reader has found its files, and one of these formats is among the first files.
 pub(crate) fn refuse_folder(folder: &Path) -> Result<()> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
-    let mut paths: Vec<_> = entries.flatten().map(|e| e.path()).filter(|p| p.is_file()).collect();
-    paths.sort();
+    let Ok(paths) = crate::dicom::files(folder) else { return Ok(()) };
     // Pictures beside the files of another format are not the scan.
     let picture =
         |p: &Path| p.extension().is_some_and(|e| ["png", "jpg", "jpeg"].iter().any(|k| e.eq_ignore_ascii_case(k)));

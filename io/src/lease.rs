@@ -103,8 +103,9 @@ impl Lease {
         let mut lease = Self { path: path.to_path_buf(), contents, locks, missing, writing: false, made: false };
         lease.settle()?;
         // A folder that was put back has its own lock.
-        let more = own_again(&lease)?;
-        lease.locks.extend(more);
+        if !lease.locks.iter().any(|held| lock::is_at(held, path)) {
+            lease.locks.extend(own(path)?);
+        }
         Ok(lease)
     }
 
@@ -151,13 +152,8 @@ impl Lease {
             let slot = aside.join(waiting(&aside)?.len().to_string());
             fs::create_dir_all(&slot).map_err(at)?;
             let new = own(&slot)?;
-            if !exchange(&slot, &self.path).map_err(at)? {
-                let beside = aside.join("new");
-                fs::rename(&slot, &beside).map_err(at)?;
-                fs::rename(&self.path, &slot).map_err(at)?;
-                fs::rename(&beside, &self.path).map_err(at)?;
-            }
-            sync_folder(&parent(&self.path));
+            swap(&self.path, &slot, &aside).map_err(at)?;
+            sync_folder(parent(&self.path));
             self.locks.extend(new);
         }
         self.writing = true;
@@ -199,7 +195,7 @@ impl Lease {
                 }
                 // Files that someone else put there stay where they can be found.
                 let _ = fs::remove_dir(&earlier).and_then(|()| fs::remove_dir(&aside));
-                sync_folder(&parent(&self.path));
+                sync_folder(parent(&self.path));
                 Ok(())
             }
         }
@@ -360,28 +356,25 @@ fn folders(path: &Path, depth: usize, wanted: fn(&Path) -> bool, found: &mut Vec
     Ok(())
 }
 
-/// Locks the folder at the lease's path, unless the lease already holds that lock.
-fn own_again(lease: &Lease) -> Result<Vec<File>> {
-    let same = |lock: &File| {
-        let a = lock.try_clone().and_then(same_file::Handle::from_file);
-        a.ok().zip(same_file::Handle::from_path(&lease.path).ok()).is_some_and(|(a, b)| a == b)
-    };
-    if lease.locks.iter().any(same) { Ok(vec![]) } else { own(&lease.path) }
-}
-
 /// Puts `earlier` back to `path`. If `path` exists, it holds work without a result and moves to `earlier`.
 fn put_back(earlier: &Path, path: &Path) -> Result<()> {
-    let at = |e| Error::io(path, e);
-    if path.symlink_metadata().is_err() {
-        return fs::rename(earlier, path).map_err(at);
-    }
-    if exchange(earlier, path).map_err(at)? {
+    let back = match path.symlink_metadata() {
+        Ok(_) => swap(earlier, path, parent(earlier)),
+        Err(_) => fs::rename(earlier, path),
+    };
+    back.map_err(|e| Error::io(path, e))
+}
+
+/// Exchanges the folder `earlier`, which must not be lost, and `other`. Where the system cannot do that in one step,
+/// `other` waits in the folder `aside`: what ends the process meanwhile leaves `earlier` under one of the two names.
+fn swap(earlier: &Path, other: &Path, aside: &Path) -> std::io::Result<()> {
+    if exchange(earlier, other)? {
         return Ok(());
     }
-    let between = parent(earlier).join("new");
-    fs::rename(path, &between).map_err(at)?;
-    fs::rename(earlier, path).map_err(at)?;
-    fs::rename(&between, earlier).map_err(at)
+    let between = aside.join("new");
+    fs::rename(other, &between)?;
+    fs::rename(earlier, other)?;
+    fs::rename(&between, earlier)
 }
 
 /// Replaces `folder` by `new` where two names cannot be exchanged in one step: moves `folder` aside, then renames

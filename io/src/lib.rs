@@ -28,6 +28,7 @@ mod file_order;
 mod folder;
 mod foreign;
 mod hdf5;
+mod header;
 mod input;
 mod lease;
 mod lock;

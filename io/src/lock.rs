@@ -34,6 +34,11 @@ fn lock(path: &Path, way: fn(&File) -> Result<(), TryLockError>) -> Held {
         Ok(()) => {}
     }
     // The name may have come to refer to something else between opening and locking.
-    let same = file.try_clone().and_then(Handle::from_file).ok().zip(Handle::from_path(path).ok());
-    if same.is_some_and(|(a, b)| a == b) { Held::Ours(file) } else { Held::Unknown }
+    if is_at(&file, path) { Held::Ours(file) } else { Held::Unknown }
+}
+
+/// Whether `path` is a name of the open `file`.
+pub(crate) fn is_at(file: &File, path: &Path) -> bool {
+    let open = file.try_clone().and_then(Handle::from_file).ok();
+    open.zip(Handle::from_path(path).ok()).is_some_and(|(a, b)| a == b)
 }

@@ -13,6 +13,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
+use flate2::{Compression, GzBuilder};
 use nifti::{Endianness, NiftiHeader};
 use std::io::Write;
 use std::path::Path;
@@ -260,13 +261,21 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
     file_order::write(w, path, voxels, FileOrder::XFastest)
 }
 
+/// Writes `voxels` like [`write`], in gzip.
+pub(crate) fn write_packed(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
+    let mut packed = GzBuilder::new().write(w, Compression::fast());
+    write(&mut packed, path, voxels)?;
+    packed.finish().and_then(|w| w.flush()).map_err(|e| Error::io(path, e))
+}
+
 #[cfg(test)]
 mod tests {
-    use crate::testing::{data, file, gzip, says};
+    use crate::number::Number;
+    use crate::testing::{file, gzip, says};
+    use crate::volume::tests::two_of_each;
     use crate::{read_volume, write_volume};
     use conefield_core::scan::Volume;
     use ndarray::Array3;
-    use std::io::Read;
 
     fn volume() -> Volume {
         let data = Array3::from_shape_fn((4, 3, 2), |(x, y, z)| x as f32 + 10.0 * y as f32 + 100.0 * z as f32);
@@ -328,24 +337,32 @@ mod tests {
         assert_eq!(read_volume(&f.1).unwrap().data, volume().data);
     }
 
+    /// The header of 2×1×1 voxels without an orientation: type and bits of a number, `pixdim`, slope and intercept.
+    fn header(big_endian: bool, [code, bits]: [i16; 2], pixdim: [f32; 4], scaling: [f32; 2]) -> Vec<u8> {
+        let mut b = vec![0u8; 352];
+        let mut put = |at: usize, little: &[u8]| {
+            let field = &mut b[at..at + little.len()];
+            field.copy_from_slice(little);
+            if big_endian {
+                field.reverse();
+            }
+        };
+        put(0, &348i32.to_le_bytes());
+        for (i, x) in [4i16, 2, 1, 1, 1].into_iter().enumerate() {
+            put(40 + 2 * i, &x.to_le_bytes());
+        }
+        put(70, &code.to_le_bytes());
+        put(72, &bits.to_le_bytes());
+        pixdim.into_iter().enumerate().for_each(|(i, x)| put(76 + 4 * i, &x.to_le_bytes()));
+        scaling.into_iter().enumerate().for_each(|(i, x)| put(112 + 4 * i, &x.to_le_bytes()));
+        b[344..348].copy_from_slice(b"n+1\0");
+        b
+    }
+
     #[test]
     fn integers_scale_and_swap() {
-        // Big-endian int16 with slope and intercept, 2×1×1.
-        let mut b = vec![0u8; 352];
-        let mut put = |at: usize, x: &[u8]| b[at..at + x.len()].copy_from_slice(x);
-        put(0, &348i32.to_be_bytes());
-        for (i, d) in [4i16, 2, 1, 1, 1, 1, 1, 1].iter().enumerate() {
-            put(40 + 2 * i, &d.to_be_bytes());
-        }
-        put(70, &4i16.to_be_bytes());
-        put(72, &16i16.to_be_bytes());
-        for (i, p) in [1.0f32, 2.0, -3.0, 4.0].iter().enumerate() {
-            put(76 + 4 * i, &p.to_be_bytes());
-        }
-        put(112, &0.5f32.to_be_bytes());
-        put(116, &(-1.0f32).to_be_bytes());
-        put(123, &[3]);
-        put(344, b"n+1\0");
+        let mut b = header(true, [4, 16], [1.0, 2.0, -3.0, 4.0], [0.5, -1.0]);
+        b[123] = 3;
         b.extend([(-4i16).to_be_bytes(), 6i16.to_be_bytes()].concat());
         let v = read_volume(&file("a.nii", &[&b]).1).unwrap();
         assert_eq!(v.data.as_slice().unwrap(), [-3.0, 2.0]);
@@ -372,49 +389,25 @@ mod tests {
 
     #[test]
     fn every_type_is_read_in_both_orders() {
-        macro_rules! both {
-            ($($code:literal $t:ty: $a:expr, $b:expr;)*) => {$(
-                for big in [false, true] {
-                    let mut b = vec![0u8; 352];
-                    let mut put = |at: usize, little: &[u8]| {
-                        let n = little.len();
-                        b[at..at + n].copy_from_slice(little);
-                        if big {
-                            b[at..at + n].reverse();
-                        }
-                    };
-                    put(0, &348i32.to_le_bytes());
-                    for (i, d) in [3i16, 2, 1, 1].iter().enumerate() {
-                        put(40 + 2 * i, &d.to_le_bytes());
-                    }
-                    put(70, &($code as i16).to_le_bytes());
-                    put(72, &(8 * size_of::<$t>() as i16).to_le_bytes());
-                    for i in 0..4 {
-                        put(76 + 4 * i, &1f32.to_le_bytes());
-                    }
-                    put(112, &0.5f32.to_le_bytes());
-                    put(116, &(-8f32).to_le_bytes());
-                    b[344..348].copy_from_slice(b"n+1\0");
-                    for x in [$a as $t, $b as $t] {
-                        b.extend(if big { x.to_be_bytes() } else { x.to_le_bytes() });
-                    }
-                    let found = read_volume(&file("a.nii", &[&b]).1).unwrap().data;
-                    let want = [$a as $t, $b as $t].map(|x| (0.5 * x as f64 - 8.0) as f32);
-                    assert_eq!(found.as_slice().unwrap(), want, "{} big {big}", $code);
-                }
-            )*};
-        }
-        both! {
-            2 u8: 0, 255;
-            4 i16: -32768, 258;
-            8 i32: i32::MIN, 16909060;
-            16 f32: -1.5, 3.25e-3;
-            64 f64: -1.5, 0.1;
-            256 i8: -128, 127;
-            512 u16: 65535, 258;
-            768 u32: u32::MAX, 16909060;
-            1024 i64: i64::MIN, 72623859790382856i64;
-            1280 u64: u64::MAX, 72623859790382856i64;
+        let codes = [
+            (Number::U8, 2i16),
+            (Number::I16, 4),
+            (Number::I32, 8),
+            (Number::F32, 16),
+            (Number::F64, 64),
+            (Number::I8, 256),
+            (Number::U16, 512),
+            (Number::U32, 768),
+            (Number::I64, 1024),
+            (Number::U64, 1280),
+        ];
+        for (number, values, bytes) in two_of_each() {
+            let code = codes.iter().find(|(n, _)| *n == number).unwrap().1;
+            for (big, bytes) in [false, true].into_iter().zip(bytes) {
+                let b = header(big, [code, 8 * number.bytes() as i16], [1.0; 4], [0.5, -8.0]);
+                let found = read_volume(&file("a.nii", &[&b, &bytes]).1).unwrap().data;
+                assert_eq!(found.as_slice().unwrap(), values.map(|x| (0.5 * x - 8.0) as f32), "{number:?}, big {big}");
+            }
         }
     }
 
@@ -425,7 +418,6 @@ mod tests {
         refused(b"a text that is no volume", &["NIfTI", "NumPy"]);
         refused(&with(0, &1i32.to_le_bytes()), &["sizeof_hdr"]);
         refused(&with(40, &2i16.to_le_bytes()), &["dim[0]", "found 2"]);
-        refused(&with(70, &2048i16.to_le_bytes()), &["datatype", "complex"]);
         refused(&with(116, &f32::INFINITY.to_le_bytes()), &["scl_inter", "inf"]);
         refused(&with(123, &[5]), &["xyzt_units", "5"]);
     }
@@ -443,40 +435,5 @@ mod tests {
         // The sform's second column gets a part along x.
         let sheared = said(&with(284, &0.75f32.to_le_bytes()));
         assert!(sheared.contains("x and y of the voxels are at 45.00 degrees"), "{sheared}");
-    }
-
-    #[test]
-    fn a_clinical_file_keeps_its_place_and_spacing() {
-        let Some(path) = data("clinical/abdomen_ct_hu.nii.gz") else { return };
-        let v = read_volume(&path).unwrap();
-        assert_eq!(v.grid.shape, [122, 101, 112]);
-        for s in v.grid.spacing {
-            assert!((s - 3.0).abs() < 1e-6, "{s}");
-        }
-        assert_eq!(v.grid.center, [0.0; 3]);
-        let low = v.data.iter().copied().fold(f32::INFINITY, f32::min);
-        let high = v.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-        assert!((-3100.0..=-900.0).contains(&low) && high > 300.0, "{low} to {high} are no Hounsfield units");
-        // Compared with the raw header: int32, sform rows at byte 280, x fastest.
-        let mut raw = Vec::new();
-        flate2::read::MultiGzDecoder::new(std::fs::File::open(&path).unwrap()).read_to_end(&mut raw).unwrap();
-        let f = |at: usize| f32::from_le_bytes(raw[at..at + 4].try_into().unwrap()) as f64;
-        let a = v.affine.unwrap();
-        for r in 0..3 {
-            for c in 0..4 {
-                assert_eq!(a[r][c], f(280 + 16 * r + 4 * c));
-            }
-        }
-        assert!((0..3).any(|r| a[r][3] != 0.0), "the file has an offset");
-        let start = f(108).max(352.0) as usize;
-        for (x, y, z) in [(0, 0, 0), (60, 50, 56), (121, 3, 111), (5, 100, 7)] {
-            let at = start + 4 * (x + 122 * (y + 101 * z));
-            assert_eq!(v.data[[x, y, z]], i32::from_le_bytes(raw[at..at + 4].try_into().unwrap()) as f32);
-        }
-        let dir = tempfile::tempdir().unwrap();
-        let out = dir.path().join("out.nii.gz");
-        write_volume(&out, &v).unwrap();
-        let back = read_volume(&out).unwrap();
-        assert_eq!((back.affine, back.grid, back.data), (v.affine, v.grid, v.data));
     }
 }

@@ -33,15 +33,10 @@ pub(crate) fn read(path: &Path, axes: &[&str]) -> Result<ArrayD<f32>> {
 
 /// Reads the rest after `start`, the bytes (at most eight) read from `input` to recognize the format.
 pub(crate) fn read_from(input: &mut Input, start: Vec<u8>, axes: &[&str]) -> Result<ArrayD<f32>> {
-    read_one_of(input, start, &[axes])
+    read_counts(input, start, &[axes]).map(|(array, _)| array)
 }
 
-/// Like [`read_from`], for an array with any of several sets of axes.
-pub(crate) fn read_one_of(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
-    read_counts(input, start, sets).map(|(array, _)| array)
-}
-
-/// Like [`read_one_of`], with the type of the numbers in the file.
+/// Like [`read_from`], for an array with any of several sets of axes, with the type of the numbers in the file.
 pub(crate) fn read_counts(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<(ArrayD<f32>, Number)> {
     let header = read_header(input, start)?;
     array(input, &header, sets)
@@ -54,17 +49,17 @@ pub(crate) fn array(input: &mut Input, header: &Header, sets: &[&[&str]]) -> Res
         each.join(" or ")
     };
     if !sets.iter().any(|axes| header.shape.len() == axes.len()) {
-        return Err(input.invalid("shape", shape_text(&header.shape), expected()));
+        return Err(input.invalid("shape", format!("{:?}", header.shape), expected()));
     }
     if header.shape.contains(&0) {
-        return Err(input.invalid("shape", shape_text(&header.shape), "at least one element along every axis"));
+        return Err(input.invalid("shape", format!("{:?}", header.shape), "at least one element along every axis"));
     }
     let count = header
         .shape
         .iter()
         .try_fold(1usize, |n, &s| n.checked_mul(s))
         .filter(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize))
-        .ok_or_else(|| input.invalid("shape", shape_text(&header.shape), "a size that can be addressed"))?;
+        .ok_or_else(|| input.invalid("shape", format!("{:?}", header.shape), "a size that can be addressed"))?;
     let values = input.singles("data", count, header.number, header.order)?;
     let array = ArrayD::from_shape_vec(IxDyn(&header.shape).set_f(header.fortran), values)
         .map_err(|e| input.invalid("shape", e, expected()))?;
@@ -87,7 +82,7 @@ pub(crate) fn exact(input: &mut Input, header: &Header) -> Result<(Vec<usize>, V
     let count = header.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
     let fits = count.filter(|n| (1..=2).contains(&header.shape.len()) && *n > 0 && *n < 1 << 32);
     let count = fits.ok_or_else(|| {
-        input.invalid("shape", shape_text(&header.shape), "one or two axes with at least one element along each")
+        input.invalid("shape", format!("{:?}", header.shape), "one or two axes with at least one element along each")
     })?;
     let values = input.doubles("data", count, header.number, header.order)?;
     let values = match (header.fortran, &header.shape[..]) {
@@ -148,10 +143,11 @@ fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
         return Err(input.invalid("magic", format!("{:02x?}", &magic[..6]), "93 4e 55 4d 50 59 (\\x93NUMPY)"));
     }
     let length = match magic[6] {
-        1 => fill(input, 2)?.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize),
-        2 | 3 => fill(input, 4)?.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize),
+        1 => fill(input, 2)?,
+        2 | 3 => fill(input, 4)?,
         v => return Err(input.invalid("version", v, "1, 2 or 3")),
     };
+    let length = length.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize);
     if length > LONGEST_HEADER {
         return Err(input.invalid("header length", length, format!("at most {LONGEST_HEADER} bytes")));
     }
@@ -212,10 +208,6 @@ pub(crate) fn element(descr: &str) -> Option<(Number, ByteOrder)> {
     Some((number, order))
 }
 
-fn shape_text(shape: &[usize]) -> String {
-    format!("{shape:?}")
-}
-
 /// The three kinds of value in a header.
 enum Literal {
     Text(String),
@@ -234,21 +226,25 @@ impl Python<'_> {
         Some(())
     }
 
-    fn dict(&mut self, mut entry: impl FnMut(&str, Literal) -> Option<()>) -> Option<()> {
-        self.eat("{")?;
-        loop {
-            if self.eat("}").is_some() {
-                return self.rest.trim().is_empty().then_some(());
-            }
-            let key = self.text()?;
-            self.eat(":")?;
-            let value = self.value()?;
-            entry(&key, value)?;
+    /// Items up to `close`, separated by commas.
+    fn items(&mut self, close: &str, item: &mut dyn FnMut(&mut Self) -> Option<()>) -> Option<()> {
+        while self.eat(close).is_none() {
+            item(self)?;
             if self.eat(",").is_none() {
-                self.eat("}")?;
-                return self.rest.trim().is_empty().then_some(());
+                return self.eat(close);
             }
         }
+        Some(())
+    }
+
+    fn dict(&mut self, mut entry: impl FnMut(&str, Literal) -> Option<()>) -> Option<()> {
+        self.eat("{")?;
+        self.items("}", &mut |parser| {
+            let key = parser.text()?;
+            parser.eat(":")?;
+            entry(&key, parser.value()?)
+        })?;
+        self.rest.trim().is_empty().then_some(())
     }
 
     fn text(&mut self) -> Option<String> {
@@ -271,21 +267,16 @@ impl Python<'_> {
             return self.text().map(Literal::Text);
         }
         let mut shape = Vec::new();
-        loop {
-            if self.eat(")").is_some() {
-                return Some(Literal::Tuple(shape));
-            }
-            self.rest = self.rest.trim_start();
-            let end = self.rest.find(|c: char| !c.is_ascii_digit())?;
-            shape.push(self.rest[..end].parse().ok()?);
-            self.rest = &self.rest[end..];
+        self.items(")", &mut |parser| {
+            parser.rest = parser.rest.trim_start();
+            let end = parser.rest.find(|c: char| !c.is_ascii_digit())?;
+            shape.push(parser.rest[..end].parse().ok()?);
+            parser.rest = &parser.rest[end..];
             // Python 2's suffix of long integers.
-            let _ = self.eat("L");
-            if self.eat(",").is_none() {
-                self.eat(")")?;
-                return Some(Literal::Tuple(shape));
-            }
-        }
+            let _ = parser.eat("L");
+            Some(())
+        })?;
+        Some(Literal::Tuple(shape))
     }
 }
 

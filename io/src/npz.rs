@@ -15,7 +15,7 @@ pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
 
 /// Reads the array `name` of the archive (the only one if `None`) with any of the sets of axes, like [`npy::read`].
 pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
-    npy::read_one_of(&mut open(path, name)?, Vec::new(), sets)
+    npy::read_counts(&mut open(path, name)?, Vec::new(), sets).map(|(array, _)| array)
 }
 
 /// Shape and numbers of the small array `name`, like [`npy::read_exact`].

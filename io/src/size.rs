@@ -49,19 +49,18 @@ pub fn scan_size(path: impl AsRef<Path>) -> Result<ScanSize> {
         }
         ScanFile::Scanner(file) => scanner::size(&file)?,
     };
-    let all =
-        [("pixels of all views", size.pixels), ("pixels of test views", size.test_pixels), ("voxels", size.voxels)];
-    for (field, n) in all {
-        must_exist(path, field, n)?;
-    }
-    Ok(size)
+    checked(path, size)
 }
 
 /// The size of the scan that a scanner's description gives.
 pub fn scanner_size(path: impl AsRef<Path>) -> Result<ScanSize> {
-    let path = path.as_ref();
-    let size = scanner::size(path)?;
+    checked(path.as_ref(), scanner::size(path.as_ref())?)
+}
+
+/// Refuses a size that no machine holds.
+fn checked(path: &Path, size: ScanSize) -> Result<ScanSize> {
     must_exist(path, "pixels of all views", size.pixels)?;
+    must_exist(path, "pixels of test views", size.test_pixels)?;
     must_exist(path, "voxels", size.voxels)?;
     Ok(size)
 }

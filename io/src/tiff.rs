@@ -56,24 +56,25 @@ pub(crate) struct Stack {
 /// Converts 8 to 64 bits per pixel, integers or floats, to `f32`. Refuses other colour types, sizes that the file
 /// cannot hold, values that are not finite and damaged files, and a file that holds more images than are found.
 pub(crate) fn read(path: &Path) -> Result<Stack> {
-    stack(path, |_| Ok(())).map(|(stack, _)| stack)
+    let (values, images) = stack(path, |_| ())?;
+    Ok(Stack { values, numbers: images.sample.to_string() })
 }
 
-/// Like [`read`]; `first` gets the decoder at the first page.
-fn stack(path: &Path, first: impl FnOnce(&mut Pages) -> Result<()>) -> Result<(Stack, Images)> {
+/// The values as in [`read`]; `first` gets the decoder at the first page.
+fn stack(path: &Path, first: impl FnOnce(&mut Pages)) -> Result<(Array3<f32>, Images)> {
     let place = path.display().to_string();
     let mut values = Vec::<f32>::new();
     let mut first = Some(first);
     let images = images(path, |decoder, page| {
         if let Some(first) = first.take() {
-            first(decoder)?;
+            first(decoder);
         }
         let count = usize::try_from(page.pixels).unwrap_or(usize::MAX);
         memory::grow(&mut values, count, usize::MAX, &place, "pages")?;
         // The stored page and its decompressed strips or tiles.
         allowance::memory(&place, "page", page.bytes.saturating_mul(2))?;
-        if zstd::is_packed(decoder) {
-            return zstd::read(&place, decoder, page.size, page.sample, &mut values);
+        if compression(&place, decoder)? == zstd::ZSTD {
+            return zstd::read(&place, decoder, &page, &mut values);
         }
         append(&mut values, decoder.read_image().map_err(|e| broken(&place, &e))?);
         Ok(())
@@ -104,7 +105,7 @@ fn stack(path: &Path, first: impl FnOnce(&mut Pages) -> Result<()>) -> Result<(S
         Some(((p, r, c), x)) => {
             Err(Error::invalid(place, format!("page {p}, row {r}, column {c}"), x, "a finite number"))
         }
-        None => Ok((Stack { values: all, numbers: images.sample.to_string() }, images)),
+        None => Ok((all, images)),
     }
 }
 
@@ -147,13 +148,11 @@ impl Sample {
 
 impl std::fmt::Display for Sample {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let kind = match self.format {
-            1 => "unsigned integers",
-            2 => "signed integers",
-            3 => "floats",
-            _ => "numbers of an unknown format",
-        };
-        write!(f, "{}-bit {kind}", self.bits)
+        match self.number() {
+            Some(number) => number.fmt(f),
+            None if self.format == 3 => write!(f, "{}-bit floats", self.bits),
+            None => write!(f, "{}-bit numbers of an unknown format", self.bits),
+        }
     }
 }
 
@@ -217,12 +216,8 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
             let expected = format!("{}, as on the first page", like.sample);
             return Err(Error::invalid(&place, format!("page {pages}"), page.sample, expected));
         }
-        let mut list = |strips, tiles| {
-            let tag = if decoder.get_chunk_type() == ChunkType::Tile { tiles } else { strips };
-            decoder.find_tag_unsigned_vec::<u64>(tag).map(Option::unwrap_or_default).map_err(broken)
-        };
-        let offsets = list(Tag::StripOffsets, Tag::TileOffsets)?;
-        for (at, bytes) in offsets.into_iter().zip(list(Tag::StripByteCounts, Tag::TileByteCounts)?) {
+        let [offsets, sizes] = pieces(&place, &mut decoder)?;
+        for (at, bytes) in offsets.into_iter().zip(sizes) {
             stored = stored.saturating_add(bytes);
             end = end.max(at.saturating_add(bytes));
         }
@@ -331,6 +326,20 @@ fn compression(place: &str, decoder: &mut Pages) -> Result<u32> {
     decoder.find_tag_unsigned::<u32>(Tag::Compression).map(|c| c.unwrap_or(1)).map_err(|e| broken(place, &e))
 }
 
+/// The entries with offsets and sizes of the strips or tiles of the current page.
+fn tags(decoder: &Pages) -> [Tag; 2] {
+    match decoder.get_chunk_type() {
+        ChunkType::Strip => [Tag::StripOffsets, Tag::StripByteCounts],
+        ChunkType::Tile => [Tag::TileOffsets, Tag::TileByteCounts],
+    }
+}
+
+/// Offsets and sizes of the strips or tiles of the current page.
+fn pieces(place: &str, decoder: &mut Pages) -> Result<[Vec<u64>; 2]> {
+    let [offsets, sizes] = tags(decoder).map(|tag| decoder.find_tag_unsigned_vec(tag).map_err(|e| broken(place, &e)));
+    Ok([offsets?.unwrap_or_default(), sizes?.unwrap_or_default()])
+}
+
 /// Images without a directory, in one piece after the one page.
 struct Rest {
     /// The byte at which they start.
@@ -344,8 +353,7 @@ struct Rest {
 impl Rest {
     /// The images after the first of `claimed`. Refuses a file that does not hold them in one piece.
     fn of(place: &str, decoder: &mut Pages, page: &Page, pages: usize, claimed: u64, packed: u64) -> Result<Self> {
-        let broken = |e: TiffError| broken(place, &e);
-        let offsets = decoder.find_tag_unsigned_vec::<u64>(Tag::StripOffsets).map_err(broken)?.unwrap_or_default();
+        let [offsets, _] = pieces(place, decoder)?;
         let start = offsets.first().copied().unwrap_or(packed);
         let room = packed.saturating_sub(start);
         let strip = u64::from(decoder.chunk_dimensions().1).saturating_mul(page.bytes / page.size[0].max(1) as u64);
@@ -422,6 +430,7 @@ fn append(out: &mut Vec<f32>, image: DecodingResult) {
 mod tests {
     use super::*;
     use crate::testing::{file, says};
+    use ruzstd::encoding::{CompressionLevel, compress_to_vec};
     use std::fs::File;
     use tiff::encoder::{TiffEncoder, colortype as kind};
 
@@ -472,6 +481,18 @@ mod tests {
             assert_eq!(a.dim(), if *name == "tiles" { (1, 24, 25) } else { (3, 4, 5) });
             assert!(a.indexed_iter().all(|((p, r, c), x)| *x == want(p, r, c)), "{name}: {a}");
         }
+        // Integers in the other byte order.
+        let data: Vec<u8> = [258u16, 65_000].iter().flat_map(|x| x.to_be_bytes()).collect();
+        let packed = compress_to_vec(&data[..], CompressionLevel::Fastest);
+        let mut bytes = one_page(true, [2, 1], [1, 16], 1, "", &packed);
+        let mut put = |tag: u16, value: &[u8]| {
+            let at = bytes.windows(2).position(|w| w == tag.to_be_bytes()).unwrap() + 8;
+            bytes[at..at + value.len()].copy_from_slice(value);
+        };
+        put(259, &50_000u16.to_be_bytes());
+        put(279, &(packed.len() as u32).to_be_bytes());
+        std::fs::write(&path, &bytes).unwrap();
+        assert_eq!(read(&path).unwrap().values.as_slice().unwrap(), [258.0, 65_000.0]);
         let (_, whole) = ZSTD[0];
         let mut bytes = whole.to_vec();
         let at = bytes.windows(4).position(|w| w == [0x28, 0xb5, 0x2f, 0xfd]).unwrap();
@@ -479,13 +500,36 @@ mod tests {
         refused(&bytes, &["TIFF", "Zstandard"]);
     }
 
-    /// A file of one directory with `entries` and, from byte 1024 on, `data`.
-    fn one_page(big_endian: bool, entries: &[(u16, u16, u32, u32)], text: &str, data: &[u8]) -> Vec<u8> {
+    /// A file of one directory for the image of `columns` and `rows` at the start of `data`, whose numbers have this `format`
+    /// and `bits`.
+    fn one_page(
+        big_endian: bool,
+        [columns, rows]: [u32; 2],
+        [format, bits]: [u32; 2],
+        photometric: u32,
+        text: &str,
+        data: &[u8],
+    ) -> Vec<u8> {
         let half = |x: u16| if big_endian { x.to_be_bytes() } else { x.to_le_bytes() };
         let whole = |x: u32| if big_endian { x.to_be_bytes() } else { x.to_le_bytes() };
+        let mut entries: Vec<(u16, u16, u32, u32)> = vec![
+            (256, 4, 1, columns),
+            (257, 4, 1, rows),
+            (258, 3, 1, bits),
+            (259, 3, 1, 1),
+            (262, 3, 1, photometric),
+            (270, 2, text.len() as u32, 512),
+            (273, 4, 1, 1024),
+            (277, 3, 1, 1),
+            (278, 4, 1, rows),
+            (279, 4, 1, columns * rows * bits / 8),
+            (339, 3, 1, format),
+        ];
+        // What other programs leave out.
+        entries.retain(|e| !(e.0 == 270 && text.is_empty() || e.0 == 339 && format == 1));
         let mut out = if big_endian { b"MM".to_vec() } else { b"II".to_vec() };
         out.extend([half(42).to_vec(), whole(8).to_vec(), half(entries.len() as u16).to_vec()].concat());
-        for &(tag, kind, count, value) in entries {
+        for (tag, kind, count, value) in entries {
             out.extend([half(tag).to_vec(), half(kind).to_vec(), whole(count).to_vec()].concat());
             // A short fills the first half of its field.
             out.extend(if kind == 3 { [half(value as u16), [0; 2]].concat() } else { whole(value).to_vec() });
@@ -502,19 +546,7 @@ mod tests {
     fn three(big_endian: bool, photometric: u32, text: &str) -> Vec<u8> {
         let data: Vec<u8> =
             (0..18u16).flat_map(|x| if big_endian { x.to_be_bytes() } else { x.to_le_bytes() }).collect();
-        let entries = [
-            (256, 4, 1, 3),
-            (257, 4, 1, 2),
-            (258, 3, 1, 16),
-            (259, 3, 1, 1),
-            (262, 3, 1, photometric),
-            (270, 2, text.len() as u32, 512),
-            (273, 4, 1, 1024),
-            (277, 3, 1, 1),
-            (278, 4, 1, 2),
-            (279, 4, 1, 12),
-        ];
-        one_page(big_endian, &entries, text, &data)
+        one_page(big_endian, [3, 2], [1, 16], photometric, text, &data)
     }
 
     #[test]
@@ -543,8 +575,7 @@ mod tests {
                 let _ = read(&path);
             }
         }
-        // Nothing counts them: as many bytes as two more images, or a part of one.
-        refused(&three(false, 1, "a detector"), &["file size", "24 bytes", "2 more images"]);
+        // Nothing counts them: bytes for a part of one more image.
         std::fs::write(&path, &three(false, 1, "a detector")[..1024 + 20]).unwrap();
         assert_eq!(read(&path).unwrap().values.dim(), (1, 2, 3));
         refused(&three(false, 1, "{\"shape\": [1000000000000, 2, 3]}"), &["images", "1000000000000"]);
@@ -561,19 +592,7 @@ mod tests {
             (16, 2, [-5i16, 1].iter().flat_map(|x| x.to_le_bytes()).collect(), [-5.0, 1.0]),
             (32, 3, floats, [0.25, -3.0]),
         ] {
-            let entries = [
-                (256, 4, 1, 2),
-                (257, 4, 1, 1),
-                (258, 3, 1, bits),
-                (259, 3, 1, 1),
-                (262, 3, 1, 0),
-                (273, 4, 1, 1024),
-                (277, 3, 1, 1),
-                (278, 4, 1, 1),
-                (279, 4, 1, bits / 4),
-                (339, 3, 1, format),
-            ];
-            std::fs::write(&path, one_page(false, &entries, "", &data)).unwrap();
+            std::fs::write(&path, one_page(false, [2, 1], [format, bits], 0, "", &data)).unwrap();
             let found = read(&path).unwrap();
             assert_eq!(found.values.as_slice().unwrap(), want, "{}", found.numbers);
         }
@@ -597,20 +616,7 @@ mod tests {
         }
         let floats: Vec<u8> = [0.25f32, -3.0].iter().flat_map(|x| x.to_le_bytes()).collect();
         let text = line.replace('3', "1");
-        let entries = [
-            (256, 4, 1, 2),
-            (257, 4, 1, 1),
-            (258, 3, 1, 32),
-            (259, 3, 1, 1),
-            (262, 3, 1, 1),
-            (270, 2, text.len() as u32, 512),
-            (273, 4, 1, 1024),
-            (277, 3, 1, 1),
-            (278, 4, 1, 1),
-            (279, 4, 1, 8),
-            (339, 3, 1, 3),
-        ];
-        std::fs::write(&path, one_page(false, &entries, &text, &floats)).unwrap();
+        std::fs::write(&path, one_page(false, [2, 1], [3, 32], 1, &text, &floats)).unwrap();
         assert_eq!(read(&path).unwrap().values.as_slice().unwrap(), [0.25, -3.0]);
     }
 

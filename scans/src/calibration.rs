@@ -26,9 +26,10 @@ mod search;
 
 pub use direction::{Directions, directions};
 pub use jitter::{Jitter, jitter};
-pub use parameters::{Correction, Parameter, turns};
+pub use parameters::{Correction, Parameter};
 pub use search::Watch;
 
+use crate::provenance;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, View, norm};
@@ -50,18 +51,8 @@ const COARSEST: usize = 32;
 const FOLDS: usize = 2;
 /// A parameter is wrong if its change exceeds this many standard deviations.
 const CLEAR: f64 = 3.0;
-/// A parameter is not determined if its deviation exceeds this number of pixels of the finest level, or if its
-/// sensitivity is below these limits.
+/// A parameter is not determined if its deviation exceeds this number of pixels of the finest level.
 const VAGUE: f64 = 1.0;
-const FLAT: f64 = 0.03;
-const FLAT_PAIRS: f64 = 0.01;
-/// The voxel positions shift the minimum of the error by about this many pixels of a level. The views do not show this
-/// shift, so it is part of every deviation. For pairs of views, the sampling of the object by pixels has the same
-/// effect.
-const INEXACT: f64 = 0.02;
-/// The same if the object is cut off at the sides, also on a half-fan scan: the reconstruction is wrong there.
-const INEXACT_CUT: f64 = 0.1;
-const INEXACT_PAIRS: f64 = 0.1;
 /// Pairs of views are compared on pixels finer by this factor, at little cost; the largest number of Newton's steps.
 const FINER: usize = 2;
 const ROUNDS: usize = 6;
@@ -162,12 +153,8 @@ impl Calibration {
                 (f.parameter.to_string(), json!({ "change": f.change, "uncertainty": f.uncertainty, "unit": f.unit }))
             })
             .collect();
-        let calibrated = json!({ "from": source, "corrected": corrected, "held_out": self.held_out });
-        match &mut scan.provenance {
-            Value::Object(map) => drop(map.insert("calibrated".into(), calibrated)),
-            Value::Null => scan.provenance = json!({ "calibrated": calibrated }),
-            other => scan.provenance = json!({ "value": other.take(), "calibrated": calibrated }),
-        }
+        *provenance::entry(scan, "calibrated") =
+            json!({ "from": source, "corrected": corrected, "held_out": self.held_out });
     }
 
     /// The result as JSON, with those of [`directions`] and [`jitter()`].
@@ -202,12 +189,9 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
         Parameter::Rotation if scan.geometry.detector[0] < ROWS => Some(ROWS_REASON),
         _ => None,
     };
-    let mut open: Vec<Found> = vec![];
-    for &parameter in &asked {
-        open.extend(
-            reason(&parameter).map(|reason| undetermined(parameter, reason, PREDICTION, &first.geometry, scan)),
-        );
-    }
+    let judge = Judge { limits: PREDICTION, geometry: &first.geometry, scan };
+    let open = |p: &Parameter| Some(judge.undetermined(*p, reason(p)?));
+    let open: Vec<Found> = asked.iter().filter_map(open).collect();
     asked.retain(|p| reason(p).is_none());
     let mut pairs = if paired.is_empty() { None } else { Some(Consistency::new(scan, FINER * finest, &at)?) };
     let work = planned(&first, &widths, &asked, settings.curves)
@@ -362,16 +346,13 @@ fn compare_pairs(
         Parameter::Tilt if on_a_circle(&geometry.views) => Some(CIRCLE_REASON),
         _ => None,
     };
-    let mut found: Vec<Found> = vec![];
-    for &parameter in asked {
-        if let Some(reason) = reason(&parameter) {
-            found.push(undetermined(parameter, reason, PAIRS, geometry, scan));
-        }
-    }
+    let judge = Judge { limits: PAIRS, geometry, scan };
+    let open = |p: &Parameter| Some(judge.undetermined(*p, reason(p)?));
+    let mut found: Vec<Found> = asked.iter().filter_map(open).collect();
     let active: Vec<Parameter> = asked.iter().copied().filter(|p| reason(p).is_none()).collect();
     let findings = |place: &Place| -> Vec<Found> {
         let all = place.active.iter().zip(&place.evidence);
-        all.map(|(&p, &evidence)| finding(p, place.correction.get(p), evidence, PAIRS, geometry, scan)).collect()
+        all.map(|(&p, &evidence)| judge.finding(p, place.correction.get(p), evidence)).collect()
     };
     let without = |place: Place, gone: Parameter| {
         let rest: Vec<Parameter> = place.active.into_iter().filter(|p| *p != gone).collect();
@@ -421,92 +402,93 @@ fn settle<F>(
 
 /// The same for a fit to held-out views. Shared rays judge the result, if the sources are on a circle.
 fn settled(fine: &Search<'_>, fit: Fit, scan: &Scan, opposite: Option<&Opposite>) -> Result<(Vec<Found>, Fit)> {
-    let geometry = &fine.level.geometry;
-    let limits = if fine.level.cut { Limits { inexact: INEXACT_CUT, ..PREDICTION } } else { PREDICTION };
+    let limits = if fine.level.cut { PREDICTION_CUT } else { PREDICTION };
+    let judge = Judge { limits, geometry: &fine.level.geometry, scan };
     let findings = |fit: &Fit| -> Vec<Found> {
         let of = |(&p, evidence): (&Parameter, Evidence)| match opposite {
-            Some(opposite) => judged(p, evidence, limits, opposite, fit, geometry, scan),
-            None => finding(p, fit.correction.get(p), evidence, limits, geometry, scan),
+            Some(opposite) => judge.with_shared_rays(p, evidence, opposite, fit),
+            None => judge.finding(p, fit.correction.get(p), evidence),
         };
         fit.active.iter().zip(fine.evidence(fit)).map(of).collect()
     };
     settle(fit, findings, |fit, gone| fine.without(fit, gone))
 }
 
-/// The value of `parameter` that held-out views prefer. What shared rays prefer instead is part of its uncertainty. They
-/// must agree better with a shift along u, which every such ray shows, and with every change if the object is cut off.
-fn judged(
-    parameter: Parameter,
-    evidence: Evidence,
-    limits: Limits,
-    opposite: &Opposite,
-    fit: &Fit,
-    geometry: &Geometry,
-    scan: &Scan,
-) -> Found {
-    let Some(opinion) = opposite.opinion(&fit.correction, parameter) else {
-        return undetermined(parameter, ARC_REASON, limits, geometry, scan);
-    };
-    let beyond = (opinion.change.abs() - opinion.deviation).max(0.0);
-    let evidence = Evidence { deviation: evidence.deviation.hypot(beyond), ..evidence };
-    let found = finding(parameter, fit.correction.get(parameter), evidence, limits, geometry, scan);
-    let asked = parameter == Parameter::OffsetU || limits.inexact > INEXACT;
-    if found.verdict == Verdict::Corrected && asked && !opinion.better {
-        return undetermined(parameter, OPPOSITE_REASON, limits, geometry, scan);
-    }
-    found
-}
-
-/// The result for a parameter that the views do not determine.
-fn undetermined(parameter: Parameter, reason: &'static str, limits: Limits, geometry: &Geometry, scan: &Scan) -> Found {
-    let evidence = Evidence { deviation: f64::INFINITY, sensitivity: 0.0, sure: false };
-    Found { reason: Some(reason), ..finding(parameter, 0.0, evidence, limits, geometry, scan) }
-}
-
-/// Limits of a criterion: the least sensitivity, and the part of every deviation in pixels.
+/// Limits of a criterion.
 #[derive(Clone, Copy)]
 struct Limits {
+    /// Sensitivity below which a parameter is not determined.
     flat: f64,
+    /// Pixels of a level by which the voxel positions, or for pairs of views the sampling of the object by pixels, shift
+    /// the minimum of the error. The views do not show this shift, so it is part of every deviation.
     inexact: f64,
 }
 
-const PREDICTION: Limits = Limits { flat: FLAT, inexact: INEXACT };
-const PAIRS: Limits = Limits { flat: FLAT_PAIRS, inexact: INEXACT_PAIRS };
+const PREDICTION: Limits = Limits { flat: 0.03, inexact: 0.02 };
+/// If the object is cut off at the sides, also on a half-fan scan: the reconstruction is wrong there.
+const PREDICTION_CUT: Limits = Limits { inexact: 0.1, ..PREDICTION };
+const PAIRS: Limits = Limits { flat: 0.01, inexact: 0.1 };
 
-/// The result for a parameter with this value; `geometry` is the level's.
-fn finding(
-    parameter: Parameter,
-    value: f64,
-    evidence: Evidence,
+/// What turns evidence on a parameter into its result.
+struct Judge<'a> {
     limits: Limits,
-    geometry: &Geometry,
-    scan: &Scan,
-) -> Found {
-    let pixel = parameter.pixel(geometry);
-    let deviation = evidence.deviation.hypot(limits.inexact * pixel);
-    let verdict = if !(deviation < VAGUE * pixel && evidence.sensitivity > limits.flat) {
-        Verdict::NotDetermined
-    } else if value.abs() <= CLEAR * deviation {
-        Verdict::Kept
-    } else if evidence.sure {
-        Verdict::Corrected
-    } else {
-        Verdict::NotDetermined
-    };
-    let full = match parameter {
-        Parameter::OffsetV => norm(scan.geometry.views[0].v),
-        p => p.pixel(&scan.geometry),
-    };
-    Found {
-        parameter,
-        verdict,
-        reason: (verdict == Verdict::NotDetermined).then_some(FLAT_REASON),
-        unit: parameter.unit(),
-        change: value * parameter.in_unit(),
-        uncertainty: deviation * parameter.in_unit(),
-        pixels: [value / full, deviation / full],
-        sensitivity: evidence.sensitivity,
-        curve: vec![],
+    /// The level's.
+    geometry: &'a Geometry,
+    scan: &'a Scan,
+}
+
+impl Judge<'_> {
+    /// The result for a parameter with this value.
+    fn finding(&self, parameter: Parameter, value: f64, evidence: Evidence) -> Found {
+        let pixel = parameter.pixel(self.geometry);
+        let deviation = evidence.deviation.hypot(self.limits.inexact * pixel);
+        let verdict = if !(deviation < VAGUE * pixel && evidence.sensitivity > self.limits.flat) {
+            Verdict::NotDetermined
+        } else if value.abs() <= CLEAR * deviation {
+            Verdict::Kept
+        } else if evidence.sure {
+            Verdict::Corrected
+        } else {
+            Verdict::NotDetermined
+        };
+        let full = match parameter {
+            Parameter::OffsetV => norm(self.scan.geometry.views[0].v),
+            p => p.pixel(&self.scan.geometry),
+        };
+        Found {
+            parameter,
+            verdict,
+            reason: (verdict == Verdict::NotDetermined).then_some(FLAT_REASON),
+            unit: parameter.unit(),
+            change: value * parameter.in_unit(),
+            uncertainty: deviation * parameter.in_unit(),
+            pixels: [value / full, deviation / full],
+            sensitivity: evidence.sensitivity,
+            curve: vec![],
+        }
+    }
+
+    /// The result for a parameter that the views do not determine.
+    fn undetermined(&self, parameter: Parameter, reason: &'static str) -> Found {
+        let evidence = Evidence { deviation: f64::INFINITY, sensitivity: 0.0, sure: false };
+        Found { reason: Some(reason), ..self.finding(parameter, 0.0, evidence) }
+    }
+
+    /// The value of `parameter` that held-out views prefer. What shared rays prefer instead is part of its uncertainty.
+    /// They must agree better with a shift along u, which every such ray shows, and with every change if the object is
+    /// cut off.
+    fn with_shared_rays(&self, parameter: Parameter, evidence: Evidence, opposite: &Opposite, fit: &Fit) -> Found {
+        let Some(opinion) = opposite.opinion(&fit.correction, parameter) else {
+            return self.undetermined(parameter, ARC_REASON);
+        };
+        let beyond = (opinion.change.abs() - opinion.deviation).max(0.0);
+        let evidence = Evidence { deviation: evidence.deviation.hypot(beyond), ..evidence };
+        let found = self.finding(parameter, fit.correction.get(parameter), evidence);
+        let asked = parameter == Parameter::OffsetU || self.limits.inexact > PREDICTION.inexact;
+        if found.verdict == Verdict::Corrected && asked && !opinion.better {
+            return self.undetermined(parameter, OPPOSITE_REASON);
+        }
+        found
     }
 }
 

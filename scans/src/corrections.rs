@@ -10,7 +10,7 @@
 //! 6. `hardening`: the remaining line integrals of many energies;
 //! 7. `truncation`: the parts beyond the detector's sides, from rows that are otherwise right.
 
-pub mod filling;
+pub(crate) mod filling;
 mod flux;
 mod hardening;
 mod low_counts;
@@ -30,6 +30,7 @@ pub use rings::{RingMethod, Rings};
 pub use scatter::Scatter;
 pub use truncation::Truncation;
 
+use crate::provenance;
 use conefield_core::Result;
 use conefield_core::scan::Scan;
 use serde::{Deserialize, Serialize};
@@ -134,27 +135,14 @@ impl Corrections {
             applied.push(Applied { name, settings, found });
         }
         scan.validate(place)?;
-        note(&mut scan, &applied);
+        let list = provenance::entry(&mut scan, "corrections");
+        if list.is_null() {
+            *list = json!([]);
+        }
+        if let Value::Array(list) = list {
+            list.extend(applied.iter().map(|a| json!(a)));
+        }
         Ok((scan, applied))
-    }
-}
-
-/// Records the corrections in the scan.
-fn note(scan: &mut Scan, applied: &[Applied]) {
-    let map = match &mut scan.provenance {
-        Value::Object(map) => map,
-        Value::Null => {
-            scan.provenance = json!({});
-            return note(scan, applied);
-        }
-        other => {
-            scan.provenance = json!({ "value": other.take() });
-            return note(scan, applied);
-        }
-    };
-    let list = map.entry("corrections").or_insert_with(|| json!([]));
-    if let Value::Array(list) = list {
-        list.extend(applied.iter().map(|a| json!(a)));
     }
 }
 

@@ -7,7 +7,7 @@
 use crate::corrections::filling::Filling;
 use crate::diagnosis::bad_pixels::{from_fields, outliers};
 use crate::diagnosis::border::border_medians;
-use crate::diagnosis::quantiles::{median, quantile};
+use crate::diagnosis::quantiles::{middle, quantile};
 use conefield_core::error::ensure;
 use conefield_core::finite::stray;
 use conefield_core::parallel;
@@ -60,7 +60,7 @@ pub fn line_integrals(
     }
     let response = response(place, conversion, [rows, columns])?;
     let mut open = open_beam(place, conversion, views)?;
-    let typical = response.as_ref().map(middle).or(open.first().copied().filter(|x| *x > 0.0));
+    let typical = response.as_ref().map(|r| middle(r.view())).or(open.first().copied().filter(|x| *x > 0.0));
     let known = from_fields(response.as_ref().map(|r| r.view()), dark.map(|d| d.view()), typical.unwrap_or(f32::MAX));
     let mut bad = Array2::from_elem((rows, columns), false);
     known.iter().for_each(|&at| bad[at] = true);
@@ -141,7 +141,7 @@ fn open_beam(place: &str, conversion: &Conversion, views: usize) -> Result<Vec<f
     match &conversion.open {
         OpenBeam::Flat(_) => Ok(vec![1.0; views]),
         OpenBeam::Number(x) => {
-            let above = (x - f64::from(conversion.dark.as_ref().map_or(0.0, middle))) as f32;
+            let above = (x - f64::from(conversion.dark.as_ref().map_or(0.0, |d| middle(d.view())))) as f32;
             ensure(x.is_finite() && above > 0.0, place, "i0", x, "a finite number above the dark value")?;
             Ok(vec![above; views])
         }
@@ -182,10 +182,6 @@ fn check_field(place: &str, field: &str, image: &Array2<f32>, want: [usize; 2]) 
         Some(((r, c), x)) => Err(Error::invalid(place, format!("{field}[{r}, {c}]"), x, "a finite number")),
         None => Ok(()),
     }
-}
-
-fn middle(a: &Array2<f32>) -> f32 {
-    median(&mut a.iter().copied().collect::<Vec<_>>()).unwrap_or(0.0)
 }
 
 fn good(a: &Array2<f32>, bad: &Array2<bool>) -> Vec<f32> {

@@ -4,11 +4,10 @@
 //!   axis, the voxel size that the detector supports and the part of the volume that the views see, and gives warnings
 //!   with figures and advice.
 //! - [`check_line_integrals`]: whether projections look like line integrals.
-//! - [`bad_pixels`]: finds bad pixels.
 
 mod arc;
-pub mod bad_pixels;
-pub mod border;
+pub(crate) mod bad_pixels;
+pub(crate) mod border;
 mod coverage;
 pub(crate) mod line_integrals;
 pub mod quantiles;

@@ -9,6 +9,7 @@ pub mod corrections;
 pub mod counts;
 pub mod diagnosis;
 mod import;
+mod provenance;
 mod selection;
 
 pub use import::{ImportOptions, Imported, import, read_data_set, read_scan};

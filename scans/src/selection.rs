@@ -1,10 +1,10 @@
 //! Part of a scan: some views, a piece of the detector, rotated images, larger pixels. The geometry is adapted.
 
 use conefield_core::error::ensure;
-use conefield_core::geometry::{Geometry, Vec3, View, norm};
+use conefield_core::geometry::norm;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
-use ndarray::{Array3, Axis, s};
+use ndarray::{Axis, s};
 use std::collections::HashSet;
 use std::fmt;
 use std::ops::Range;
@@ -207,8 +207,7 @@ impl Selection {
                 images.invert_axis(Axis(axis));
             }
         }
-        let images = images.as_standard_layout().into_owned();
-        scan.projections = images;
+        scan.projections = images.as_standard_layout().into_owned();
         if turns % 2 == 1 {
             let g = &mut scan.geometry;
             g.detector.reverse();
@@ -232,19 +231,18 @@ fn crop(scan: &mut Scan, rows: Range<usize>, columns: Range<usize>) {
     let middle = |range: &Range<usize>| (range.start + range.end) as f64 / 2.0 - 0.5;
     let (row, column) = (middle(&rows), middle(&columns));
     for view in &mut scan.geometry.views {
-        let centre: Vec3 = view.pixel(detector, row, column);
-        *view = View { detector: centre, ..*view };
+        view.detector = view.pixel(detector, row, column);
     }
-    scan.geometry = Geometry { detector: piece, ..scan.geometry.clone() };
-    let cut: Array3<f32> = scan.projections.slice(s![.., rows, columns]).as_standard_layout().into_owned();
-    scan.projections = cut;
+    scan.geometry.detector = piece;
+    scan.projections = scan.projections.slice(s![.., rows, columns]).as_standard_layout().into_owned();
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::geometry::{Millimetres, Radians, VoxelGrid};
+    use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid};
     use conefield_core::scan::Unit;
+    use ndarray::Array3;
 
     /// Eight views of 6 rows and 8 columns, each pixel with its own number; pixels are not square.
     fn scan() -> Scan {

@@ -3,14 +3,14 @@
 //! Source: DICOM PS3.3 (Enhanced CT Image IOD, A.38; functional groups, C.7.6.16 and C.8.15.3). Read are uncompressed
 //! files, whichever of the two sequences holds a group.
 
-use super::slice::{Attribute, Elements, FRAMES, PIXEL_DATA, Slice, open};
+use super::slice::{Attribute, Elements, FRAMES, PIXEL_DATA, Slice, open, stored};
 use super::write::{DicomTemplate, Series, number, numbers, text};
 use super::{assemble, check_shape, lengths, pixels};
 use crate::write_atomic;
 use conefield_core::error::ensure;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
-use conefield_core::{Error, Result, allowance};
+use conefield_core::{Error, Result};
 use dicom_core::header::HasLength;
 use dicom_core::value::DataSetSequence;
 use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
@@ -258,12 +258,9 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
             Slice::of(path, head.end, k, &Elements { place: &place, object: &o }, format)
         })
         .collect::<Result<_>>()?;
-    allowance::memory(&place, "PixelData", head.end.saturating_mul(2))?;
-    let object = open(path, head.end, OpenFileOptions::new().read_to(PIXEL_DATA.0))?;
-    let element = object.get(PIXEL_DATA.0).ok_or_else(|| e.invalid(PIXEL_DATA, "no such element", "pictures"))?;
-    let values = pixels::values(&place, &object, element, &all, |v| v as f64)?;
-    assemble(&place, slices, |slice| {
-        let stored = values.chunks_exact(format.count()).nth(slice.frame).unwrap_or_default();
-        slice.rescaled(stored.iter().copied())
+    let values = stored(path, head.end, &all)?;
+    assemble(&place, slices, &|slice| {
+        let frame = values.chunks_exact(format.count()).nth(slice.frame).unwrap_or_default();
+        slice.rescaled(frame.iter().copied())
     })
 }

@@ -3,6 +3,7 @@
 //! `dicom-object` allocates as much as an element claims, up to 4 GiB, and recurses into nested sequences. This walk
 //! bounds both.
 
+use super::slice::PIXEL_DATA;
 use crate::input::must_unpack;
 use conefield_core::{Error, Result, files};
 use dicom_core::VR;
@@ -18,12 +19,14 @@ const LONGEST_HEADER: u64 = 64 << 20;
 /// Deepest nesting of sequences; real files stay below ten.
 const DEEPEST: usize = 32;
 
-const PIXELS: Tag = Tag(0x7fe0, 0x0010);
 const SYNTAX: Tag = Tag(0x0002, 0x0010);
 const ITEM: Tag = Tag(0xfffe, 0xe000);
 const ITEM_END: Tag = Tag(0xfffe, 0xe00d);
 const SEQUENCE_END: Tag = Tag(0xfffe, 0xe0dd);
 const UNDEFINED: u32 = u32::MAX;
+
+/// Value representations whose length has two bytes. It has four for all others, also those that the standard may add.
+const SHORT: &str = "AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US";
 
 /// How a file stores its pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -114,7 +117,7 @@ impl ElementWalk {
                 continue;
             }
             let (kind, length) = self.kind_and_length(tag)?;
-            if tag == PIXELS && stack.is_empty() {
+            if tag == PIXEL_DATA.0 && stack.is_empty() {
                 return match length {
                     UNDEFINED => self.pieces(),
                     n => self.end(tag, n).map(|end| (PixelStorage::Plain(u64::from(n)), end)),
@@ -251,35 +254,12 @@ impl ElementWalk {
                 return Err(self.invalid(&format!("element {tag}"), format!("the kind {kind:02x?}"), "two letters"));
             }
             let kind = VR::from_binary(kind).unwrap_or(VR::UN);
-            let length = match kind {
-                VR::AE
-                | VR::AS
-                | VR::AT
-                | VR::CS
-                | VR::DA
-                | VR::DS
-                | VR::DT
-                | VR::FD
-                | VR::FL
-                | VR::IS
-                | VR::LO
-                | VR::LT
-                | VR::PN
-                | VR::SH
-                | VR::SL
-                | VR::SS
-                | VR::ST
-                | VR::TM
-                | VR::UI
-                | VR::UL
-                | VR::US => u32::from(self.u16()?),
-                // All other value representations, also ones that the standard may add, have a length of four bytes.
-                _ => {
-                    self.read(&mut [0; 2])?;
-                    self.u32()?
-                }
-            };
-            (kind, length)
+            if SHORT.split(' ').any(|short| short == kind.to_string()) {
+                (kind, u32::from(self.u16()?))
+            } else {
+                self.read(&mut [0; 2])?;
+                (kind, self.u32()?)
+            }
         } else {
             let kind = StandardDataDictionary.by_tag(tag).map_or(VR::UN, |e| e.vr().relaxed());
             (kind, self.u32()?)

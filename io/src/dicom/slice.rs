@@ -51,9 +51,7 @@ pub(super) struct Slice {
     pub spacing: [f64; 2],
     thickness: Option<f64>,
     rescale: [f64; 2],
-    pub rows: usize,
-    pub columns: usize,
-    format: PixelFormat,
+    pub format: PixelFormat,
 }
 
 /// The elements of an open file.
@@ -181,8 +179,6 @@ impl Slice {
             spacing,
             thickness,
             rescale: [slope, intercept],
-            rows: format.rows,
-            columns: format.columns,
             format,
         })
     }
@@ -198,11 +194,12 @@ impl Slice {
             let expected = format!("{want}, as in {}", first.name());
             Err(Error::invalid(self.path.display().to_string(), field.1, found, expected))
         };
-        if self.rows != first.rows {
-            return refuse(ROWS, self.rows.to_string(), first.rows.to_string());
-        }
-        if self.columns != first.columns {
-            return refuse(COLUMNS, self.columns.to_string(), first.columns.to_string());
+        for (field, [own, want]) in
+            [(ROWS, [self.format.rows, first.format.rows]), (COLUMNS, [self.format.columns, first.format.columns])]
+        {
+            if own != want {
+                return refuse(field, own.to_string(), want.to_string());
+            }
         }
         let near = |a: f64, b: f64, tolerance: f64| (a - b).abs() <= tolerance;
         if !self.spacing.iter().zip(first.spacing).all(|(a, b)| near(*a, b, 1e-3 * b)) {
@@ -222,14 +219,7 @@ impl Slice {
 
     /// The rescaled values, row after row.
     pub fn values(&self) -> Result<Vec<f32>> {
-        let place = self.path.display().to_string();
-        // The library keeps the fragments it reads and returns copies.
-        allowance::memory(&place, "PixelData", self.end.saturating_mul(2))?;
-        let object = open(&self.path, self.end, OpenFileOptions::new().read_to(PIXEL_DATA.0))?;
-        let element = object.get(PIXEL_DATA.0);
-        let element = element.ok_or_else(|| Error::invalid(&place, PIXEL_DATA.1, "no such element", "a picture"))?;
-        let stored = pixels::values(&place, &object, element, &self.format, |v| v as f64)?;
-        self.rescaled(stored)
+        self.rescaled(stored(&self.path, self.end, &self.format)?)
     }
 
     /// The rescaled values of `stored` ones.
@@ -242,6 +232,17 @@ impl Slice {
         }
         Ok(rescaled)
     }
+}
+
+/// The stored values in the first `end` bytes of `path`, whose lengths have been checked.
+pub(super) fn stored(path: &Path, end: u64, format: &PixelFormat) -> Result<Vec<f64>> {
+    let place = path.display().to_string();
+    // The library keeps the fragments it reads and returns copies.
+    allowance::memory(&place, PIXEL_DATA.1, end.saturating_mul(2))?;
+    let object = open(path, end, OpenFileOptions::new().read_to(PIXEL_DATA.0))?;
+    let element = object.get(PIXEL_DATA.0);
+    let element = element.ok_or_else(|| Error::invalid(&place, PIXEL_DATA.1, "no such element", "a picture"))?;
+    pixels::values(&place, &object, element, format)
 }
 
 /// The first `end` bytes of a file, whose lengths have been checked.

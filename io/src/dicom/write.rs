@@ -4,9 +4,10 @@
 //! slope, so they are rounded to half a slope. Identifiers are version-8 UUIDs (`2.25.`) of a hash of the content: the
 //! same content gives the same bytes.
 
-use super::slice::open;
+use super::slice::{PIXEL_DATA, open};
 use super::{is_dicom, lengths};
 use crate::affine;
+use crate::atomic::parent;
 use crate::file_order::{self, FileOrder};
 use crate::{PACKED_BYTES, folder, write_folder_atomic};
 use conefield_core::error::ensure;
@@ -22,7 +23,6 @@ use tempfile::SpooledTempFile;
 
 const CT_IMAGE: &str = "1.2.840.10008.5.1.4.1.1.2";
 const EXPLICIT: &str = "1.2.840.10008.1.2.1";
-const PIXELS: Tag = Tag(0x7fe0, 0x0010);
 const CLASS: Tag = Tag(0x0008, 0x0016);
 const STUDY: Tag = Tag(0x0020, 0x000d);
 
@@ -57,7 +57,7 @@ impl DicomTemplate {
         let place = path.display().to_string();
         ensure(is_dicom(path)?, &place, "template", "a file of another kind", "a DICOM file")?;
         let (_, end) = lengths::check(path)?;
-        let object = open(path, end, OpenFileOptions::new().read_until(PIXELS))?;
+        let object = open(path, end, OpenFileOptions::new().read_until(PIXEL_DATA.0))?;
         let text = |tag: Tag| object.get(tag)?.to_str().ok().map(|t| t.trim_end_matches(['\0', ' ']).to_owned());
         let all: Vec<_> = COPIED.iter().filter_map(|&(tag, vr)| Some((tag, vr, text(tag)?))).collect();
         let study = all.iter().find(|(tag, ..)| *tag == STUDY).map_or("", |(.., uid)| uid);
@@ -68,10 +68,13 @@ impl DicomTemplate {
     }
 }
 
-/// Refuses a slice with more rows or columns than a 16-bit number says, before the voxels are computed.
+/// Refuses a slice with more rows or columns than a 16-bit number says, or more bytes than a 32-bit one, before the
+/// voxels are computed.
 pub(crate) fn check_shape(place: &str, [x, y, _]: [usize; 3]) -> Result<()> {
     let expected = "at most 65535 voxels along x and y, the limit of DICOM";
-    ensure(x.max(y) <= 65535, place, "shape", format!("{x} x {y}"), expected)
+    ensure(x.max(y) <= 65535, place, "shape", format!("{x} x {y}"), expected)?;
+    let expected = "less than 4 GiB of 16-bit voxels in a slice, the limit of DICOM";
+    ensure(2 * (x as u64) * (y as u64) < u64::from(u32::MAX), place, "shape", format!("{x} x {y}"), expected)
 }
 
 /// Whether a series of this module may have a file of this name.
@@ -118,9 +121,8 @@ impl Series {
         let spacing = affine::spacing(&lps);
         let axes = [0, 1, 2].map(|k| affine::column(&lps, k).map(|x| x / spacing[k]));
         // The identifiers depend on the values and every value has the slope: the voxels are computed once and kept.
-        let beside = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let mut spool = Spool {
-            file: tempfile::spooled_tempfile_in(PACKED_BYTES as usize, beside),
+            file: tempfile::spooled_tempfile_in(PACKED_BYTES as usize, parent(path)),
             digest: Digest::new(),
             range: [f32::INFINITY, f32::NEG_INFINITY],
         };
@@ -285,7 +287,7 @@ pub(super) fn text(object: &mut InMemDicomObject, tag: Tag, vr: VR, value: &str)
     object.put(DataElement::new(tag, vr, value));
 }
 
-fn word(object: &mut InMemDicomObject, tag: Tag, value: u16) {
+pub(super) fn word(object: &mut InMemDicomObject, tag: Tag, value: u16) {
     object.put(DataElement::new(tag, VR::US, PrimitiveValue::from(value)));
 }
 

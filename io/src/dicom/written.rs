@@ -186,6 +186,7 @@ fn what_is_there_stays_unless_it_is_such_a_series() {
     std::fs::write(path.join("notes.txt"), "mine").unwrap();
     says(write_volume(&path, &volume()), &["notes.txt"]);
     says(crate::check_shape(&path, [70_000, 1, 1]), &["a.dicom: shape", "65535"]);
+    says(crate::check_shape(&path, [60_000, 60_000, 1]), &["a.dicom: shape", "4 GiB"]);
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
 }
 

@@ -22,12 +22,16 @@ pub(super) enum Calibration {
     Other(u32),
 }
 
+/// The value of `name` in ImageJ's lines.
+pub(super) fn entry<'t>(text: &'t str, name: &str) -> Option<&'t str> {
+    text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix('=')).map(str::trim)
+}
+
 impl Calibration {
     /// The calibration in ImageJ's lines; `None` if it shows integers as they are stored.
     pub fn of(text: &str) -> Option<Self> {
-        let entry = |name: &str| text.lines().find_map(|l| l.strip_prefix(name)?.strip_prefix('='));
-        let number = |name| entry(name)?.trim().parse::<f64>().ok().filter(|x| x.is_finite());
-        let function: u32 = entry("cf").filter(|_| text.starts_with("ImageJ="))?.trim().parse().ok()?;
+        let number = |name| entry(text, name)?.parse::<f64>().ok().filter(|x| x.is_finite());
+        let function: u32 = entry(text, "cf").filter(|_| text.starts_with("ImageJ="))?.parse().ok()?;
         match (function, number("c0"), number("c1")) {
             (0, Some(0.0), Some(1.0)) => None,
             (0, Some(at), Some(times)) => Some(Self::Line([at, times])),
@@ -40,10 +44,7 @@ impl Calibration {
 pub(super) fn claimed(text: &str, [rows, columns]: [u64; 2]) -> Option<Claim> {
     let text = text.trim_start();
     if text.starts_with("ImageJ=") {
-        let number = |name: &str| {
-            let line = text.lines().find_map(|l| l.strip_prefix(name)?.strip_prefix('='));
-            line.and_then(|n| n.trim().parse::<u64>().ok())
-        };
+        let number = |name: &str| entry(text, name)?.parse::<u64>().ok();
         let volumes = number("channels").unwrap_or(1).saturating_mul(number("frames").unwrap_or(1));
         return Some(Claim { images: number("images")?, volumes, whole: true });
     }

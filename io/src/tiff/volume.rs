@@ -3,6 +3,7 @@
 //! Voxel sizes are read where ImageJ's text on the first page states their unit; the affine where conefield's writer
 //! has added it.
 
+use super::images::entry;
 use super::{stack, values};
 use crate::affine::{self, Affine};
 use crate::{file_order, folder, text};
@@ -23,11 +24,7 @@ pub(super) const AFFINE: &str = "affine";
 pub(crate) fn read_volume(path: &Path) -> Result<Volume> {
     let place = path.display().to_string();
     let mut text = StackText::default();
-    let (stack, images) = stack(path, |decoder| {
-        text = StackText::of(decoder);
-        Ok(())
-    })?;
-    let pages = stack.values;
+    let (pages, images) = stack(path, |decoder| text = StackText::of(decoder))?;
     let (slices, rows, columns) = pages.dim();
     if let Some(n) = images.claim.map(|c| c.volumes).filter(|n| *n > 1) {
         let found = format!("{n} channels or points in time");
@@ -67,18 +64,15 @@ pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
             if z == 0 {
                 text = StackText::of(decoder);
             }
-            Ok(())
         })?;
-        let slice = slice.values;
-        let numbers = *sample.get_or_insert(images.sample);
-        if images.sample != numbers {
-            let expected = format!("{numbers}, as in {}", names[0]);
-            return Err(Error::invalid(path.display().to_string(), "numbers", images.sample, expected));
-        }
         let (pages, rows, columns) = slice.dim();
         let invalid = |field: &str, found: String, expected: String| {
             Err(Error::invalid(path.display().to_string(), field, found, expected))
         };
+        let numbers = *sample.get_or_insert(images.sample);
+        if images.sample != numbers {
+            return invalid("numbers", images.sample.to_string(), format!("{numbers}, as in {}", names[0]));
+        }
         if pages != 1 {
             return invalid("pages", pages.to_string(), "1: one slice per file, or all slices in one file".into());
         }
@@ -134,17 +128,9 @@ impl StackText {
         Self { text: text.filter(|t| t.starts_with("ImageJ=")).unwrap_or_default(), resolution }
     }
 
-    fn entry(&self, name: &str) -> Option<&str> {
-        self.text.lines().find_map(|l| l.strip_prefix(name)?.strip_prefix('=')).map(str::trim)
-    }
-
-    fn number(&self, name: &str) -> Option<f64> {
-        self.entry(name)?.parse().ok()
-    }
-
     /// The voxel sizes in mm, if the file states all of them.
     fn spacing(&self) -> Option<[f64; 3]> {
-        let mm = match self.entry("unit")? {
+        let mm = match entry(&self.text, "unit")? {
             "mm" | "millimeter" => 1.0,
             "cm" => 10.0,
             "m" => 1000.0,
@@ -154,7 +140,8 @@ impl StackText {
             _ => return None,
         };
         // ImageJ leaves out a distance of 1 between the slices of a stack.
-        let between = self.number("spacing").or_else(|| self.number("images").filter(|n| *n > 1.0).map(|_| 1.0))?;
+        let number = |name| entry(&self.text, name)?.parse::<f64>().ok();
+        let between = number("spacing").or_else(|| number("images").filter(|n| *n > 1.0).map(|_| 1.0))?;
         let [x, y] = self.resolution;
         let spacing = [mm / x?, mm / y?, mm * between];
         spacing.iter().all(|s| s.is_finite() && *s > 0.0).then_some(spacing)
@@ -163,7 +150,8 @@ impl StackText {
     /// The affine that conefield wrote, if it has voxels of about `spacing`: other programs may have rescaled the image
     /// since.
     fn affine(&self, spacing: [f64; 3]) -> Option<Affine> {
-        let numbers: Option<Vec<f64>> = self.entry(AFFINE)?.split_ascii_whitespace().map(|t| t.parse().ok()).collect();
+        let numbers: Option<Vec<f64>> =
+            entry(&self.text, AFFINE)?.split_ascii_whitespace().map(|t| t.parse().ok()).collect();
         let rows: [f64; 12] = numbers?.try_into().ok()?;
         let row = |i: usize| [rows[4 * i], rows[4 * i + 1], rows[4 * i + 2], rows[4 * i + 3]];
         let affine = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
@@ -185,19 +173,12 @@ impl StackText {
 
 #[cfg(test)]
 mod tests {
-    use crate::testing::{comes_back_to_the_bit, says};
+    use crate::testing::says;
     use crate::{is_volume, read_volume, volume_voxels};
-    use ndarray::Array3;
     use std::fs::File;
     use std::path::Path;
     use tiff::encoder::{Rational, TiffEncoder, colortype::Gray16};
     use tiff::tags::Tag;
-
-    #[test]
-    fn what_is_written_comes_back_to_the_bit() {
-        let data = Array3::from_shape_fn((4, 3, 2), |(x, y, z)| (x + 10 * y + 100 * z) as f32 / 7.0);
-        comes_back_to_the_bit("a.tif", data);
-    }
 
     /// Pages of 3 x 2 pixels, with a text on the first one.
     fn write(path: &Path, pages: u16, text: Option<&str>) {

@@ -14,6 +14,7 @@
 
 use crate::calibration::criterion::{bin, spread};
 use crate::calibration::parameters::{Correction, Parameter};
+use crate::diagnosis::quantiles::median;
 use conefield_core::geometry::{Geometry, Vec3, View, cross, dot, norm, sub};
 use conefield_core::parallel;
 use conefield_core::scan::{Scan, Unit};
@@ -326,8 +327,7 @@ impl Noise {
         all.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
         let step = |part: &[(f32, f32)]| {
             let mut bends: Vec<f32> = part.iter().map(|x| x.1).collect();
-            let middle = bends.len() / 2;
-            let median = f64::from(*bends.select_nth_unstable_by(middle, f32::total_cmp).1);
+            let median = f64::from(median(&mut bends).unwrap_or(0.0));
             // A median deviation is 0.6745 standard deviations; three pixels with weights 1, -2, 1 have six times the
             // variance.
             (part[part.len() - 1].0, (median / 0.6745).powi(2) / 6.0)
@@ -354,9 +354,21 @@ impl Noise {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::calibration::search::Watch;
     use conefield_core::geometry::VoxelGrid;
     use conefield_core::orbit::CircularOrbit;
     use std::f64::consts::TAU;
+
+    /// A watch that ignores progress and never cancels.
+    pub(crate) struct Silent;
+
+    impl Watch for Silent {
+        fn cancelled(&self) -> bool {
+            false
+        }
+
+        fn progress(&self, _: f64) {}
+    }
 
     /// Gaussians with known line integrals: centre in mm, width in mm, largest value in 1/mm.
     const OBJECT: [(Vec3, f64, f64); 6] = [

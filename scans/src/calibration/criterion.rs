@@ -89,15 +89,14 @@ impl Level {
     }
 
     fn of(binned: Scan, bin: usize, width: usize, folds: usize, known: &Correction) -> Result<Self> {
-        let binned = Scan { unit: Unit::default(), ..binned };
+        let mut binned = Scan { unit: Unit::default(), ..binned };
         let given = binned.geometry.views.clone();
-        let views = known.views(&given);
-        let seen = Scan { geometry: Geometry { views, ..binned.geometry.clone() }, ..binned };
-        let cut = cut(&seen, 2);
-        let grid = grid(&seen, width, cut);
-        let magnification = setup(&seen.geometry).magnification;
-        let (geometry, binned) = (Geometry { views: given, volume: grid, ..seen.geometry.clone() }, seen);
-        let binned = Scan { geometry: geometry.clone(), ..binned };
+        binned.geometry.views = known.views(&given);
+        let cut = cut(&binned, 2);
+        let volume = grid(&binned, width, cut);
+        let magnification = setup(&binned.geometry).magnification;
+        let geometry = Geometry { views: given, volume, ..binned.geometry };
+        binned.geometry = geometry.clone();
         let n = geometry.views.len();
         let every = EVERY.min(n / 2).max(2);
         let folds: Vec<Fold> = (0..folds.min(every))

@@ -84,22 +84,12 @@ impl Watch for Half<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::calibration::consistency::tests::scan;
+    use crate::calibration::consistency::tests::{Silent, scan};
     use conefield_backend_cpu::Cpu;
     use conefield_core::geometry::VoxelGrid;
     use conefield_core::orbit::CircularOrbit;
     use conefield_projectors::simulate::{Ellipsoid, scan_ellipsoids};
     use std::f64::consts::TAU;
-
-    struct Silent;
-
-    impl Watch for Silent {
-        fn cancelled(&self) -> bool {
-            false
-        }
-
-        fn progress(&self, _: f64) {}
-    }
 
     /// The errors of a scan and of the same scan with reversed angles.
     fn both(right: Scan) -> [Directions; 2] {

@@ -12,6 +12,7 @@
 use crate::calibration::criterion::Level;
 use crate::calibration::search::{LONGEST, Meter, SMALL};
 use crate::calibration::{FEWEST, Verdict, Watch, widths};
+use crate::provenance;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Vec3, View, dot, norm, sub};
@@ -19,7 +20,7 @@ use conefield_core::matrix::inverse;
 use conefield_core::scan::Scan;
 use ndarray::{ArrayView2, Zip};
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::json;
 use std::sync::Mutex;
 
 /// Rounds of prediction and comparison at each level.
@@ -59,12 +60,7 @@ impl Jitter {
         }
         scan.geometry.views = shifted(&scan.geometry.views, &self.shifts);
         let [v, u] = self.pixels;
-        let note = json!({ "rms_pixels": { "v": v, "u": u }, "held_out": self.held_out });
-        match &mut scan.provenance {
-            Value::Object(map) => drop(map.insert("jitter".into(), note)),
-            Value::Null => scan.provenance = json!({ "jitter": note }),
-            other => scan.provenance = json!({ "value": other.take(), "jitter": note }),
-        }
+        *provenance::entry(scan, "jitter") = json!({ "rms_pixels": { "v": v, "u": u }, "held_out": self.held_out });
     }
 }
 
@@ -138,7 +134,7 @@ fn compare(level: &Level, shifts: &[[f64; 2]], backend: &dyn Backend, meter: &Me
         let pixel = pixel(&g.views[i]);
         let in_mm = |d: [f64; 2]| [d[0] * pixel[0], d[1] * pixel[1]];
         let [one, two] = normal_equations(measured, residual);
-        let both = one.plus(&two);
+        let both = Normal(std::array::from_fn(|k| one.0[k] + two.0[k]));
         steps[i] = in_mm(both.solve());
         let [a, b] = [one, two].map(|half| in_mm(half.solve()));
         differences[i] = [a[0] - b[0], a[1] - b[1]];
@@ -151,38 +147,21 @@ fn pixel(view: &View) -> [f64; 2] {
     [norm(view.v), norm(view.u)]
 }
 
-/// Normal equations of a shift along v and u.
+/// Normal equations of a shift along v and u: sums of v·v, v·u, u·u, v·r and u·r for slopes v and u of the prediction and
+/// residuals r.
 #[derive(Default, Clone, Copy)]
-struct Normal {
-    vv: f64,
-    vu: f64,
-    uu: f64,
-    v: f64,
-    u: f64,
-}
+struct Normal([f64; 5]);
 
 impl Normal {
-    fn plus(&self, other: &Self) -> Self {
-        Self {
-            vv: self.vv + other.vv,
-            vu: self.vu + other.vu,
-            uu: self.uu + other.uu,
-            v: self.v + other.v,
-            u: self.u + other.u,
-        }
-    }
-
     /// The shift in pixels; zero along a direction without structure.
     fn solve(&self) -> [f64; 2] {
-        let determinant = self.vv * self.uu - self.vu * self.vu;
-        if determinant > 1e-6 * self.vv * self.uu {
-            return [
-                (self.uu * self.v - self.vu * self.u) / determinant,
-                (self.vv * self.u - self.vu * self.v) / determinant,
-            ];
+        let Self([vv, vu, uu, v, u]) = *self;
+        let determinant = vv * uu - vu * vu;
+        if determinant > 1e-6 * vv * uu {
+            return [(uu * v - vu * u) / determinant, (vv * u - vu * v) / determinant];
         }
         let along = |square: f64, product: f64| if square > 0.0 { product / square } else { 0.0 };
-        if self.vv > self.uu { [along(self.vv, self.v), 0.0] } else { [0.0, along(self.uu, self.u)] }
+        if vv > uu { [along(vv, v), 0.0] } else { [0.0, along(uu, u)] }
     }
 }
 
@@ -198,12 +177,9 @@ fn normal_equations(measured: ArrayView2<'_, f32>, residual: ArrayView2<'_, f32>
         }
         let v = (predicted(i + 1, j) - predicted(i - 1, j)) / 2.0;
         let u = (predicted(i, j + 1) - predicted(i, j - 1)) / 2.0;
-        let s = &mut sums[(i / SQUARE + j / SQUARE) % 2];
-        s.vv += v * v;
-        s.vu += v * u;
-        s.uu += u * u;
-        s.v += v * f64::from(r);
-        s.u += u * f64::from(r);
+        let r = f64::from(r);
+        let sums = &mut sums[(i / SQUARE + j / SQUARE) % 2].0;
+        sums.iter_mut().zip([v * v, v * u, u * u, v * r, u * r]).for_each(|(sum, x)| *sum += x);
     });
     sums
 }
@@ -266,18 +242,8 @@ fn motion(view: &View, center: Vec3) -> [[f64; 2]; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::calibration::consistency::tests::scan;
+    use crate::calibration::consistency::tests::{Silent, scan};
     use conefield_backend_cpu::Cpu;
-
-    struct Silent;
-
-    impl Watch for Silent {
-        fn cancelled(&self) -> bool {
-            false
-        }
-
-        fn progress(&self, _: f64) {}
-    }
 
     /// Shifts along v and u for each view, mm, without the part that is a motion of the object.
     fn irregular(scan: &Scan, size: f64) -> Vec<[f64; 2]> {

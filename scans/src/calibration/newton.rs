@@ -11,13 +11,9 @@
 use crate::calibration::CLEAR;
 use crate::calibration::consistency::Consistency;
 use crate::calibration::parameters::{Correction, Parameter};
-use crate::calibration::search::{Evidence, LONGEST, Meter, REACH, SMALL, damped};
+use crate::calibration::search::{Evidence, Meter, REACH, advance, solved};
 use conefield_core::Result;
-use conefield_core::matrix::{inner, inverse};
 use conefield_core::parallel;
-
-/// How often a step that does not reduce the criterion is cut to a third.
-const CUTS: usize = 3;
 
 /// The pairs with their progress meter.
 #[derive(Clone, Copy)]
@@ -68,11 +64,11 @@ impl Newton<'_> {
             let around = self.around(active, &units, &here)?;
             evidence = self.evidence(&around, &units);
             let Some(step) = around.step(None) else { break };
-            let longest = step.iter().fold(0.0f64, |m, s| m.max(s.abs()));
-            let share = (LONGEST / longest.max(1e-12)).min(1.0);
-            let Some((next, share)) = self.better(active, &units, &here, &step, share)? else { break };
-            here = next;
-            if share * longest < SMALL {
+            let better = |before: &Vec<f64>, there: &Correction| {
+                let found = self.misfits(there)?;
+                Ok((found.iter().sum::<f64>() < before.iter().sum::<f64>()).then_some(found))
+            };
+            if advance(active, &units, &mut here, &step, better)? {
                 break;
             }
         }
@@ -80,28 +76,6 @@ impl Newton<'_> {
             one.sure = self.surely_better(&here.1, &self.misfits(&here.0.with(p, 0.0))?);
         }
         Ok(Place { correction: here.0, active: active.to_vec(), evidence })
-    }
-
-    /// The first of ever shorter steps that reduces the criterion.
-    fn better(
-        &self,
-        active: &[Parameter],
-        units: &[f64],
-        here: &Misfits,
-        step: &[f64],
-        mut share: f64,
-    ) -> Result<Option<(Misfits, f64)>> {
-        let before: f64 = here.1.iter().sum();
-        for _ in 0..=CUTS {
-            let moves = active.iter().zip(units).zip(step);
-            let there = moves.fold(here.0, |c, ((&p, unit), s)| c.with(p, c.get(p) + share * s * unit));
-            let found = self.misfits(&there)?;
-            if found.iter().sum::<f64>() < before {
-                return Ok(Some(((there, found), share)));
-            }
-            share /= 3.0;
-        }
-        Ok(None)
     }
 
     fn around(&self, active: &[Parameter], units: &[f64], here: &Misfits) -> Result<Around> {
@@ -183,31 +157,21 @@ impl Around {
         };
         let matrix = self.curvature.iter().map(|row| row.iter().map(sum).collect()).collect();
         let gradient: Vec<f64> = self.gradient.iter().map(sum).collect();
-        Some(inverse(damped(matrix))?.iter().map(|row| -inner(row, &gradient)).collect())
+        solved(matrix, &gradient)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::calibration::consistency::tests::scan;
-    use crate::calibration::search::Watch;
+    use crate::calibration::consistency::tests::{Silent, scan};
     use std::sync::Mutex;
-
-    struct Nobody;
-
-    impl Watch for Nobody {
-        fn cancelled(&self) -> bool {
-            false
-        }
-        fn progress(&self, _: f64) {}
-    }
 
     #[test]
     fn distance_and_step_are_found_within_their_uncertainty() {
         let active = [Parameter::OffsetV, Parameter::Distance, Parameter::Step];
         let right = scan(24, 0.003);
-        let meter = Meter { watch: &Nobody, total: 1.0, done: Mutex::new(0.0) };
+        let meter = Meter { watch: &Silent, total: 1.0, done: Mutex::new(0.0) };
         for off in
             [Correction::default(), Correction::default().with(Parameter::Distance, -40.0).with(Parameter::Step, 0.01)]
         {

@@ -154,7 +154,7 @@ impl Correction {
 }
 
 /// Angles of the sources relative to the first one, without jumps of more than half a turn.
-pub fn turns(views: &[View]) -> Vec<f64> {
+fn turns(views: &[View]) -> Vec<f64> {
     let angle = |v: &View| v.source[1].atan2(v.source[0]);
     let Some(first) = views.first().map(angle) else { return vec![] };
     let mut last = 0.0f64;

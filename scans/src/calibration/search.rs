@@ -135,14 +135,12 @@ impl Search<'_> {
         for _ in 0..rounds.min(rounds * active.len()) {
             slopes = self.slopes(active, &units, here.0)?;
             let normal = Normal::of(&slopes, &here.1);
-            let Some(inverse) = inverse(damped(normal.matrix)) else { break };
-            let step: Vec<f64> = inverse.iter().map(|row| -inner(row, &normal.gradient)).collect();
-            let longest = step.iter().fold(0.0f64, |m, s| m.max(s.abs()));
-            let share = (LONGEST / longest.max(1e-12)).min(1.0);
-            let better = self.better(active, &units, &here, &step, share)?;
-            let Some((next, share)) = better else { break };
-            here = next;
-            if share * longest < SMALL {
+            let Some(step) = solved(normal.matrix, &normal.gradient) else { break };
+            let better = |before: &Prediction, there: &Correction| {
+                let found = self.predict(there)?;
+                Ok((found.error < before.error).then_some(found))
+            };
+            if advance(active, &units, &mut here, &step, better)? {
                 break;
             }
         }
@@ -169,30 +167,6 @@ impl Search<'_> {
         }
         let prediction = self.predict(&correction)?;
         Ok(Fit { correction, prediction, active, units, slopes })
-    }
-
-    /// The first of ever shorter steps that reduces the held-out error.
-    fn better(
-        &self,
-        active: &[Parameter],
-        units: &[f64],
-        here: &(Correction, Prediction),
-        step: &[f64],
-        mut share: f64,
-    ) -> Result<Option<((Correction, Prediction), f64)>> {
-        for _ in 0..=CUTS {
-            let there = active
-                .iter()
-                .zip(units)
-                .zip(step)
-                .fold(here.0, |c, ((&p, unit), s)| c.with(p, c.get(p) + share * s * unit));
-            let found = self.predict(&there)?;
-            if found.error < here.1.error {
-                return Ok(Some(((there, found), share)));
-            }
-            share /= 3.0;
-        }
-        Ok(None)
     }
 
     /// Derivatives of the residuals by each parameter, per pixel of the level.
@@ -260,8 +234,37 @@ impl Normal {
     }
 }
 
+/// The step, in pixels of each parameter, that solves the equations of a `matrix` of second and a `gradient` of first
+/// derivatives; `None` if they have no solution.
+pub(crate) fn solved(matrix: Vec<Vec<f64>>, gradient: &[f64]) -> Option<Vec<f64>> {
+    Some(inverse(damped(matrix))?.iter().map(|row| -inner(row, gradient)).collect())
+}
+
+/// Moves `here` by the first of ever shorter parts of `step` that is `better` than what has been found there; stays if
+/// none is. Returns whether this is the last step. `units` are pixels of the parameters `active`.
+pub(crate) fn advance<T>(
+    active: &[Parameter],
+    units: &[f64],
+    here: &mut (Correction, T),
+    step: &[f64],
+    better: impl Fn(&T, &Correction) -> Result<Option<T>>,
+) -> Result<bool> {
+    let longest = step.iter().fold(0.0f64, |m, s| m.max(s.abs()));
+    let mut share = (LONGEST / longest.max(1e-12)).min(1.0);
+    for _ in 0..=CUTS {
+        let moves = active.iter().zip(units).zip(step);
+        let there = moves.fold(here.0, |c, ((&p, unit), s)| c.with(p, c.get(p) + share * s * unit));
+        if let Some(found) = better(&here.1, &there)? {
+            *here = (there, found);
+            return Ok(share * longest < SMALL);
+        }
+        share /= 3.0;
+    }
+    Ok(true)
+}
+
 /// Adds a small number to the diagonal: a parameter that the views do not determine then keeps its value.
-pub(crate) fn damped(mut matrix: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
+fn damped(mut matrix: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
     let most = (0..matrix.len()).map(|k| matrix[k][k]).fold(0.0, f64::max);
     for (k, row) in matrix.iter_mut().enumerate() {
         row[k] += 1e-6 * most;

@@ -2,7 +2,7 @@
 
 use crate::corrections::Correct;
 use crate::diagnosis::border::border_medians;
-use crate::diagnosis::quantiles::{median, quantile};
+use crate::diagnosis::quantiles::{middle, quantile};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::scan::Scan;
 use ndarray::{ArrayView2, s};
@@ -74,6 +74,6 @@ impl Flux {
         }
         let [rows, columns] = [view.nrows(), view.ncols()];
         let ([top, bottom], [left, right]) = (self.rows.unwrap_or([0, rows]), self.columns.unwrap_or([0, columns]));
-        median(&mut view.slice(s![top..bottom, left..right]).iter().copied().collect::<Vec<_>>()).unwrap_or(0.0)
+        middle(view.slice(s![top..bottom, left..right]))
     }
 }

@@ -2,12 +2,12 @@
 
 use crate::corrections::Correct;
 use crate::corrections::filling::Filling;
-use crate::diagnosis::bad_pixels::outliers;
-use crate::diagnosis::quantiles::{median, quantile};
+use crate::diagnosis::bad_pixels::{neighbours, outliers};
+use crate::diagnosis::quantiles::{median, quantile, sorted_sample};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::parallel;
-use conefield_core::scan::{Scan, stride};
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
+use conefield_core::scan::Scan;
+use ndarray::{Array2, Array3, ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 
 /// Least number of views for judging a pixel over the views.
@@ -51,7 +51,12 @@ impl Correct for Pixels {
         if values.dim().0 >= LEAST_VIEWS {
             let [changes, flickers] = over_time(values.view());
             for ((at, &change), &flicker) in changes.indexed_iter().zip(&flickers) {
-                let [changes, flickers] = [&changes, &flickers].map(|a| sorted_around(a.view(), at, &bad));
+                let [changes, flickers] = [&changes, &flickers].map(|a| {
+                    let mut around = Vec::with_capacity(8);
+                    neighbours(a.view(), at, Some(&bad), &mut around);
+                    around.sort_unstable_by(f32::total_cmp);
+                    around
+                });
                 // Along an edge of the object two neighbours flicker as well.
                 let (Some(usual), Some(most)) =
                     (changes.get(changes.len().saturating_sub(1) / 2), flickers.iter().nth_back(1))
@@ -88,7 +93,7 @@ impl Pixels {
         let mut bad = Array2::from_elem(view.dim(), false);
         let mut around = Vec::with_capacity(8);
         for (at, &x) in view.indexed_iter() {
-            neighbours(view.view(), at, &mut around);
+            neighbours(view.view(), at, None, &mut around);
             around.sort_unstable_by(f32::total_cmp);
             let n = around.len();
             if n < 3 {
@@ -119,9 +124,7 @@ fn few(bad: usize, all: usize, what: &str) -> Result<()> {
 
 /// The range of the line integrals, without one percent at either end.
 fn range(values: ArrayView3<'_, f32>) -> f32 {
-    let mut sample: Vec<f32> =
-        values.iter().copied().step_by(stride(values.len(), 1_000_000, values.dim().2)).collect();
-    sample.sort_unstable_by(f32::total_cmp);
+    let sample = sorted_sample(values);
     let at = |share| quantile(&sample, share).unwrap_or(0.0);
     at(0.99) - at(0.01)
 }
@@ -135,7 +138,7 @@ fn over_time(values: ArrayView3<'_, f32>) -> [Array2<f32>; 2] {
         let mut around = Vec::with_capacity(8);
         for ((c, v), out) in line.indexed_iter_mut() {
             let view = values.index_axis(Axis(0), v);
-            neighbours(view, (r, c), &mut around);
+            neighbours(view, (r, c), None, &mut around);
             *out = view[[r, c]] - median(&mut around).unwrap_or(0.0);
         }
     });
@@ -153,32 +156,4 @@ fn over_time(values: ArrayView3<'_, f32>) -> [Array2<f32>; 2] {
         }
     }
     [changes, flickers]
-}
-
-/// The values of the up to eight pixels around `at`.
-fn neighbours(view: ArrayView2<'_, f32>, (i, j): (usize, usize), out: &mut Vec<f32>) {
-    let (rows, columns) = view.dim();
-    out.clear();
-    for r in i.saturating_sub(1)..(i + 2).min(rows) {
-        for c in j.saturating_sub(1)..(j + 2).min(columns) {
-            if (r, c) != (i, j) {
-                out.push(view[[r, c]]);
-            }
-        }
-    }
-}
-
-/// The values of the up to eight pixels around `at` that are not `bad`, in rising order.
-fn sorted_around(view: ArrayView2<'_, f32>, (i, j): (usize, usize), bad: &Array2<bool>) -> Vec<f32> {
-    let (rows, columns) = view.dim();
-    let mut around = Vec::with_capacity(8);
-    for r in i.saturating_sub(1)..(i + 2).min(rows) {
-        for c in j.saturating_sub(1)..(j + 2).min(columns) {
-            if (r, c) != (i, j) && !bad[[r, c]] {
-                around.push(view[[r, c]]);
-            }
-        }
-    }
-    around.sort_unstable_by(f32::total_cmp);
-    around
 }

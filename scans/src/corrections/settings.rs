@@ -14,7 +14,7 @@ impl Corrections {
     /// with its default settings, or one setting of it. Values are TOML; anything else is a string. Refuses unknown
     /// names and settings, and invalid values.
     pub fn parse<S: AsRef<str>>(texts: &[S]) -> Result<Self> {
-        let mut all = Table::new();
+        let mut all = Value::Table(Table::new());
         for text in texts {
             let text = text.as_ref().trim();
             let (path, value) = match text.split_once('=') {
@@ -27,9 +27,13 @@ impl Corrections {
                     "the name of a correction, such as rings, or one of its settings, such as rings.window=21";
                 return Err(Error::invalid(PLACE, "name", format!("\"{text}\""), expected));
             }
-            put(&mut all, &keys, value, text)?;
+            let one = keys.iter().rev().fold(value, |inner, key| Table::from_iter([(key.to_string(), inner)]).into());
+            if !merge(&mut all, one) {
+                let found = format!("\"{text}\" and another value for the same setting");
+                return Err(Error::invalid(PLACE, path, found, "each setting once"));
+            }
         }
-        let read: Self = Value::Table(all).try_into().map_err(|e: toml::de::Error| {
+        let read: Self = all.try_into().map_err(|e: toml::de::Error| {
             let expected = "corrections and settings as docs/guide/corrections.md has them";
             Error::invalid(PLACE, "settings", e.message(), expected)
         })?;
@@ -54,31 +58,13 @@ fn read(text: &str) -> Value {
     parsed.and_then(|mut t| t.remove("value")).unwrap_or_else(|| Value::String(text.to_owned()))
 }
 
-/// Puts `value` at `keys`. A name alone keeps the settings from other texts.
-fn put(table: &mut Table, keys: &[&str], value: Value, text: &str) -> Result<()> {
-    let twice = || {
-        let found = format!("\"{text}\" and another value for the same setting");
-        Err(Error::invalid(PLACE, keys.join("."), found, "each setting once"))
-    };
-    match keys {
-        [] => Ok(()),
-        [key] => match (table.get_mut(*key), value) {
-            (None, value) => {
-                table.insert((*key).to_owned(), value);
-                Ok(())
-            }
-            (Some(Value::Table(_)), Value::Table(more)) if more.is_empty() => Ok(()),
-            (Some(Value::Table(there)), Value::Table(more)) if there.is_empty() => {
-                *there = more;
-                Ok(())
-            }
-            _ => twice(),
-        },
-        [key, rest @ ..] => match table.entry((*key).to_owned()).or_insert_with(|| Value::Table(Table::new())) {
-            Value::Table(inner) => put(inner, rest, value, text),
-            _ => twice(),
-        },
-    }
+/// Adds `more` to `there`; false if both give a setting.
+fn merge(there: &mut Value, more: Value) -> bool {
+    let (Value::Table(there), Value::Table(more)) = (there, more) else { return false };
+    more.into_iter().all(|(key, value)| match there.get_mut(&key) {
+        Some(old) => merge(old, value),
+        None => there.insert(key, value).is_none(),
+    })
 }
 
 #[cfg(test)]
@@ -90,8 +76,11 @@ mod tests {
     fn names_settings_and_words_are_read() {
         let c = Corrections::parse(&["rings", "flux"]).unwrap();
         assert_eq!((c.rings, c.flux.is_some(), c.pixels), (Some(Rings::default()), true, None));
-        for order in [["rings.window=21", "rings.method=sorting"], ["rings.method = \"sorting\"", "rings.window = 21"]]
-        {
+        for order in [
+            ["rings.window=21", "rings.method=sorting"],
+            ["rings.method = \"sorting\"", "rings.window = 21"],
+            ["rings={ window = 21 }", "rings={ method = 'sorting' }"],
+        ] {
             let c = Corrections::parse(&order).unwrap();
             assert_eq!(c.rings, Some(Rings { window: 21, method: RingMethod::Sorting }));
         }

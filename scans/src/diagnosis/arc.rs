@@ -36,11 +36,8 @@ pub(crate) fn scan_arc(views: &[View]) -> ScanArc {
     sorted.sort_unstable_by(f64::total_cmp);
     let n = sorted.len();
     // Gap to the next view and its start, widest first.
-    let mut gaps: Vec<[f64; 2]> = (0..n)
-        .map(|i| {
-            if i + 1 < n { [sorted[i + 1] - sorted[i], sorted[i]] } else { [sorted[0] + 360.0 - sorted[i], sorted[i]] }
-        })
-        .collect();
+    let mut gaps: Vec<[f64; 2]> =
+        (0..n).map(|i| [sorted.get(i + 1).copied().unwrap_or(sorted[0] + 360.0) - sorted[i], sorted[i]]).collect();
     // Further turns repeat angles: they leave no gaps.
     let same = Arcs::of(&turns).same.to_degrees();
     gaps.retain(|g| g[0] > same);

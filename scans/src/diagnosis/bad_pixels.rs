@@ -1,6 +1,6 @@
 //! Detection of bad pixels, in flat and dark fields and as persistent outliers.
 
-use crate::diagnosis::quantiles::{median, quantile};
+use crate::diagnosis::quantiles::{middle, quantile};
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 
 /// A pixel whose response is below this share of the median response is dead.
@@ -22,7 +22,6 @@ const MOST_VIEWS: usize = 32;
 /// Finds pixels that hardly respond to the open beam or are far brighter than the others. `response` is flat − dark (or
 /// a substitute), `dark` the dark field; both `[row, column]`.
 pub fn from_fields(response: Option<ArrayView2<f32>>, dark: Option<ArrayView2<f32>>, open: f32) -> Vec<[usize; 2]> {
-    let middle = |a: ArrayView2<f32>| median(&mut a.iter().copied().collect::<Vec<_>>()).unwrap_or(0.0);
     let typical = response.map_or(open, middle);
     let mut bad = Vec::new();
     if let Some(r) = response {
@@ -51,14 +50,7 @@ pub fn outliers(projections: ArrayView3<f32>, known: &Array2<bool>) -> Vec<[usiz
     for &v in &looked {
         let view = projections.index_axis(Axis(0), v);
         let off = Array2::from_shape_fn((rows, columns), |(i, j)| {
-            around.clear();
-            for r in i.saturating_sub(1)..(i + 2).min(rows) {
-                for c in j.saturating_sub(1)..(j + 2).min(columns) {
-                    if (r, c) != (i, j) && !known[[r, c]] {
-                        around.push(view[[r, c]]);
-                    }
-                }
-            }
+            neighbours(view, (i, j), Some(known), &mut around);
             around.sort_unstable_by(f32::total_cmp);
             let n = around.len();
             let (Some(lower), Some(upper)) = (around.get(n.saturating_sub(1) / 2), around.get(n / 2)) else {
@@ -69,7 +61,7 @@ pub fn outliers(projections: ArrayView3<f32>, known: &Array2<bool>) -> Vec<[usiz
             (x - upper).max(lower - x).max(0.0)
         });
         // 1.4826 makes the median of |x| the standard deviation of normal noise.
-        let sigma = 1.4826 * median(&mut off.iter().copied().collect::<Vec<_>>()).unwrap_or(0.0);
+        let sigma = 1.4826 * middle(off.view());
         let mut sorted: Vec<f32> = view.iter().copied().collect();
         sorted.sort_unstable_by(f32::total_cmp);
         let at = |share| quantile(&sorted, share).unwrap_or(0.0);
@@ -78,6 +70,24 @@ pub fn outliers(projections: ArrayView3<f32>, known: &Array2<bool>) -> Vec<[usiz
     }
     let enough = (SHARE_OF_VIEWS * looked.len() as f64).ceil() as u16;
     times.indexed_iter().filter(|((i, j), n)| **n >= enough && !known[[*i, *j]]).map(|((i, j), _)| [i, j]).collect()
+}
+
+/// Puts the values of the up to eight pixels around `at` that are not `bad` into `out`.
+pub(crate) fn neighbours(
+    view: ArrayView2<'_, f32>,
+    (i, j): (usize, usize),
+    bad: Option<&Array2<bool>>,
+    out: &mut Vec<f32>,
+) {
+    let (rows, columns) = view.dim();
+    out.clear();
+    for r in i.saturating_sub(1)..(i + 2).min(rows) {
+        for c in j.saturating_sub(1)..(j + 2).min(columns) {
+            if (r, c) != (i, j) && bad.is_none_or(|bad| !bad[[r, c]]) {
+                out.push(view[[r, c]]);
+            }
+        }
+    }
 }
 
 #[cfg(test)]

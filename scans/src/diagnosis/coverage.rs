@@ -25,23 +25,16 @@ pub struct VolumeCoverage {
     pub least: f64,
 }
 
-/// The shadows of evenly spaced views.
-fn shadows(geometry: &Geometry) -> Vec<Shadow> {
-    geometry.views.iter().step_by(geometry.views.len().div_ceil(VIEWS).max(1)).map(Shadow::of).collect()
-}
-
-/// The share of `shadows` in which `point` projects onto a detector of `[rows, columns]`.
-fn share(shadows: &[Shadow], detector: [usize; 2], point: Vec3) -> f64 {
-    let [rows, columns] = detector.map(|n| n as f64 / 2.0);
-    let sees = |s: &&Shadow| s.of_point(point).is_some_and(|f| f.row.abs() <= rows && f.column.abs() <= columns);
-    shadows.iter().filter(sees).count() as f64 / shadows.len().max(1) as f64
-}
-
 /// For each of `points` (mm), the share of the views of `geometry` onto whose detector it projects; uses evenly spaced
 /// views if there are many.
 pub fn share_of_views(geometry: &Geometry, points: &[Vec3]) -> Vec<f64> {
-    let shadows = shadows(geometry);
-    parallel::map(points, |_, p| share(&shadows, geometry.detector, *p))
+    let shadows: Vec<Shadow> =
+        geometry.views.iter().step_by(geometry.views.len().div_ceil(VIEWS).max(1)).map(Shadow::of).collect();
+    let [rows, columns] = geometry.detector.map(|n| n as f64 / 2.0);
+    parallel::map(points, |_, point| {
+        let sees = |s: &&Shadow| s.of_point(*point).is_some_and(|f| f.row.abs() <= rows && f.column.abs() <= columns);
+        shadows.iter().filter(sees).count() as f64 / shadows.len().max(1) as f64
+    })
 }
 
 /// Computes how many views see each part of the volume.

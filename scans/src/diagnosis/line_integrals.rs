@@ -1,13 +1,11 @@
 //! Checks whether projections look like line integrals, and finds the likely cause if they do not.
 
 use crate::diagnosis::border::border_medians;
-use crate::diagnosis::quantiles::{median, quantile};
-use conefield_core::scan::stride;
+use crate::diagnosis::quantiles::{median, middle, quantile, sorted_sample};
+use conefield_core::finite::range;
 use ndarray::{ArrayView3, Axis, s};
 use serde::Serialize;
 
-/// Sample size for the range.
-const SAMPLE: usize = 1_000_000;
 /// Views whose border is examined.
 const VIEWS: usize = 32;
 /// At this line integral less than one photon in 10²¹ gets through; no detector measures that.
@@ -32,18 +30,11 @@ pub struct LineIntegralCheck {
 /// Checks whether `projections` (`[view, row, column]`) can be line integrals `A = −ln(I/I0)`, which have no unit:
 /// their range, air near zero at the border, the share of negative values.
 pub fn check_line_integrals(projections: ArrayView3<'_, f32>) -> LineIntegralCheck {
-    let n = projections.len();
-    let (mut min, mut max) = (f32::INFINITY, f32::NEG_INFINITY);
-    for &x in projections {
-        (min, max) = (min.min(x), max.max(x));
-    }
-    let step = stride(n, SAMPLE, projections.len_of(Axis(2)));
-    let mut sample: Vec<f32> = projections.iter().copied().step_by(step).collect();
-    sample.sort_unstable_by(f32::total_cmp);
+    let sample = sorted_sample(projections);
     let at = |share| quantile(&sample, share).unwrap_or(0.0);
     let (low, high) = (at(0.001), at(0.999));
     let negative = sample.partition_point(|&x| x < -0.05 * high.abs()) as f64 / sample.len().max(1) as f64;
-    let (mut dark, mut bright, mut middle) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut dark, mut bright, mut centres) = (Vec::new(), Vec::new(), Vec::new());
     let (rows, columns) = (projections.len_of(Axis(1)), projections.len_of(Axis(2)));
     for view in projections.axis_iter(Axis(0)).step_by(projections.len_of(Axis(0)).div_ceil(VIEWS).max(1)) {
         if rows == 0 || columns == 0 {
@@ -53,9 +44,9 @@ pub fn check_line_integrals(projections: ArrayView3<'_, f32>) -> LineIntegralChe
         dark.extend(quantile(&border, 0.15));
         bright.extend(quantile(&border, 0.85));
         let centre = view.slice(s![rows / 4..rows - rows / 4, columns / 4..columns - columns / 4]);
-        middle.extend(median(&mut centre.iter().copied().collect::<Vec<_>>()));
+        centres.push(middle(centre));
     }
-    let [air, bright, centre] = [dark, bright, middle].map(|mut v| median(&mut v).unwrap_or(0.0));
+    let [air, bright, centre] = [dark, bright, centres].map(|mut v| median(&mut v).unwrap_or(0.0));
     let mut complaints = Vec::new();
     // Intensities are highest in air; line integrals are lowest there.
     let upside_down = bright > 0.7 * high && centre < 0.95 * bright && air > 0.2 * high;
@@ -84,7 +75,7 @@ pub fn check_line_integrals(projections: ArrayView3<'_, f32>) -> LineIntegralChe
             100.0 * negative
         ));
     }
-    LineIntegralCheck { range: [min, max], typical_range: [low, high], air, negative, complaints }
+    LineIntegralCheck { range: range(&projections), typical_range: [low, high], air, negative, complaints }
 }
 
 #[cfg(test)]

@@ -1,5 +1,24 @@
 //! Medians and quantiles of values.
 
+use conefield_core::scan::stride;
+use ndarray::{ArrayView2, ArrayView3};
+
+/// Values of a scan that suffice for its quantiles.
+const SAMPLE: usize = 1_000_000;
+
+/// About a million values of `projections` (`[view, row, column]`), ascending.
+pub(crate) fn sorted_sample(projections: ArrayView3<'_, f32>) -> Vec<f32> {
+    let step = stride(projections.len(), SAMPLE, projections.dim().2);
+    let mut sample: Vec<f32> = projections.iter().copied().step_by(step).collect();
+    sample.sort_unstable_by(f32::total_cmp);
+    sample
+}
+
+/// The median of an image; 0 if it has no pixels.
+pub(crate) fn middle(image: ArrayView2<'_, f32>) -> f32 {
+    median(&mut image.iter().copied().collect::<Vec<_>>()).unwrap_or(0.0)
+}
+
 /// The median, or `None` for no values. For an even number, the upper one of the middle two.
 pub fn median(values: &mut [f32]) -> Option<f32> {
     let middle = values.len() / 2;

@@ -63,13 +63,8 @@ const FEW: f64 = 8.0;
 const OVERLAP: f64 = 0.05;
 /// A gap is large if it exceeds the mean gap by this factor.
 const GAP: f64 = 3.0;
-/// Names of physical units in data sets.
+/// Names of physical units in data sets; others are those of a unit cube or the like.
 const UNITS: [&str; 6] = ["mm", "cm", "m", "um", "µm", "dm"];
-
-/// Whether lengths are physical, and not those of a unit cube or the like.
-fn has_size(scan: &Scan) -> bool {
-    UNITS.contains(&scan.unit.name.as_str())
-}
 
 fn percent(x: f64) -> String {
     match 100.0 * x {
@@ -265,7 +260,7 @@ fn repeats(scan: &Scan, s: &Survey, warn: Warn) {
 }
 
 fn scale(scan: &Scan, s: &Survey, warn: Warn) {
-    if !has_size(scan) {
+    if !UNITS.contains(&scan.unit.name.as_str()) {
         return;
     }
     let dso = s.setup.source_to_axis_mm;
@@ -325,8 +320,6 @@ fn voxels(scan: &Scan, s: &Survey, warn: Warn) {
         true => format!("a shape of {:?} gives voxels of that size", fitting.map(|n| n as usize)),
         false => "check that the pixel size is in mm, and that dso and dsd are not swapped".into(),
     };
-    match fine {
-        true => warn(WarningKind::VoxelSize, found, format!("finer than the detector resolves; {shape}")),
-        false => warn(WarningKind::VoxelSize, found, format!("details that the detector resolves are lost; {shape}")),
-    }
+    let why = if fine { "finer than the detector resolves" } else { "details that the detector resolves are lost" };
+    warn(WarningKind::VoxelSize, found, format!("{why}; {shape}"));
 }

@@ -43,13 +43,16 @@ fn clean() -> Setting {
 }
 
 impl Setting {
-    fn scan(&self) -> Scan {
+    fn views(&self) -> Vec<View> {
         let mm = |x: [f64; 2]| x.map(Millimetres);
         let view = |a: &f64| {
             View::circular(Radians(*a), Millimetres(self.dso), Millimetres(self.dsd), mm(self.pixel), mm(self.offset))
         };
-        let geometry =
-            Geometry { detector: self.detector, views: self.angles.iter().map(view).collect(), volume: self.volume };
+        self.angles.iter().map(view).collect()
+    }
+
+    fn scan(&self) -> Scan {
+        let geometry = Geometry { detector: self.detector, views: self.views(), volume: self.volume };
         let shape = [geometry.views.len(), self.detector[0], self.detector[1]];
         let half = self.volume.size()[2] / 2.0;
         let projections = Array3::from_shape_fn(shape, |(view, row, column)| {
@@ -150,16 +153,6 @@ fn unusual_but_complete_scans_give_no_warning() {
     let noise = |i: usize| 0.04 * (((i * 7919) % 101) as f32 / 50.0 - 1.0);
     noisy.projections.iter_mut().enumerate().for_each(|(i, x)| *x += noise(i));
     assert_eq!(survey(&noisy).warnings, []);
-}
-
-impl Setting {
-    fn views(&self) -> Vec<View> {
-        let mm = |x: [f64; 2]| x.map(Millimetres);
-        let view = |a: &f64| {
-            View::circular(Radians(*a), Millimetres(self.dso), Millimetres(self.dsd), mm(self.pixel), mm(self.offset))
-        };
-        self.angles.iter().map(view).collect()
-    }
 }
 
 #[test]
