@@ -193,11 +193,8 @@ impl TvProx {
     /// the bounds.
     fn apply(&mut self, v: &[f32], tau: f32, steps: usize, u: &mut [f32]) {
         if tau < f32::MIN_POSITIVE {
-            let bounds = self.bounds;
-            return match &self.each {
-                None => bounds.clip_to(u, v),
-                Some(each) => clip_each(v, each, u),
-            };
+            self.bounds.clip_to(u, v);
+            return clip_each(u, self.each.as_deref());
         }
         let mut left = steps;
         loop {
@@ -351,11 +348,11 @@ impl Penalty for TvProx {
     }
 }
 
-/// Overwrites each `u` with the number within its bounds that is closest to `v`.
-pub(super) fn clip_each(v: &[f32], [low, high]: &[Vec<f32>; 2], u: &mut [f32]) {
-    parallel::change(u, [v, low, high], |u, [v, low, high]| {
-        let all = u.iter_mut().zip(v).zip(low).zip(high);
-        all.for_each(|(((u, v), low), high)| *u = v.max(*low).min(*high));
+/// Clips each `u` to its own bounds, if it has some.
+pub(super) fn clip_each(u: &mut [f32], each: Option<&[Vec<f32>; 2]>) {
+    let Some([low, high]) = each else { return };
+    parallel::change(u, [low, high], |u, [low, high]| {
+        u.iter_mut().zip(low).zip(high).for_each(|((u, low), high)| *u = u.max(*low).min(*high));
     });
 }
 
