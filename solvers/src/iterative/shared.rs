@@ -138,11 +138,8 @@ impl Shared {
 
     /// The known volume, in 1/mm; 0 if there is none.
     pub(super) fn known(&self, job: &Job<'_>, space: &Space) -> Result<Array> {
-        let volume = match (job.start, &self.start) {
-            (Some(given), _) => in_mm(job, "start", given.clone())?,
-            (None, Some(path)) => start_volume(job, path)?,
-            (None, None) => return space.volume(),
-        };
+        let named = self.start.as_ref().map(|file| KnownVolume { path: file.0.clone(), steps: 0 });
+        let Some((volume, ..)) = known_volume(job, named)? else { return space.volume() };
         space.hold(4 * space.header().voxels());
         space.place().adopt(volume.data)
     }
@@ -276,14 +273,9 @@ pub fn known_volume(job: &Job<'_>, named: Option<KnownVolume>) -> Result<Option<
             let steps = named.map_or(KnownVolume::STEPS, |n| n.steps);
             Ok(Some((in_mm(job, "start", given.clone())?, steps, "the volume of the previous method".into())))
         }
-        (None, Some(KnownVolume { path, steps })) => Ok(Some((start_volume(job, &path)?, steps, path))),
+        (None, Some(KnownVolume { path, steps })) => Ok(Some((in_mm(job, &path, (job.volumes)(&path)?)?, steps, path))),
         (None, None) => Ok(None),
     }
-}
-
-/// Reads a volume that matches the scan, in 1/mm.
-fn start_volume(job: &Job<'_>, path: &str) -> Result<Volume> {
-    in_mm(job, path, (job.volumes)(path)?)
 }
 
 /// Converts a volume from 1/unit of the scan to 1/mm. Refuses one that does not match the scan.
