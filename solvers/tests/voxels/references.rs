@@ -145,10 +145,11 @@ fn two_priors_reach_the_minimum_of_their_sum() {
         format!("{{ type = \"sum\", turns = {turns}, priors = [{first}, {second}] }}")
     };
     for turns in [1, 3] {
-        let found = [30, 100, 300].map(|passes| objective(&a, &p, &of(sum(turns, 1.0), passes)) / least - 1.0);
+        let volumes = [30, 100, 300].map(|passes| of(sum(turns, 1.0), passes));
+        let found = volumes.each_ref().map(|x| objective(&a, &p, x) / least - 1.0);
         println!("{turns} turns: {found:?} above the least objective {least:.6} after 30, 100, 300 passes");
         assert!(found[2] < 1e-4 && found[2] > -1e-4, "{turns} turns: {found:?}");
-        let apart = (&of(sum(turns, 1.0), 300) - &reference).mapv(f64::abs).fold(0.0f64, |m, x| m.max(*x));
+        let apart = (&volumes[2] - &reference).mapv(f64::abs).fold(0.0f64, |m, x| m.max(*x));
         assert!(apart < 0.01 * reference.fold(0.0f64, |m, x| m.max(*x)), "{turns} turns: {apart}");
     }
     for (what, other) in [("the first", prior(&PRIORS[0], 1.0)), ("half", sum(1, 0.5))] {
