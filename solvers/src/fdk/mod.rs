@@ -117,7 +117,7 @@ impl Plan for Fdk {
         finite(&volume, 1)?;
         train_s += taken.elapsed().as_secs_f64();
         let mm = job.scan.unit.mm as f32;
-        let psnr = monitor.psnr(&volume, mm);
+        let psnr = monitor.psnr(volume.view(), mm);
         observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
         parallel::scale(&mut volume, mm);
         let volume = Volume { data: volume, grid: geometry.volume, affine: None };

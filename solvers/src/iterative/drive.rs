@@ -215,7 +215,8 @@ impl<'a> Run<'a> {
         if let Some(volume) = volume {
             held_out = self.monitor.held_out(self.problem.place, self.problem.projector, volume)?;
             if self.monitor.has_reference() {
-                psnr = self.monitor.psnr(&self.problem.place.read(volume)?, self.job.scan.unit.mm as f32);
+                let scale = self.job.scan.unit.mm as f32;
+                psnr = self.monitor.psnr(self.problem.place.read(volume)?.view(), scale);
             }
         }
         let mut record = Record {
