@@ -55,7 +55,7 @@ fn main() -> Result<()> {
         times(RUNS, || {
             for part in views.chunks(8) {
                 let images = projections.slice(ndarray::s![part[0]..part[0] + part.len(), .., ..]);
-                let pixels = ColumnMajor::new(geometry, part, images, |_, _, _, x| x);
+                let pixels = ColumnMajor::new(geometry, part, images);
                 backproject(geometry, part, &pixels, &scales[part[0]..], back.view_mut(), 0);
             }
         })

@@ -498,16 +498,6 @@ impl<R: Real> DenseGrads<R> {
         &mut self.values[self.places[k].clone()]
     }
 
-    /// Number of gradients.
-    pub fn len(&self) -> usize {
-        self.values.len()
-    }
-
-    /// Whether no stage is dense.
-    pub fn is_empty(&self) -> bool {
-        self.values.is_empty()
-    }
-
     /// Resets to zero.
     pub fn clear(&mut self) {
         self.values.fill(R::ZERO);

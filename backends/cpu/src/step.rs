@@ -31,6 +31,15 @@ enum Group {
     Blocks(usize, Range<usize>),
 }
 
+/// What the slots work on.
+#[derive(Clone, Copy)]
+struct Task<'a, R: Real> {
+    kernels: &'a Kernels<'a, R>,
+    projector: &'a dyn Projector,
+    params: &'a [R],
+    work: &'a Work<'a>,
+}
+
 /// Data of one slot.
 #[derive(Debug, Default)]
 struct Slot<R> {
@@ -61,7 +70,7 @@ impl<R: Real> Slots<R> {
     /// Slots for `kernels`. Their number depends on the plan only, since it determines the order of sums.
     pub fn new(kernels: &Kernels<'_, R>) -> Self {
         let dense = DenseGrads::new(kernels);
-        let count = Self::count(dense.len());
+        let count = Self::count(DenseGrads::numbers(kernels));
         let slot = || Slot { dense: dense.clone(), logs: vec![Log::default(); kernels.steps.len()], ..Slot::default() };
         Self { slots: std::iter::repeat_with(slot).take(count).collect() }
     }
@@ -87,6 +96,7 @@ impl<R: Real> Slots<R> {
         grads: &mut [R],
         work: &Work<'_>,
     ) -> StepStats {
+        let task = Task { kernels, projector, params, work };
         let mut stats = StepStats::default();
         for slot in &mut self.slots {
             slot.dense.clear();
@@ -96,13 +106,11 @@ impl<R: Real> Slots<R> {
             let start = Instant::now();
             let share = wave.len().div_ceil(self.slots.len()).max(1);
             let groups = |i: usize| &wave[(i * share).min(wave.len())..((i + 1) * share).min(wave.len())];
-            self.slots.par_iter_mut().enumerate().for_each(|(i, slot)| slot.begin(kernels, projector, work, groups(i)));
+            self.slots.par_iter_mut().enumerate().for_each(|(i, slot)| slot.begin(task, groups(i)));
             for pass in 0..kernels.encoder_passes() {
                 self.slots.par_iter_mut().for_each(|slot| slot.encoded.pass(kernels, params, pass));
             }
-            self.slots.par_iter_mut().enumerate().for_each(|(i, slot)| {
-                slot.learn_all(kernels, projector, params, work, groups(i));
-            });
+            self.slots.par_iter_mut().enumerate().for_each(|(i, slot)| slot.learn_all(task, groups(i)));
             let dense_done = Instant::now();
             self.scatter(kernels, params, grads);
             stats.dense_s += (dense_done - start).as_secs_f64();
@@ -219,34 +227,27 @@ fn cut(rows: Range<usize>) -> impl Iterator<Item = Range<usize>> {
 
 impl<R: Real> Slot<R> {
     /// Samples `groups`, as input of the encoder.
-    fn begin(&mut self, kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Work<'_>, groups: &[Group]) {
+    fn begin(&mut self, task: Task<'_, R>, groups: &[Group]) {
         self.samples.points.clear();
         self.samples.weights.clear();
         self.counts.clear();
         self.placed.clear();
         for group in groups {
-            self.place(kernels, projector, work, group);
+            self.place(task, group);
         }
-        self.encoded.begin(kernels, &self.samples.points);
+        self.encoded.begin(task.kernels, &self.samples.points);
     }
 
     /// Forward and backward of all stages after the encoder, group by group.
-    fn learn_all(
-        &mut self,
-        kernels: &Kernels<'_, R>,
-        projector: &dyn Projector,
-        params: &[R],
-        work: &Work<'_>,
-        groups: &[Group],
-    ) {
+    fn learn_all(&mut self, task: Task<'_, R>, groups: &[Group]) {
         for (i, group) in groups.iter().enumerate() {
-            self.learn(kernels, projector, params, work, group, i);
+            self.learn(task, group, i);
         }
-        self.encoded.backward(kernels, params, &mut self.dense);
+        self.encoded.backward(task.kernels, task.params, &mut self.dense);
     }
 
     /// Appends the samples of `group`.
-    fn place(&mut self, kernels: &Kernels<'_, R>, projector: &dyn Projector, work: &Work<'_>, group: &Group) {
+    fn place(&mut self, Task { kernels, projector, work, .. }: Task<'_, R>, group: &Group) {
         let points = &mut self.samples.points;
         let (start, counted) = (points.len(), self.counts.len());
         match group {
@@ -279,22 +280,15 @@ impl<R: Real> Slot<R> {
     }
 
     /// All stages after the encoder, for the group with index `at`.
-    fn learn(
-        &mut self,
-        kernels: &Kernels<'_, R>,
-        projector: &dyn Projector,
-        params: &[R],
-        work: &Work<'_>,
-        group: &Group,
-        at: usize,
-    ) {
+    fn learn(&mut self, task: Task<'_, R>, group: &Group, at: usize) {
+        let Task { kernels, params, work, .. } = task;
         let [rows, counts] = self.placed[at].clone();
         if rows.is_empty() {
             // Rays without samples still have a measured value that they do not explain.
             if let Group::Rays(range) = group {
                 self.mu.clear();
                 self.dmu.clear();
-                self.ray_loss(projector, work, range.clone(), rows.start, counts);
+                self.ray_loss(task, range.clone(), rows.start, counts);
             }
             return;
         }
@@ -315,7 +309,7 @@ impl<R: Real> Slot<R> {
         self.dmu.clear();
         self.dmu.resize(self.mu.len(), 0.0);
         match group {
-            Group::Rays(range) => self.ray_loss(projector, work, range.clone(), rows.start, counts),
+            Group::Rays(range) => self.ray_loss(task, range.clone(), rows.start, counts),
             Group::Points(range) => {
                 let scale = 1.0 / work.points.len() as f64;
                 for (i, (_, target)) in work.points[range.clone()].iter().enumerate() {
@@ -346,14 +340,8 @@ impl<R: Real> Slot<R> {
     }
 
     /// Losses of `rays`, whose rows begin at `first` of the slot.
-    fn ray_loss(
-        &mut self,
-        projector: &dyn Projector,
-        work: &Work<'_>,
-        rays: Range<usize>,
-        first: usize,
-        counts: Range<usize>,
-    ) {
+    fn ray_loss(&mut self, task: Task<'_, R>, rays: Range<usize>, first: usize, counts: Range<usize>) {
+        let Task { projector, work, .. } = task;
         let scale = 1.0 / work.rays.len() as f64;
         let mut at = 0;
         for (i, &n) in rays.zip(&self.counts[counts]) {

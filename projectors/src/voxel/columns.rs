@@ -418,7 +418,7 @@ pub fn adjoint<R: Real>(
         let views = &views[part.clone()];
         let numbers: Vec<usize> = views.iter().map(|v| v.0).collect();
         let images = projections.slice_axis(Axis(0), part.into());
-        let mut pixels = ColumnMajor::new(geometry, &numbers, images, |_, _, _, x| x);
+        let mut pixels = ColumnMajor::new(geometry, &numbers, images);
         // The nonzero rows of each column: zeros, as the residual of air in an empty volume, are not gathered.
         let of_view = |_, (mut view, (_, columns)): (ViewColumns<'_, R>, &(usize, &[Column]))| -> Vec<Range<usize>> {
             let rows = |c: &Column| {

@@ -37,14 +37,8 @@ pub struct ColumnMajor<R> {
 }
 
 impl<R: Real> ColumnMajor<R> {
-    /// The views `views` of `geometry`, with one image each in `projections`; `value` computes a number from a pixel's
-    /// view (index within `views`), row, column and measured value.
-    pub fn new(
-        geometry: &Geometry,
-        views: &[usize],
-        projections: ArrayView3<'_, R>,
-        value: impl Fn(usize, usize, usize, R) -> R + Sync,
-    ) -> Self {
+    /// The views `views` of `geometry`, with one image each in `projections`.
+    pub fn new(geometry: &Geometry, views: &[usize], projections: ArrayView3<'_, R>) -> Self {
         let [rows, columns] = geometry.detector;
         let stride = rows + 2 * PAD;
         let mut data = vec![R::ZERO; views.len() * columns * stride];
@@ -57,7 +51,7 @@ impl<R: Real> ColumnMajor<R> {
                 for row in 0..rows {
                     let from_below = if downwards { rows - 1 - row } else { row };
                     for column in left..(left + STRIP).min(columns) {
-                        out[column * stride + PAD + from_below] = value(n, row, column, view[[row, column]]);
+                        out[column * stride + PAD + from_below] = view[[row, column]];
                     }
                 }
             }
@@ -109,9 +103,13 @@ impl<R> ViewColumns<'_, R> {
 }
 
 /// Number of views to hold column by column at once: a few MiB, which stay in the last-level cache.
-pub fn batch<R>([rows, columns]: [usize; 2]) -> usize {
-    let view = (rows + 2 * PAD) * columns * size_of::<R>();
-    ((12 << 20) / view.max(1)).clamp(1, 64)
+pub fn batch<R>(detector: [usize; 2]) -> usize {
+    views_within::<R>(detector, 12 << 20)
+}
+
+/// Number of views of which [`ColumnMajor`] fits into `bytes`, 1 to 64.
+pub fn views_within<R>(detector: [usize; 2], bytes: u64) -> usize {
+    (bytes / column_major_bytes::<R>(detector, 1).max(1)).clamp(1, 64) as usize
 }
 
 /// Bytes of [`ColumnMajor`] for `views` views.

@@ -1,7 +1,6 @@
 //! The built-in voxel projectors.
 
 use super::rays;
-use super::walk::{SiddonWalk, TrilinearWalk};
 use super::{bundles, columns};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::Geometry;
@@ -108,11 +107,8 @@ impl VoxelProjector for Joseph {
 impl Trilinear {
     /// Axis-aligned rays of a parallel beam cross whole numbers of steps. Their counts must not depend on rounding, which
     /// differs between devices.
-    fn samples(&self) -> f64 {
+    pub(super) fn samples(&self) -> f64 {
         self.samples_per_voxel * (1.0 - 1e-5)
-    }
-    fn walk(&self) -> TrilinearWalk {
-        TrilinearWalk { samples_per_voxel: self.samples() }
     }
 }
 
@@ -140,19 +136,19 @@ impl<R: Real> VoxelOperator<R> for Siddon {
     }
 
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, out: ArrayViewMut3<'_, R>) {
-        rays::forward(&SiddonWalk, geometry, views, volume, out);
+        rays::forward(self, geometry, views, volume, out);
     }
     fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, volume: ArrayViewMut3<'_, R>) {
-        rays::adjoint(&SiddonWalk, geometry, views, p, volume);
+        rays::adjoint(self, geometry, views, p, volume);
     }
 }
 
 impl<R: Real> VoxelOperator<R> for Trilinear {
     fn forward(&self, geometry: &Geometry, views: &[usize], volume: ArrayView3<'_, R>, out: ArrayViewMut3<'_, R>) {
-        rays::forward(&self.walk(), geometry, views, volume, out);
+        rays::forward(self, geometry, views, volume, out);
     }
     fn adjoint(&self, geometry: &Geometry, views: &[usize], p: ArrayView3<'_, R>, volume: ArrayViewMut3<'_, R>) {
-        rays::adjoint(&self.walk(), geometry, views, p, volume);
+        rays::adjoint(self, geometry, views, p, volume);
     }
 }
 

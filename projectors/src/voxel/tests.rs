@@ -6,7 +6,6 @@ use super::layout::{ColumnMajor, Pinhole, main_axis};
 use super::rays;
 use super::walk::{VoxelRay, Walk};
 use super::{Joseph, Siddon, Trilinear};
-use crate::simulate::{Ellipsoid, ellipsoids, scan_ellipsoids};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, View, VoxelGrid, cross, norm};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
@@ -87,53 +86,13 @@ fn mismatch<R: Real>(op: &dyn VoxelOperator<R>, g: &Geometry, seed: u64) -> f64 
     let y = noise::<R>([g.views.len(), g.detector[0], g.detector[1]], seed + 1);
     let ax = forward(op, g, x.view());
     let aty = adjoint(op, g, y.view());
-    let norm = (dot(&ax, &ax) * dot(&y, &y)).sqrt();
-    assert!(norm > 0.0);
+    // Every ray may miss the volume.
+    let norm = (dot(&ax, &ax) * dot(&y, &y)).sqrt() + 1e-9;
     (dot(&ax, &y) - dot(&x, &aty)).abs() / norm
 }
 
 fn projectors() -> Vec<Box<dyn VoxelProjector>> {
     vec![Box::new(Siddon {}), Box::new(Joseph {}), Box::new(Trilinear::default())]
-}
-
-#[test]
-fn adjoints_are_exact() {
-    for upright in [true, false] {
-        let g = crooked(upright);
-        for p in projectors() {
-            let double = mismatch(p.reference(), &g, 7);
-            let single = mismatch(p.operator(), &g, 7);
-            assert!(double < 1e-12, "{}: {double:e} in f64", p.describe());
-            assert!(single < 1e-5, "{}: {single:e} in f32", p.describe());
-        }
-    }
-}
-
-/// Verifies that the check above can fail: a forward projection of another projector does not match the adjoint.
-#[test]
-fn a_wrong_adjoint_is_caught() {
-    struct Wrong;
-    impl VoxelOperator<f64> for Wrong {
-        fn forward(
-            &self,
-            g: &Geometry,
-            views: &[usize],
-            volume: ArrayView3<'_, f64>,
-            out: ndarray::ArrayViewMut3<'_, f64>,
-        ) {
-            Siddon {}.forward(g, views, volume, out);
-        }
-        fn adjoint(
-            &self,
-            g: &Geometry,
-            views: &[usize],
-            p: ArrayView3<'_, f64>,
-            volume: ndarray::ArrayViewMut3<'_, f64>,
-        ) {
-            Joseph {}.adjoint(g, views, p, volume);
-        }
-    }
-    assert!(mismatch(&Wrong, &crooked(true), 7) > 1e-4);
 }
 
 /// Bilinear interpolation in the planes of voxel centres across the ray's main direction, plane by plane (Joseph, IEEE
@@ -201,6 +160,14 @@ fn off_the_rays(g: &Geometry) -> [f64; 2] {
     [double, single / largest]
 }
 
+/// Joseph's projections are those ray by ray, and its adjoint is exact.
+fn agrees_with_rays(g: &Geometry, what: &str) {
+    let [double, single] = off_the_rays(g);
+    assert!(double < 1e-10 && single < 1e-5, "{what}: {double:e} and {single:e} from rays");
+    let [double, single] = [mismatch::<f64>(&Joseph {}, g, 7), mismatch::<f32>(&Joseph {}, g, 7)];
+    assert!(double < 1e-12 && single < 1e-5, "{what}: {double:e} and {single:e} between adjoints");
+}
+
 #[test]
 fn columns_and_bundles_agree_with_rays() {
     // Two of these views are tilted; from above, rays run along z; a detector narrower than a bundle.
@@ -239,13 +206,7 @@ fn tilted_columns_agree_with_rays_and_are_adjoint() {
             g.volume = VoxelGrid { shape, spacing, center: [1.0, -2.0, 3.0] };
             g.detector = [41, 21];
             assert!(degrees > 4.0 || all_views(&g).iter().all(|&v| columns::of(&g, v).is_some()), "{degrees}");
-            let [double, single] = off_the_rays(&g);
-            assert!(double < 1e-10, "{degrees}° {shape:?}: {double:e}");
-            assert!(single < 1e-5, "{degrees}° {shape:?}: {single:e}");
-            let double = mismatch::<f64>(&Joseph {}, &g, 7);
-            let single = mismatch::<f32>(&Joseph {}, &g, 7);
-            assert!(double < 1e-12, "{degrees}° {shape:?}: {double:e}");
-            assert!(single < 1e-5, "{degrees}° {shape:?}: {single:e}");
+            agrees_with_rays(&g, &format!("{degrees}° {shape:?}"));
         }
     }
 }
@@ -257,8 +218,7 @@ fn a_column_across_the_diagonal_is_split() {
     g.views = vec![g.views[2]];
     let columns = columns::of(&g, 0).unwrap();
     assert!(columns.len() > g.detector[1], "{} of {}", columns.len(), g.detector[1]);
-    assert!(off_the_rays(&g)[0] < 1e-10);
-    assert!(mismatch::<f64>(&Joseph {}, &g, 7) < 1e-12);
+    agrees_with_rays(&g, "across the diagonal");
 }
 
 #[test]
@@ -271,57 +231,8 @@ fn rows_finer_than_voxels_and_coarser_agree_too() {
             v.u = v.u.map(|x| 3.0 * x);
         }
         for g in [turned(g.clone(), 1.5), g] {
-            assert!(off_the_rays(&g)[0] < 1e-10, "rows of {rows}");
-            assert!(mismatch::<f64>(&Joseph {}, &g, 5) < 1e-12, "rows of {rows}");
-            assert!(mismatch::<f32>(&Joseph {}, &g, 5) < 1e-5, "rows of {rows}");
+            agrees_with_rays(&g, &format!("rows of {rows}"));
         }
-    }
-}
-
-#[test]
-fn any_number_of_threads_gives_the_same_bits() {
-    let g = crooked(false);
-    let x = noise::<f32>(g.volume.shape, 1);
-    let y = noise::<f32>([g.views.len(), g.detector[0], g.detector[1]], 2);
-    let on = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| {
-            let both =
-                |p: &dyn VoxelProjector| (forward(p.operator(), &g, x.view()), adjoint(p.operator(), &g, y.view()));
-            let all = projectors().iter().map(|p| both(p.as_ref())).collect::<Vec<_>>();
-            (all, by_lines::<f32>(&g, &y.mapv(f64::from)))
-        })
-    };
-    assert_eq!(on(1), on(3));
-}
-
-/// Root mean square error against the closed form, relative to its mean.
-fn error_at(p: &dyn VoxelProjector, n: usize) -> f64 {
-    let side = 40.0;
-    let g = Geometry {
-        detector: [24, 24],
-        views: [0.1, 1.2, 2.5].map(|a| circular(a, 100.0, 150.0, [2.6; 2], [0.7, -1.1])).to_vec(),
-        volume: VoxelGrid { shape: [n; 3], spacing: [side / n as f64; 3], center: [0.0; 3] },
-    };
-    let body = [Ellipsoid { center: [2.0, -1.0, 1.5], axes: [15.0, 11.0, 13.0], value: 1.0 }];
-    let found = forward(p.operator(), &g, ellipsoids(&body, &g.volume).data.view());
-    let (mut square, mut sum) = (0.0, 0.0);
-    for (x, exact) in found.iter().zip(&scan_ellipsoids(&body, g).projections) {
-        square += f64::from(x - exact).powi(2);
-        sum += f64::from(*exact);
-    }
-    let count = found.len() as f64;
-    (square / count).sqrt() / (sum / count)
-}
-
-/// Voxels resolve the edge of a homogeneous body to a fraction of their size: every projector has order about 1.
-#[test]
-fn projections_of_an_ellipsoid_converge() {
-    for (p, least) in projectors().iter().zip([0.9; 3]) {
-        let errors = [16, 32, 64].map(|n| error_at(p.as_ref(), n));
-        let order = (errors[0] / errors[2]).log2() / 2.0;
-        assert!(order > least, "{}: order {order:.2} of {errors:?}", p.describe());
-        assert!(errors[2] < 0.05, "{}: {errors:?}", p.describe());
     }
 }
 
@@ -402,7 +313,7 @@ fn scales(g: &Geometry) -> Vec<f64> {
 
 fn by_lines<R: Real>(g: &Geometry, y: &Array3<f64>) -> Array3<R> {
     let views = all_views(g);
-    let pixels = ColumnMajor::new(g, &views, y.mapv(R::of).view(), |_, _, _, x| x);
+    let pixels = ColumnMajor::new(g, &views, y.mapv(R::of).view());
     let mut out = Array3::from_elem(g.volume.shape, R::ZERO);
     backproject(g, &views, &pixels, &scales(g), out.view_mut(), 0);
     out
@@ -416,8 +327,14 @@ fn agrees_with_voxels(g: &Geometry) {
     fn error<R: Real>(found: &Array3<R>, want: &Array3<f64>) -> f64 {
         Zip::from(found).and(want).fold(0.0, |w, a, b| w.max((a.f64() - b).abs()))
     }
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| by_lines::<f32>(g, &y))
+    };
+    let single = on(1);
+    assert!(single == on(3), "the number of threads changes {:?} of {:?}", g.volume, g.detector);
     let double = error(&by_lines::<f64>(g, &y), &want) / largest;
-    let single = error(&by_lines::<f32>(g, &y), &want) / largest;
+    let single = error(&single, &want) / largest;
     assert!(double < 1e-11, "{double:e} in {:?} of {:?}", g.volume, g.detector);
     assert!(single < 2e-5, "{single:e} in {:?} of {:?}", g.volume, g.detector);
 }
@@ -441,15 +358,9 @@ proptest! {
             views: vec![circular(angle, dso, dso * ratio, [pixel, pixel], [offset, -offset])],
             volume: VoxelGrid { shape, spacing, center: [0.5, -0.3, 0.2] },
         };
-        let x = noise::<f64>(g.volume.shape, seed);
-        let y = noise::<f64>([1, detector[0], detector[1]], seed + 1);
         for p in projectors() {
-            let ax = forward(p.reference(), &g, x.view());
-            let aty = adjoint(p.reference(), &g, y.view());
-            let (left, right) = (dot(&ax, &y), dot(&x, &aty));
-            let scale = (dot(&ax, &ax) * dot(&y, &y)).sqrt() + 1e-9;
-            prop_assert!((left - right).abs() < 1e-11 * scale, "{}: {left} {right}", p.describe());
-            prop_assert!(ax.iter().all(|v| v.is_finite()));
+            let off = mismatch(p.reference(), &g, seed);
+            prop_assert!(off < 1e-11, "{}: {off:e}", p.describe());
         }
     }
 }
@@ -458,10 +369,9 @@ proptest! {
 /// operator says so.
 #[test]
 fn slabs_of_an_additive_operator_add_up() {
-    let projectors = [&Joseph {} as &dyn VoxelProjector, &Siddon {}, &Trilinear::default()];
     for g in [crooked(true), crooked(false), turned(crooked(true), 4.0)] {
         let (x, y) = (noise::<f64>(g.volume.shape, 3), noise::<f64>([g.views.len(), 29, 37], 5));
-        for projector in projectors {
+        for projector in projectors() {
             let op = projector.reference();
             let (whole, back) = (forward(op, &g, x.view()), adjoint(op, &g, y.view()));
             let (mut sum, mut parts) = (Array3::zeros(whole.raw_dim()), vec![]);

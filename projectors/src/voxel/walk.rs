@@ -1,6 +1,7 @@
 //! The voxels along a ray and the millimetres in each.
 
-use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, norm, sub};
+use super::{Siddon, Trilinear};
+use conefield_core::geometry::{Geometry, Ray, Vec3, VoxelGrid, norm, sub};
 use std::ops::Range;
 
 /// A ray in voxel coordinates: `source + t·ahead`, where `t = 1` is the pixel.
@@ -33,19 +34,7 @@ impl VoxelRay {
 
     /// The range of `t`, from the source on, in which `lower ≤ position ≤ upper` on every axis; `None` if it is empty.
     pub(super) fn clip(&self, lower: Vec3, upper: Vec3) -> Option<[f64; 2]> {
-        let (mut near, mut far) = (0.0f64, f64::INFINITY);
-        for k in 0..3 {
-            if self.ahead[k] == 0.0 {
-                if self.source[k] < lower[k] || self.source[k] > upper[k] {
-                    return None;
-                }
-                continue;
-            }
-            let (a, b) = ((lower[k] - self.source[k]) / self.ahead[k], (upper[k] - self.source[k]) / self.ahead[k]);
-            near = near.max(a.min(b));
-            far = far.min(a.max(b));
-        }
-        (far > near).then_some([near, far])
+        Ray { origin: self.source, direction: self.ahead }.clip([lower, upper])
     }
 }
 
@@ -57,10 +46,7 @@ pub trait Walk: Sync {
 
 /// The exact length of the ray inside each voxel (Siddon, Med. Phys. 12(2), 1985), traversed voxel by voxel (Amanatides
 /// and Woo, Eurographics 1987).
-#[derive(Debug, Clone, Copy)]
-pub struct SiddonWalk;
-
-impl Walk for SiddonWalk {
+impl Walk for Siddon {
     fn walk(&self, ray: &VoxelRay, grid: &VoxelGrid, slab: &Range<usize>, mut visit: impl FnMut([usize; 3], f64)) {
         let n = grid.shape;
         let lower = [slab.start as f64 - 0.5, -0.5, -0.5];
@@ -104,18 +90,12 @@ impl Walk for SiddonWalk {
 
 /// Trilinear interpolation at the midpoints of equal steps inside the box of the voxels; in its outer half voxel the
 /// outermost values are constant.
-#[derive(Debug, Clone, Copy)]
-pub struct TrilinearWalk {
-    /// The step is at most the smallest voxel side divided by this.
-    pub samples_per_voxel: f64,
-}
-
-impl Walk for TrilinearWalk {
+impl Walk for Trilinear {
     fn walk(&self, ray: &VoxelRay, grid: &VoxelGrid, slab: &Range<usize>, mut visit: impl FnMut([usize; 3], f64)) {
         let n = grid.shape;
         let Some([near, far]) = ray.clip([-0.5; 3], n.map(|n| n as f64 - 0.5)) else { return };
         let side = grid.spacing.into_iter().fold(f64::INFINITY, f64::min);
-        let count = ((far - near) * ray.length * self.samples_per_voxel / side).ceil().max(1.0);
+        let count = ((far - near) * ray.length * self.samples() / side).ceil().max(1.0);
         let step = (far - near) / count;
         // Samples that may touch the slab.
         let (lo, hi) = (slab.start as f64 - 1.0, slab.end as f64);

@@ -28,7 +28,7 @@ use conefield_core::space::Space;
 use conefield_core::voxel::VoxelView;
 use conefield_projectors::voxel::Joseph;
 use conefield_projectors::voxel::backproject::{TILE, backproject};
-use conefield_projectors::voxel::layout::{ColumnMajor, Pinhole, column_major_bytes};
+use conefield_projectors::voxel::layout::{ColumnMajor, Pinhole, column_major_bytes, views_within};
 use filter::{Ramp, Window};
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, s};
 use schemars::JsonSchema;
@@ -117,7 +117,7 @@ impl Plan for Fdk {
         finite(&volume, 1)?;
         train_s += taken.elapsed().as_secs_f64();
         let mm = job.scan.unit.mm as f32;
-        let psnr = monitor.psnr(&volume, mm);
+        let psnr = monitor.psnr(volume.view(), mm);
         observer.record(&Record { step: 1, seconds: train_s, psnr, held_out, ..Record::default() });
         parallel::scale(&mut volume, mm);
         let volume = Volume { data: volume, grid: geometry.volume, affine: None };
@@ -148,7 +148,7 @@ impl Plan for Fdk {
     /// Without the columns added for an offset detector, which only the scan itself determines.
     fn needs(&self, header: &ScanHeader) -> Needs {
         let space = Space::tally(*header);
-        let at_once = views_at_once(header.detector, held(header));
+        let at_once = views_within::<f32>(header.detector, held(header));
         let _ = images(&space, header.detector, at_once);
         space.pass(column_major_bytes::<f32>(header.detector, at_once.min(header.views)));
         let [surround, corrected] = surround::bytes(self.scene.surround, header);
@@ -179,7 +179,7 @@ impl Backprojection<'_> {
     /// all views, and collected on the host. Reports progress since `start`. Returns the volume with its place.
     fn all(&self, space: &Space, start: Instant, observer: &mut dyn Observer) -> Result<(Array, Arc<dyn Place>)> {
         let (place, [nx, ny, nz]) = (space.place(), space.header().volume);
-        let at_once = views_at_once(self.geometry.detector, held(space.header()));
+        let at_once = views_within::<f32>(self.geometry.detector, held(space.header()));
         let mut images = images(space, self.geometry.detector, at_once)?;
         let all: Vec<usize> = (0..self.geometry.views.len()).collect();
         let planes = planes(place.as_ref(), [nx, ny, nz])?;
@@ -264,7 +264,7 @@ impl FilteredViews for Backprojection<'_> {
 
     fn backproject(&self, views: &[usize], images: ArrayView3<'_, f32>, slab: ArrayViewMut3<'_, f32>, first: usize) {
         let scales: Vec<f64> = views.iter().map(|&v| self.scale(v)).collect();
-        let pixels = ColumnMajor::new(self.geometry, views, images, |_, _, _, x| x);
+        let pixels = ColumnMajor::new(self.geometry, views, images);
         backproject(self.geometry, views, &pixels, &scales, slab, first);
     }
 
@@ -343,11 +343,6 @@ fn cone(orbit: &FdkOrbit, volume: VoxelGrid, axis: Option<&OrbitAxis>) -> [f64; 
 /// and from and to a device, once for all views held.
 fn held(header: &ScanHeader) -> u64 {
     (header.pixels().saturating_add(header.voxels()) / 4).clamp(1 << 20, 256 << 20)
-}
-
-/// Number of views that fit into `bytes`.
-fn views_at_once(detector: [usize; 2], bytes: u64) -> usize {
-    (bytes / column_major_bytes::<f32>(detector, 1).max(1)).clamp(1, 64) as usize
 }
 
 /// Planes along x of the largest slab within `room` bytes: whole tiles of the back-projection, at least one.

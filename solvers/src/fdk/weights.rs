@@ -316,11 +316,11 @@ fn positions(edges: &[[f64; 2]]) -> Vec<Vec<usize>> {
     let mut groups: Vec<Vec<usize>> = vec![];
     let mut last = f64::NEG_INFINITY;
     for v in order {
-        if middle(v) - last > APART * width {
-            groups.push(vec![]);
+        match groups.last_mut() {
+            Some(group) if middle(v) - last <= APART * width => group.push(v),
+            _ => groups.push(vec![v]),
         }
         last = middle(v);
-        groups.last_mut().unwrap_or_else(|| unreachable!("the first view starts a group")).push(v);
     }
     if groups.len() > GROUPS {
         return vec![(0..edges.len()).collect()];
@@ -498,6 +498,14 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// A source on the axis has no angle: it must be there to be refused.
+    #[test]
+    fn a_source_on_the_axis_has_no_radius() {
+        let mut g = scan(turn(9, TAU), 0.0);
+        g.views.iter_mut().for_each(|v| v.source = [0.0, 0.0, 500.0]);
+        assert!(FdkOrbit::of(&g).radius.iter().all(|r| *r == 0.0));
     }
 
     #[test]

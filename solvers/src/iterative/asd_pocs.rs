@@ -4,57 +4,28 @@
 use super::noise::{self, Noise};
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets};
-use super::plan::{Iterative, IterativePlan};
+use super::plan::OnVoxels;
 use super::problem::copy;
 use super::sart::{Sweep, Updates};
-use super::shared::Shared;
+use super::shared::settings;
 use super::tv::{anisotropy, descend};
-use super::{Iteration, Pass, Problem, Stop, drive::drive};
+use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::error::Result;
-use conefield_core::input_file::InputFile;
-use conefield_core::method::StartFile;
-use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, StatePart};
-use conefield_core::scan::{Scan, ScanHeader};
-use conefield_core::scene::VoxelScene;
-use conefield_core::space::Space;
-use conefield_core::spec::stage;
-use conefield_core::voxel::VoxelProjectorSpec;
-use conefield_projectors::voxel::Joseph;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-use std::time::Instant;
+use conefield_core::method::Method;
+use conefield_core::place::Array;
+use conefield_core::scan::Scan;
+use ndarray::Array3;
 
-/// Settings of `asd-pocs`.
-#[derive(Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct AsdPocs {
-    /// Voxel projector.
-    #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
-    pub projector: Box<dyn VoxelProjectorSpec>,
-    /// Support of the object, and attenuation beyond the volume.
-    pub scene: VoxelScene,
-    /// File of a known volume to start from.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<InputFile>,
-    /// Stopping criteria.
-    pub stop: Stop,
-    /// Number of ordered subsets of the views, or "views" for one view at a time.
-    pub subsets: Subsets,
-    /// Descent steps per pass.
-    pub descents: usize,
-}
-
-impl Default for AsdPocs {
-    fn default() -> Self {
-        Self {
-            projector: Box::new(Joseph {}),
-            scene: VoxelScene::default(),
-            start: None,
-            stop: Stop::after(20),
-            subsets: Subsets::Count(50),
-            descents: 20,
-        }
+settings! {
+    /// Settings of `asd-pocs`.
+    AsdPocs {
+        /// File of a known volume to start from.
+        start,
+        stop: Stop::after(20),
+        /// Number of ordered subsets of the views, or "views" for one view at a time.
+        subsets: Subsets = Subsets::Count(50),
+        /// Descent steps per pass.
+        descents: usize = 20,
     }
 }
 
@@ -70,73 +41,27 @@ const RATIO: f64 = 0.95;
 
 conefield_core::stage_type!(Method, "asd-pocs", AsdPocs, "alternates data passes and total-variation descent");
 
-impl Method for AsdPocs {
-    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
-        Ok(Box::new(IterativePlan(self.built()?)))
-    }
-
-    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
-        file.as_volume()
-    }
-}
-
 impl AsdPocs {
-    fn built(&self) -> Result<AsdPocsMethod> {
-        let (subsets, order) = (self.subsets, Order::Golden);
+    fn built(&self) -> Result<OnVoxels> {
+        let Self { subsets, descents, .. } = *self;
+        let order = Order::Golden;
         let updates = Updates { subsets, relaxation: RELAXATION, decay: DECAY, order, nonnegative: true };
         updates.validate()?;
-        let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;
-        Ok(AsdPocsMethod { shared, updates, descents: self.descents })
-    }
-}
-
-/// The stages that [`AsdPocs`] builds.
-struct AsdPocsMethod {
-    shared: Shared,
-    updates: Updates,
-    descents: usize,
-}
-
-impl Iterative for AsdPocsMethod {
-    fn kind(&self) -> &'static str {
-        "asd-pocs"
-    }
-
-    fn shared(&self) -> &Shared {
-        &self.shared
-    }
-
-    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
-        let begun = Instant::now();
-        let opened = self.shared.open(self, job, observer)?;
-        let job = &opened.job(job);
-        let mut problem = opened.problem(job);
-        let sigma = Noise::of(job.scan.projections.view(), false).sigma;
-        let space = opened.space(job.scan.header());
-        let mut iterate = AsdPocsIterate::new(self, &space, self.shared.start(job, &problem, &space)?)?;
-        iterate.target = sigma * (job.scan.projections.len() as f64).sqrt();
-        iterate.sweep.prepare(&problem)?;
-        problem.settle()?;
-        drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
-    }
-
-    fn subsets(&self) -> Subsets {
-        self.updates.subsets
-    }
-
-    fn found(&self, scan: &Scan) -> Vec<String> {
-        vec![Noise::of(scan.projections.view(), false).to_string()]
-    }
-
-    fn bytes(&self, header: &ScanHeader) -> u64 {
-        let space = Space::tally(*header);
-        space.pass(noise::scratch(header));
-        let _ = space.volume().and_then(|x| AsdPocsIterate::new(self, &space, x));
-        self.shared.price(&space, self.updates.subsets)
-    }
-
-    fn describe(&self) -> String {
-        format!("asd-pocs: {}, {} descents per pass", self.updates.subsets, self.descents)
+        let text = format!("asd-pocs: {subsets}, {descents} descents per pass");
+        let method = OnVoxels::new("asd-pocs", self.shared()?, text, move |space, x, scan| {
+            space.pass(noise::scratch(space.header()));
+            let noise = |pixels: &Array3<f32>| Noise::of(pixels.view(), false).sigma * (pixels.len() as f64).sqrt();
+            Ok(Box::new(AsdPocsIterate {
+                descents,
+                target: scan.map_or(0.0, |scan| noise(&scan.projections)),
+                sweep: Sweep::new(updates, space, x)?,
+                length: 0.0,
+                before: space.volume()?,
+                fitted: space.volume()?,
+            }))
+        });
+        let found = |scan: &Scan| vec![Noise::of(scan.projections.view(), false).to_string()];
+        Ok(OnVoxels { subsets, found, ..method })
     }
 }
 
@@ -153,20 +78,11 @@ struct AsdPocsIterate {
     fitted: Array,
 }
 
-impl AsdPocsIterate {
-    fn new(built: &AsdPocsMethod, space: &Space, x: Array) -> Result<Self> {
-        Ok(Self {
-            descents: built.descents,
-            sweep: Sweep::new(built.updates, space, x)?,
-            target: 0.0,
-            length: 0.0,
-            before: space.volume()?,
-            fitted: space.volume()?,
-        })
-    }
-}
-
 impl Iteration for AsdPocsIterate {
+    fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
+        self.sweep.prepare(problem)
+    }
+
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         let (grid, place) = (&problem.scan.geometry.volume, problem.place);
         copy(place, &self.sweep.x, &mut self.before)?;
@@ -189,16 +105,8 @@ impl Iteration for AsdPocsIterate {
         Ok(Pass { residual, change: Some(change(place, &self.sweep.x, &self.before)?), prior: None })
     }
 
-    fn volume(&mut self, _: &Problem<'_>) -> Result<&Array> {
-        Ok(&self.sweep.x)
-    }
-
-    fn take(self: Box<Self>, _: &Problem<'_>) -> Result<Array> {
-        Ok(self.sweep.x)
-    }
-
-    fn state(&mut self) -> Vec<(String, StatePart<'_>)> {
-        vec![("x".into(), StatePart::Placed(&mut self.sweep.x))]
+    fn x(&mut self) -> &mut Array {
+        &mut self.sweep.x
     }
 
     fn numbers(&mut self) -> Vec<&mut f64> {

@@ -32,17 +32,31 @@ pub struct Pass {
 
 /// The state of an iterative method.
 pub trait Iteration {
+    /// Computes what the first pass starts from.
+    fn prepare(&mut self, _: &Problem<'_>) -> Result<()> {
+        Ok(())
+    }
+
     /// Makes one pass over all views. `pass` counts from 0.
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass>;
 
+    /// The unknowns: voxels in 1/mm, unless [`Iteration::volume`] and [`Iteration::take`] convert them.
+    fn x(&mut self) -> &mut Array;
+
     /// The current volume, in 1/mm.
-    fn volume(&mut self, problem: &Problem<'_>) -> Result<&Array>;
+    fn volume(&mut self, _: &Problem<'_>) -> Result<&Array> {
+        Ok(self.x())
+    }
 
     /// The final volume; ends the method.
-    fn take(self: Box<Self>, problem: &Problem<'_>) -> Result<Array>;
+    fn take(mut self: Box<Self>, _: &Problem<'_>) -> Result<Array> {
+        Ok(std::mem::replace(self.x(), Array::nothing()))
+    }
 
     /// The complete state for the next pass, by name, for checkpoints.
-    fn state(&mut self) -> Vec<(String, StatePart<'_>)>;
+    fn state(&mut self) -> Vec<(String, StatePart<'_>)> {
+        vec![("x".into(), StatePart::Placed(self.x()))]
+    }
 
     /// An error of a stage since the last call.
     fn fault(&self) -> Result<()> {
@@ -201,7 +215,8 @@ impl<'a> Run<'a> {
         if let Some(volume) = volume {
             held_out = self.monitor.held_out(self.problem.place, self.problem.projector, volume)?;
             if self.monitor.has_reference() {
-                psnr = self.monitor.psnr(&self.problem.place.read(volume)?, self.job.scan.unit.mm as f32);
+                let scale = self.job.scan.unit.mm as f32;
+                psnr = self.monitor.psnr(self.problem.place.read(volume)?.view(), scale);
             }
         }
         let mut record = Record {

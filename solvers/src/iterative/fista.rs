@@ -15,90 +15,59 @@ use super::data::NoiseWeighted;
 use super::model::{Model, projected};
 use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, split};
-use super::plan::{Iterative, IterativePlan};
+use super::plan::Iterative;
 use super::problem::{copy, room};
 use super::regularizers::Nonnegative;
-use super::shared::Shared;
+use super::shared::{Shared, settings};
 use super::{Iteration, Pass, Problem, Stop, drive::drive};
 use conefield_core::Error;
 use conefield_core::basis::{Basis, BasisSpec, Expansion};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
-use conefield_core::input_file::InputFile;
-use conefield_core::method::StartFile;
-use conefield_core::method::{Context, Job, Line, Method, Observer, Plan, Solution};
+use conefield_core::method::{Job, Line, Method, Observer, Solution};
 use conefield_core::orbit::Arcs;
 use conefield_core::place::{Array, Bounds, DIVIDE, Host, ProximalStep, Reduction, StatePart};
 use conefield_core::random::stream;
 use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, penalty};
 use conefield_core::scan::{Scan, ScanHeader};
-use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
 use conefield_core::spec::stage;
-use conefield_core::voxel::VoxelProjectorSpec;
-use conefield_projectors::voxel::Joseph;
 use ndarray::Array3;
 use rand::RngExt;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Settings of `fista`.
-#[derive(Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Fista {
-    /// Voxel projector.
-    #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
-    pub projector: Box<dyn VoxelProjectorSpec>,
-    /// Basis of the volume.
-    #[schemars(schema_with = "stage::schema::<dyn BasisSpec>")]
-    pub basis: Box<dyn BasisSpec>,
-    /// Data term: misfit between computed and measured line integrals.
-    #[schemars(schema_with = "stage::schema::<dyn DataTermSpec>")]
-    pub data: Box<dyn DataTermSpec>,
-    /// Regularizer of the volume.
-    #[schemars(schema_with = "stage::schema::<dyn RegularizerSpec>")]
-    pub prior: Box<dyn RegularizerSpec>,
-    /// Support of the object, and attenuation beyond the volume.
-    pub scene: VoxelScene,
-    /// File of a known volume to start from.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<InputFile>,
-    /// Stopping criteria.
-    pub stop: Stop,
-    /// Set pixels outside the object's shadow to 0, whatever noise they have. If negative values were clipped, noise
-    /// has a mean above 0, which causes a haze around the object.
-    pub air: bool,
-    /// Average this many detector rows and columns to one pixel.
-    pub bin: usize,
-    /// Number of ordered subsets of the views, or "views" for one view at a time.
-    pub subsets: Subsets,
-    /// Order of the subsets.
-    pub order: Order,
-    /// Strength of the pull towards the start volume: the weight μ of a third term `½μ‖x − x₀‖²`, relative to the
-    /// largest eigenvalue L of the data term. With 0, the volume is only the start.
-    pub pull: f64,
-}
-
-impl Default for Fista {
-    fn default() -> Self {
-        Self {
-            projector: Box::new(Joseph {}),
-            basis: Box::new(Voxels {}),
-            data: Box::new(NoiseWeighted {}),
-            prior: Box::new(Nonnegative {}),
-            scene: VoxelScene::default(),
-            start: None,
-            stop: Stop { change: Some(1e-3), ..Stop::after(16) },
-            air: true,
-            bin: 1,
-            subsets: Subsets::Count(10),
-            order: Order::Golden,
-            pull: 0.0,
+settings! {
+    /// Settings of `fista`.
+    Fista {
+        stages {
+            /// Basis of the volume.
+            #[schemars(schema_with = "stage::schema::<dyn BasisSpec>")]
+            basis: Box<dyn BasisSpec> = Box::new(Voxels {}),
+            /// Data term: misfit between computed and measured line integrals.
+            #[schemars(schema_with = "stage::schema::<dyn DataTermSpec>")]
+            data: Box<dyn DataTermSpec> = Box::new(NoiseWeighted {}),
+            /// Regularizer of the volume.
+            #[schemars(schema_with = "stage::schema::<dyn RegularizerSpec>")]
+            prior: Box<dyn RegularizerSpec> = Box::new(Nonnegative {}),
         }
+        /// File of a known volume to start from.
+        start,
+        stop: Stop { change: Some(1e-3), ..Stop::after(16) },
+        /// Set pixels outside the object's shadow to 0, whatever noise they have. If negative values were clipped, noise
+        /// has a mean above 0, which causes a haze around the object.
+        air: bool = true,
+        /// Average this many detector rows and columns to one pixel.
+        bin: usize = 1,
+        /// Number of ordered subsets of the views, or "views" for one view at a time.
+        subsets: Subsets = Subsets::Count(10),
+        /// Order of the subsets.
+        order: Order = Order::Golden,
+        /// Strength of the pull towards the start volume: the weight μ of a third term `½μ‖x − x₀‖²`, relative to the
+        /// largest eigenvalue L of the data term. With 0, the volume is only the start.
+        pull: f64 = 0.0,
     }
 }
 
@@ -107,16 +76,6 @@ impl Default for Fista {
 const MOMENTUM: f64 = 400.0;
 
 conefield_core::stage_type!(Method, "fista", Fista, "ordered-subset FISTA with any basis, data term and prior");
-
-impl Method for Fista {
-    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
-        Ok(Box::new(IterativePlan(self.built()?)))
-    }
-
-    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
-        file.as_volume()
-    }
-}
 
 impl Fista {
     /// Bytes for a scan of this size, besides the resulting volume.
@@ -135,7 +94,7 @@ impl Fista {
         ensure(pull.is_finite() && pull >= 0.0, "spec", "pull", pull, "a finite number, 0 or more")?;
         ensure((1..=64).contains(&self.bin), "spec", "bin", self.bin, "1 to 64")?;
         Ok(FistaMethod {
-            shared: Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?,
+            shared: self.shared()?,
             basis: self.basis.build().map_err(|e| e.within("basis"))?,
             data: self.data.build().map_err(|e| e.within("data"))?,
             prior: self.prior.build().map_err(|e| e.within("prior"))?,
@@ -195,7 +154,7 @@ impl Iterative for FistaMethod {
         ensure(self.bin <= longest, "spec", "bin", self.bin, room)?;
         let grid = projected(expansion.as_ref(), voxels);
         let text = format!("{}; {stages}", self.describe());
-        let opened = self.shared.open_on(grid, self.bin, &text, self, job, observer)?;
+        let opened = self.shared.open(grid, self.bin, &text, self, job, observer)?;
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
         if self.air {
@@ -358,17 +317,6 @@ impl Arrays {
         self.penalty.confine_each(problem.regions.on(&grid, problem.bounds))
     }
 
-    /// Makes an update with the gradient.
-    fn update(&mut self, problem: &Problem<'_>, factors: Factors) -> Result<()> {
-        let Self { model, penalty, x, ahead, gradient, towards, .. } = self;
-        let Factors { step, momentum, pull, tau } = factors;
-        let towards = towards.as_ref().map(|towards| (towards, pull));
-        let inside = model.inside(problem);
-        problem
-            .place
-            .update(ProximalStep { gradient, ahead, x, step, momentum, towards, inside, tau }, penalty.as_mut())
-    }
-
     /// Clears coefficients outside the object's support and restarts from the rest.
     fn begin(&mut self, problem: &Problem<'_>) -> Result<()> {
         self.model.prepare(problem, &mut self.gradient)?;
@@ -460,14 +408,6 @@ impl Arrays {
     }
 }
 
-/// Factors of an update; see [`ProximalStep`].
-struct Factors {
-    step: f32,
-    momentum: f32,
-    pull: f32,
-    tau: f32,
-}
-
 /// Number of subsets for the power iteration, and the safety factor on the eigenvalue found.
 const PROBES: usize = 3;
 const SAFETY: f64 = 1.15;
@@ -554,7 +494,11 @@ impl FistaIterate {
         let momentum = ((self.t - 1.0) / t) as f32;
         self.t = t.min((MOMENTUM / self.subsets).max(1.0));
         let (step, tau) = ((self.subsets / self.lipschitz) as f32, (self.lambda / self.lipschitz) as f32);
-        self.arrays.update(problem, Factors { step, momentum, pull: self.pull, tau })?;
+        let Arrays { model, penalty, x, ahead, gradient, towards, .. } = &mut self.arrays;
+        let towards = towards.as_ref().map(|towards| (towards, self.pull));
+        let inside = model.inside(problem);
+        let by = ProximalStep { gradient, ahead, x, step, momentum, towards, inside, tau };
+        problem.place.update(by, penalty.as_mut())?;
         Ok(misfits)
     }
 
@@ -598,6 +542,10 @@ impl Iteration for FistaIterate {
         }
         self.objective = objective;
         Ok(Pass { residual, change: Some(change), prior: Some(prior) })
+    }
+
+    fn x(&mut self) -> &mut Array {
+        &mut self.arrays.x
     }
 
     fn volume(&mut self, problem: &Problem<'_>) -> Result<&Array> {

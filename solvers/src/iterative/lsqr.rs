@@ -2,100 +2,42 @@
 //! Its volumes are those of conjugate gradients, with less rounding, and it takes a pull: it minimizes
 //! `‖p − A·x‖² + λ²‖x − x₀‖²`.
 
-use super::cgls::least_squares;
 use super::norms::{distance, norm2};
-use super::order::Subsets;
-use super::plan::{Iterative, IterativePlan};
+use super::plan::OnVoxels;
 use super::problem::copy;
-use super::shared::Shared;
+use super::shared::settings;
 use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::error::{Result, ensure};
-use conefield_core::input_file::InputFile;
-use conefield_core::method::StartFile;
-use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
+use conefield_core::method::Method;
 use conefield_core::place::{ADD, Array, StatePart};
-use conefield_core::scan::ScanHeader;
-use conefield_core::scene::VoxelScene;
 use conefield_core::space::Space;
-use conefield_core::spec::stage;
-use conefield_core::voxel::VoxelProjectorSpec;
-use conefield_projectors::voxel::Joseph;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
-/// Settings of `lsqr`.
-#[derive(Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Lsqr {
-    /// Voxel projector.
-    #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
-    pub projector: Box<dyn VoxelProjectorSpec>,
-    /// Support of the object, and attenuation beyond the volume.
-    pub scene: VoxelScene,
-    /// File of a known volume to start from.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<InputFile>,
-    /// Stopping criteria.
-    pub stop: Stop,
-    /// Strength of the pull towards the start volume, or towards 0 without one: the weight λ² of `‖x − x₀‖²`, relative to
-    /// `‖Aᵀr‖²/‖r‖²` for the residual r of the start, which is close to the largest eigenvalue of AᵀA.
-    pub pull: f64,
-    /// Raise attenuation to `scene.bounds.low`, by default 0, at the end.
-    pub nonnegative: bool,
-}
-
-impl Default for Lsqr {
-    fn default() -> Self {
-        let (scene, stop) = (VoxelScene::default(), Stop::after(15));
-        Self { projector: Box::new(Joseph {}), scene, start: None, stop, pull: 0.0, nonnegative: true }
+settings! {
+    /// Settings of `lsqr`.
+    Lsqr {
+        /// File of a known volume to start from.
+        start,
+        stop: Stop::after(15),
+        /// Strength of the pull towards the start volume, or towards 0 without one: the weight λ² of `‖x − x₀‖²`, relative to
+        /// `‖Aᵀr‖²/‖r‖²` for the residual r of the start, which is close to the largest eigenvalue of AᵀA.
+        pull: f64 = 0.0,
+        /// Raise attenuation to `scene.bounds.low`, by default 0, at the end.
+        nonnegative: bool = true,
     }
 }
 
 conefield_core::stage_type!(Method, "lsqr", Lsqr, "least squares by bidiagonalization, with a pull towards a volume");
 
-impl Method for Lsqr {
-    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
+impl Lsqr {
+    fn built(&self) -> Result<OnVoxels> {
         let pull = self.pull;
         ensure(pull.is_finite() && pull >= 0.0, "spec", "pull", pull, "a finite number, 0 or more")?;
-        let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;
-        Ok(Box::new(IterativePlan(LsqrMethod { shared, pull, nonnegative: self.nonnegative })))
-    }
-
-    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
-        file.as_volume()
-    }
-}
-
-/// The stages that [`Lsqr`] builds.
-struct LsqrMethod {
-    shared: Shared,
-    pull: f64,
-    nonnegative: bool,
-}
-
-impl Iterative for LsqrMethod {
-    fn kind(&self) -> &'static str {
-        "lsqr"
-    }
-
-    fn shared(&self) -> &Shared {
-        &self.shared
-    }
-
-    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
-        let make = |space: &Space, x| LsqrIterate::new(space, x, self.pull);
-        least_squares(self, self.nonnegative, job, observer, make, LsqrIterate::prepare)
-    }
-
-    fn bytes(&self, header: &ScanHeader) -> u64 {
-        let space = Space::tally(*header);
-        let _ = space.volume().and_then(|x| LsqrIterate::new(&space, x, self.pull));
-        self.shared.price(&space, Subsets::Count(1))
-    }
-
-    fn describe(&self) -> String {
-        let pull = if self.pull > 0.0 { format!(", pull {}", self.pull) } else { String::new() };
-        format!("lsqr: Golub and Kahan's bidiagonalization{pull}")
+        let held = if pull > 0.0 { format!(", pull {pull}") } else { String::new() };
+        let text = format!("lsqr: Golub and Kahan's bidiagonalization{held}");
+        let method = OnVoxels::new("lsqr", self.shared()?, text, move |space, x, _| {
+            Ok(Box::new(LsqrIterate::new(space, x, pull)?))
+        });
+        Ok(OnVoxels { nonnegative: Some(self.nonnegative), ..method })
     }
 }
 
@@ -148,23 +90,6 @@ impl LsqrIterate {
         })
     }
 
-    fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
-        let views = problem.views();
-        self.beta = problem.residual(&views, &self.x, None, &mut self.left)?.sqrt();
-        if let Some(towards) = &mut self.towards {
-            copy(problem.place, &self.x, towards)?;
-        }
-        problem.back(&views, &self.left, &mut self.right)?;
-        self.scale = norm2(problem.place, &self.right)?.sqrt();
-        if self.scale > 0.0 {
-            self.alpha = self.scale / self.beta;
-            problem.place.map(&ADD, [1.0 / self.scale, 0.0], &mut self.direction, &[&self.right])?;
-        }
-        self.damping = self.pull.sqrt() * self.alpha;
-        (self.rho, self.phi) = (self.alpha, self.beta);
-        Ok(())
-    }
-
     /// Makes a step; returns its length.
     fn step(&mut self, problem: &Problem<'_>) -> Result<f64> {
         let (views, place) = (problem.views(), problem.place);
@@ -196,6 +121,23 @@ impl LsqrIterate {
 }
 
 impl Iteration for LsqrIterate {
+    fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
+        let views = problem.views();
+        self.beta = problem.residual(&views, &self.x, None, &mut self.left)?.sqrt();
+        if let Some(towards) = &mut self.towards {
+            copy(problem.place, &self.x, towards)?;
+        }
+        problem.back(&views, &self.left, &mut self.right)?;
+        self.scale = norm2(problem.place, &self.right)?.sqrt();
+        if self.scale > 0.0 {
+            self.alpha = self.scale / self.beta;
+            problem.place.map(&ADD, [1.0 / self.scale, 0.0], &mut self.direction, &[&self.right])?;
+        }
+        self.damping = self.pull.sqrt() * self.alpha;
+        (self.rho, self.phi) = (self.alpha, self.beta);
+        Ok(())
+    }
+
     fn pass(&mut self, problem: &Problem<'_>, _: u64) -> Result<Pass> {
         let place = problem.place;
         // An α of 0: the volume solves the problem.
@@ -207,12 +149,8 @@ impl Iteration for LsqrIterate {
         Ok(Pass { residual: (all - prior).max(0.0), change, prior: Some(prior) })
     }
 
-    fn volume(&mut self, _: &Problem<'_>) -> Result<&Array> {
-        Ok(&self.x)
-    }
-
-    fn take(self: Box<Self>, _: &Problem<'_>) -> Result<Array> {
-        Ok(self.x)
+    fn x(&mut self) -> &mut Array {
+        &mut self.x
     }
 
     fn state(&mut self) -> Vec<(String, StatePart<'_>)> {

@@ -5,132 +5,53 @@
 
 use super::norms::change;
 use super::order::{Order, Subsets};
-use super::plan::{Iterative, IterativePlan};
+use super::plan::OnVoxels;
 use super::problem::{copy, room};
 use super::sart::column_sums;
-use super::shared::Shared;
-use super::{Iteration, Pass, Problem, Stop, drive::drive};
+use super::shared::settings;
+use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::data_term::Misfit;
 use conefield_core::error::{Result, ensure};
-use conefield_core::input_file::InputFile;
-use conefield_core::method::StartFile;
-use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, Bounds, CLIP, MULTIPLY, RELAX, Reduction, StatePart};
-use conefield_core::scan::ScanHeader;
-use conefield_core::scene::VoxelScene;
-use conefield_core::space::Space;
-use conefield_core::spec::stage;
-use conefield_core::voxel::VoxelProjectorSpec;
+use conefield_core::method::Method;
+use conefield_core::place::{Array, Bounds, CLIP, MULTIPLY, RELAX, Reduction};
 use conefield_core::wgsl::Fragment;
-use conefield_projectors::voxel::Joseph;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-use std::time::Instant;
 
-/// Settings of `mlem`.
-#[derive(Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Mlem {
-    /// Voxel projector.
-    #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
-    pub projector: Box<dyn VoxelProjectorSpec>,
-    /// Support of the object, and attenuation beyond the volume.
-    pub scene: VoxelScene,
-    /// File of a known volume to start from. Voxels below a thousandth of the uniform start are raised to it: a voxel of 0
-    /// would stay 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<InputFile>,
-    /// Stopping criteria.
-    pub stop: Stop,
-    /// Number of ordered subsets of the views, or "views" for one view at a time. 1 is MLEM, more is OSEM.
-    pub subsets: Subsets,
-    /// Order of the subsets.
-    pub order: Order,
-}
-
-impl Default for Mlem {
-    fn default() -> Self {
-        Self {
-            projector: Box::new(Joseph {}),
-            scene: VoxelScene::default(),
-            start: None,
-            stop: Stop::after(20),
-            subsets: Subsets::Count(10),
-            order: Order::Golden,
-        }
+settings! {
+    /// Settings of `mlem`.
+    Mlem {
+        /// File of a known volume to start from. Voxels below a thousandth of the uniform start are raised to it: a voxel of 0
+        /// would stay 0.
+        start,
+        stop: Stop::after(20),
+        /// Number of ordered subsets of the views, or "views" for one view at a time. 1 is MLEM, more is OSEM.
+        subsets: Subsets = Subsets::Count(10),
+        /// Order of the subsets.
+        order: Order = Order::Golden,
     }
 }
 
 conefield_core::stage_type!(Method, "mlem", Mlem, "maximum likelihood by expectation maximization, in ordered subsets");
 
-impl Method for Mlem {
-    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
-        self.subsets.validate()?;
-        let shared = Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?;
-        Ok(Box::new(IterativePlan(MlemMethod { shared, subsets: self.subsets, order: self.order })))
-    }
-
-    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
-        file.as_volume()
-    }
-}
-
-/// The stages that [`Mlem`] builds.
-struct MlemMethod {
-    shared: Shared,
-    subsets: Subsets,
-    order: Order,
-}
-
-impl MlemMethod {
-    fn iterate(&self, space: &Space, x: Array) -> Result<MlemIterate> {
-        let views = space.header().views;
-        Ok(MlemIterate {
-            subsets: self.subsets.of(views),
-            order: self.order,
-            likelihood: Likelihood { least: 0.0 },
-            x,
-            columns: space.volume()?,
-            work: space.volume()?,
-            pixels: room(space, self.subsets.count(views))?,
-            before: self.shared.stop.change.map(|_| space.volume()).transpose()?,
-        })
-    }
-}
-
-impl Iterative for MlemMethod {
-    fn kind(&self) -> &'static str {
-        "mlem"
-    }
-
-    fn shared(&self) -> &Shared {
-        &self.shared
-    }
-
-    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
-        let begun = Instant::now();
-        let opened = self.shared.open(self, job, observer)?;
-        let job = &opened.job(job);
-        let mut problem = opened.problem(job);
-        let space = opened.space(job.scan.header());
-        let mut iterate = self.iterate(&space, self.shared.known(job, &space)?)?;
-        iterate.prepare(&problem, self.shared.has_start(job))?;
-        problem.settle()?;
-        drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
-    }
-
-    fn subsets(&self) -> Subsets {
-        self.subsets
-    }
-
-    fn bytes(&self, header: &ScanHeader) -> u64 {
-        let space = Space::tally(*header);
-        let _ = space.volume().and_then(|x| self.iterate(&space, x));
-        self.shared.price(&space, self.subsets)
-    }
-
-    fn describe(&self) -> String {
-        format!("mlem: {}", self.subsets)
+impl Mlem {
+    fn built(&self) -> Result<OnVoxels> {
+        let Self { subsets, order, .. } = *self;
+        subsets.validate()?;
+        let shared = self.shared()?;
+        let limited = shared.stop.change.is_some();
+        let method = OnVoxels::new("mlem", shared, format!("mlem: {subsets}"), move |space, x, _| {
+            let views = space.header().views;
+            Ok(Box::new(MlemIterate {
+                subsets: subsets.of(views),
+                order,
+                likelihood: Likelihood { least: 0.0 },
+                x,
+                columns: space.volume()?,
+                work: space.volume()?,
+                pixels: room(space, subsets.count(views))?,
+                before: limited.then(|| space.volume()).transpose()?,
+            }))
+        });
+        Ok(OnVoxels { subsets, ..method })
     }
 }
 
@@ -153,32 +74,6 @@ struct MlemIterate {
 }
 
 impl MlemIterate {
-    /// Makes the start positive inside the object's support, and computes the sums that do not change.
-    fn prepare(&mut self, problem: &Problem<'_>, known: bool) -> Result<()> {
-        let place = problem.place;
-        problem.ones(&mut self.work)?;
-        let mut longest = 0.0f64;
-        for views in &self.subsets {
-            problem.forward(views, &self.work, &mut self.pixels)?;
-            longest = longest.max(place.reduce(Reduction::Maximum, &self.pixels, &self.pixels)?);
-        }
-        ensure(longest > 0.0, "scan", "geometry", "rays that all miss the object's support", "rays through it")?;
-        let top = f64::from(problem.scan.projections.iter().fold(0.0f32, |m, p| m.max(*p)));
-        // The first update has the same result for a uniform start of any size.
-        let uniform = if top > 0.0 { top / longest } else { 0.0 };
-        if known {
-            place.map(&CLIP, [RAISED * uniform, f64::from(f32::MAX)], &mut self.x, &[])?;
-        } else {
-            place.fill(&mut self.x, uniform as f32)?;
-        }
-        problem.outside(&mut self.x, 0.0)?;
-        self.likelihood.least = (1e-6 * top) as f32;
-        match &self.subsets[..] {
-            [all] => column_sums(problem, all, &mut self.pixels, &mut self.columns),
-            _ => Ok(()),
-        }
-    }
-
     /// Processes one subset. Returns `‖p − A·x‖²`.
     fn update(&mut self, problem: &Problem<'_>, subset: usize) -> Result<f64> {
         let (views, place) = (&self.subsets[subset], problem.place);
@@ -200,6 +95,32 @@ impl MlemIterate {
 }
 
 impl Iteration for MlemIterate {
+    /// Makes the start positive inside the object's support, and computes the sums that do not change.
+    fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
+        let place = problem.place;
+        problem.ones(&mut self.work)?;
+        let mut longest = 0.0f64;
+        for views in &self.subsets {
+            problem.forward(views, &self.work, &mut self.pixels)?;
+            longest = longest.max(place.reduce(Reduction::Maximum, &self.pixels, &self.pixels)?);
+        }
+        ensure(longest > 0.0, "scan", "geometry", "rays that all miss the object's support", "rays through it")?;
+        let top = f64::from(problem.scan.projections.iter().fold(0.0f32, |m, p| m.max(*p)));
+        // The first update has the same result for a uniform start of any size.
+        let uniform = if top > 0.0 { top / longest } else { 0.0 };
+        if problem.started {
+            place.map(&CLIP, [RAISED * uniform, f64::from(f32::MAX)], &mut self.x, &[])?;
+        } else {
+            place.fill(&mut self.x, uniform as f32)?;
+        }
+        problem.outside(&mut self.x, 0.0)?;
+        self.likelihood.least = (1e-6 * top) as f32;
+        match &self.subsets[..] {
+            [all] => column_sums(problem, all, &mut self.pixels, &mut self.columns),
+            _ => Ok(()),
+        }
+    }
+
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         if let Some(before) = &mut self.before {
             copy(problem.place, &self.x, before)?;
@@ -212,16 +133,8 @@ impl Iteration for MlemIterate {
         Ok(Pass { residual, change, prior: None })
     }
 
-    fn volume(&mut self, _: &Problem<'_>) -> Result<&Array> {
-        Ok(&self.x)
-    }
-
-    fn take(self: Box<Self>, _: &Problem<'_>) -> Result<Array> {
-        Ok(self.x)
-    }
-
-    fn state(&mut self) -> Vec<(String, StatePart<'_>)> {
-        vec![("x".into(), StatePart::Placed(&mut self.x))]
+    fn x(&mut self) -> &mut Array {
+        &mut self.x
     }
 }
 

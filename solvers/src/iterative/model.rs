@@ -132,8 +132,7 @@ impl Model {
 
     /// Sets the coefficients that must stay 0 to `value`.
     pub(super) fn outside(&self, problem: &Problem<'_>, x: &mut Array, value: f32) -> Result<()> {
-        let inside = if self.expands() { self.inside.as_ref() } else { problem.inside };
-        inside.map_or(Ok(()), |inside| problem.place.keep(x, inside, value))
+        self.inside(problem).map_or(Ok(()), |inside| problem.place.keep(x, inside, value))
     }
 
     /// The coefficients whose volume is closest to `voxels`, from `x = 0` by a few conjugate gradient steps.

@@ -7,7 +7,7 @@ use conefield_core::method::Job;
 use conefield_core::place::{Array, Place};
 use conefield_core::scan::Scan;
 use conefield_core::voxel::VoxelProjector;
-use ndarray::{Array3, ArrayBase, Data, Ix3};
+use ndarray::{Array3, ArrayView3};
 
 /// Evaluates a job's reference and held-out views; never trains on them.
 pub struct VolumeMonitor<'a> {
@@ -35,7 +35,7 @@ impl<'a> VolumeMonitor<'a> {
     }
 
     /// PSNR in dB of `scale·volume` over the voxels of `watched`.
-    pub fn psnr<S: Data<Elem = f32>>(&self, volume: &ArrayBase<S, Ix3>, scale: f32) -> Option<f64> {
+    pub fn psnr(&self, volume: ArrayView3<'_, f32>, scale: f32) -> Option<f64> {
         let reference = self.reference?;
         let (mut sum, mut n) = (0.0, 0usize);
         for voxel in watched::voxels(volume.dim().into()) {

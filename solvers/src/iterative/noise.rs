@@ -1,6 +1,7 @@
 //! Estimates the noise of a scan from the scan alone.
 
-use conefield_core::data_term::Misfit;
+use conefield_core::data_term::{DataTerm, Misfit};
+use conefield_core::error::Result;
 use conefield_core::parallel;
 use conefield_core::scan::{ScanHeader, high};
 use conefield_core::wgsl::Fragment;
@@ -56,9 +57,7 @@ impl Noise {
             .collect();
         line(&points)
     }
-}
 
-impl Noise {
     /// Multiplies values by powers of the weights `exp(−growth·p)`, at most 1: inverse variances up to a factor.
     /// Returns `Σ w·y²`.
     fn weigh(&self, power: f64, measured: &[f32], y: &mut [f32]) -> f64 {
@@ -101,6 +100,27 @@ impl Misfit for Noise {
 
     fn describe(&self) -> String {
         self.to_string()
+    }
+}
+
+/// The data term of squared residuals, with weights by the scan's noise.
+pub(super) struct Squares {
+    /// Whether the noise may grow with the line integral; if not, all weights are 1.
+    pub(super) growing: bool,
+    pub(super) text: &'static str,
+}
+
+impl DataTerm for Squares {
+    fn of(&self, measured: ArrayView3<'_, f32>) -> Result<Box<dyn Misfit>> {
+        Ok(Box::new(Noise::of(measured, self.growing)))
+    }
+
+    fn scratch(&self, header: &ScanHeader) -> u64 {
+        scratch(header)
+    }
+
+    fn describe(&self) -> String {
+        self.text.into()
     }
 }
 

@@ -1,13 +1,17 @@
 //! Common part of the plans of iterative methods.
 
+use super::drive::{Iteration, drive};
 use super::mask_bytes;
 use super::order::{Subsets, summary};
 use super::shared::Shared;
 use crate::fit::object;
 use crate::{solid, surround};
 use conefield_core::error::Result;
-use conefield_core::method::{Findings, Job, Line, Needs, Observer, Outline, Plan, Solution};
+use conefield_core::method::{Findings, Job, Line, Needs, Observer, Outline, Plan, Reconstruction, Solution};
+use conefield_core::place::{Array, Bounds};
 use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::space::Space;
+use std::time::Instant;
 
 /// An iterative method, built and validated.
 pub(super) trait Iterative: Send + Sync {
@@ -23,15 +27,10 @@ pub(super) trait Iterative: Send + Sync {
     }
 
     /// Its subsets of views.
-    fn subsets(&self) -> Subsets {
-        Subsets::Count(1)
-    }
+    fn subsets(&self) -> Subsets;
 
     /// Its findings about a scan besides the subsets, one line each.
-    fn found(&self, scan: &Scan) -> Vec<String> {
-        let _ = scan;
-        vec![]
-    }
+    fn found(&self, scan: &Scan) -> Vec<String>;
 
     /// The header of the scan as the method uses it: binned detector, unknowns in place of voxels.
     fn seen(&self, scan: &ScanHeader) -> ScanHeader {
@@ -48,14 +47,94 @@ pub(super) trait Iterative: Send + Sync {
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution>;
 }
 
+/// Makes the state of a method from its first volume, with arrays of a space. Where the space only counts, there is no
+/// scan.
+type Make = dyn Fn(&Space, Array, Option<&Scan>) -> Result<Box<dyn Iteration>> + Send + Sync;
+
+/// An iterative method whose unknowns are the voxels.
+pub(super) struct OnVoxels {
+    pub(super) kind: &'static str,
+    pub(super) shared: Shared,
+    /// Description of its settings.
+    pub(super) text: String,
+    pub(super) make: Box<Make>,
+    /// Subsets of views, by default all at once.
+    pub(super) subsets: Subsets,
+    /// Findings about a scan besides the subsets, one line each.
+    pub(super) found: fn(&Scan) -> Vec<String>,
+    /// For a method that ignores the bounds until its end: whether it keeps to the lower one, too.
+    pub(super) nonnegative: Option<bool>,
+}
+
+impl OnVoxels {
+    /// The method of the type `kind`, described by `text`.
+    pub(super) fn new(
+        kind: &'static str,
+        shared: Shared,
+        text: String,
+        make: impl Fn(&Space, Array, Option<&Scan>) -> Result<Box<dyn Iteration>> + Send + Sync + 'static,
+    ) -> Self {
+        let (make, subsets) = (Box::new(make), Subsets::Count(1));
+        Self { kind, shared, text, make, subsets, found: |_| vec![], nonnegative: None }
+    }
+}
+
+impl Iterative for OnVoxels {
+    fn kind(&self) -> &'static str {
+        self.kind
+    }
+
+    fn shared(&self) -> &Shared {
+        &self.shared
+    }
+
+    fn subsets(&self) -> Subsets {
+        self.subsets
+    }
+
+    fn found(&self, scan: &Scan) -> Vec<String> {
+        (self.found)(scan)
+    }
+
+    fn bytes(&self, header: &ScanHeader) -> u64 {
+        let space = Space::tally(*header);
+        let _ = space.volume().and_then(|x| (self.make)(&space, x, None));
+        self.shared.price(&space, self.subsets)
+    }
+
+    fn describe(&self) -> String {
+        self.text.clone()
+    }
+
+    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
+        let begun = Instant::now();
+        let opened = self.shared.open(job.scan.geometry.volume, 1, &self.text, self, job, observer)?;
+        let job = &opened.job(job);
+        let mut problem = opened.problem(job);
+        let space = opened.space(job.scan.header());
+        let start = self.shared.start(job, &problem, &space)?;
+        let mut iteration = (self.make)(&space, start, Some(job.scan))?;
+        problem.settle()?;
+        iteration.prepare(&problem)?;
+        let mut solution = drive(job, &self.shared.stop, begun, &problem, &space, iteration, observer)?;
+        if let (Some(nonnegative), Reconstruction::Volume(volume)) = (self.nonnegative, &mut solution.result) {
+            let bounds = Bounds { low: if nonnegative { problem.bounds.low } else { f32::MIN }, ..problem.bounds };
+            // The volume is in the scan's unit.
+            let factor = job.scan.unit.mm as f32;
+            problem.regions.clip(&mut volume.data, &volume.grid, bounds, factor);
+        }
+        Ok(solution)
+    }
+}
+
 /// Cost per unknown of the rest of a pass, in ray samples of forward and back-projection. On 50 views of 512² pixels
 /// and 256³ voxels, ten subsets with total variation spend equal time on both.
 const SAMPLES: f64 = 200.0;
 
 /// The plan of an iterative method.
-pub(super) struct IterativePlan<T>(pub(super) T);
+pub(super) struct IterativePlan(pub(super) Box<dyn Iterative>);
 
-impl<T: Iterative> Plan for IterativePlan<T> {
+impl Plan for IterativePlan {
     fn outline(&self) -> Outline {
         let shared = self.0.shared();
         let projector = Line::new("projector", shared.projector_kind, &shared.projector.describe());

@@ -28,6 +28,8 @@ pub struct Problem<'a> {
     pub projector: &'a dyn VoxelProjector,
     /// Seed of all randomness.
     pub seed: u64,
+    /// Whether a known volume is the start.
+    pub(super) started: bool,
     /// Bounds of the attenuation, in 1/mm.
     pub bounds: Bounds,
     /// Regions with other bounds.

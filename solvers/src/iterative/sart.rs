@@ -4,90 +4,49 @@
 
 use super::norms::change;
 use super::order::{Order, Subsets};
-use super::plan::{Iterative, IterativePlan};
+use super::plan::OnVoxels;
 use super::problem::{copy, invert, room};
-use super::shared::Shared;
-use super::{Iteration, Pass, Problem, Stop, drive::drive};
+use super::shared::settings;
+use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::error::{Result, ensure};
-use conefield_core::input_file::InputFile;
-use conefield_core::method::StartFile;
-use conefield_core::method::{Context, Job, Method, Observer, Plan, Solution};
-use conefield_core::place::{Array, Bounds, RELAX, StatePart};
-use conefield_core::scan::ScanHeader;
-use conefield_core::scene::VoxelScene;
+use conefield_core::method::Method;
+use conefield_core::place::{Array, Bounds, RELAX};
 use conefield_core::space::Space;
-use conefield_core::spec::stage;
-use conefield_core::voxel::VoxelProjectorSpec;
-use conefield_projectors::voxel::Joseph;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-use std::time::Instant;
 
-/// Settings of `sart`.
-#[derive(Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Sart {
-    /// Voxel projector.
-    #[schemars(schema_with = "stage::schema::<dyn VoxelProjectorSpec>")]
-    pub projector: Box<dyn VoxelProjectorSpec>,
-    /// Support of the object, and attenuation beyond the volume.
-    pub scene: VoxelScene,
-    /// File of a known volume to start from.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub start: Option<InputFile>,
-    /// Stopping criteria.
-    pub stop: Stop,
-    /// Number of ordered subsets of the views, or "views" for one view at a time. 1 uses all views at once.
-    pub subsets: Subsets,
-    /// Relaxation λ of the first pass, above 0 and below 2.
-    pub relaxation: f64,
-    /// Factor of λ after each pass.
-    pub decay: f64,
-    /// Order of the subsets.
-    pub order: Order,
-    /// Raise attenuation to `scene.bounds.low`, by default 0, after each update.
-    pub nonnegative: bool,
-}
-
-impl Default for Sart {
-    fn default() -> Self {
-        Self {
-            projector: Box::new(Joseph {}),
-            scene: VoxelScene::default(),
-            start: None,
-            stop: Stop::after(15),
-            subsets: Subsets::VIEWS,
-            relaxation: 0.3,
-            decay: 0.9,
-            order: Order::Golden,
-            nonnegative: true,
-        }
+settings! {
+    /// Settings of `sart`.
+    Sart {
+        /// File of a known volume to start from.
+        start,
+        stop: Stop::after(15),
+        /// Number of ordered subsets of the views, or "views" for one view at a time. 1 uses all views at once.
+        subsets: Subsets = Subsets::VIEWS,
+        /// Relaxation λ of the first pass, above 0 and below 2.
+        relaxation: f64 = 0.3,
+        /// Factor of λ after each pass.
+        decay: f64 = 0.9,
+        /// Order of the subsets.
+        order: Order = Order::Golden,
+        /// Raise attenuation to `scene.bounds.low`, by default 0, after each update.
+        nonnegative: bool = true,
     }
 }
 
 conefield_core::stage_type!(Method, "sart", Sart, "simultaneous algebraic reconstruction by subsets of the views");
 
-impl Method for Sart {
-    fn plan(&self, _: &Context<'_>) -> Result<Box<dyn Plan>> {
-        Ok(Box::new(IterativePlan(self.built()?)))
-    }
-
-    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
-        file.as_volume()
-    }
-}
-
 impl Sart {
-    fn built(&self) -> Result<SartMethod> {
-        let updates = Updates {
-            subsets: self.subsets,
-            relaxation: self.relaxation,
-            decay: self.decay,
-            order: self.order,
-            nonnegative: self.nonnegative,
-        };
+    fn built(&self) -> Result<OnVoxels> {
+        let Self { subsets, relaxation, decay, order, nonnegative, .. } = *self;
+        let updates = Updates { subsets, relaxation, decay, order, nonnegative };
         updates.validate()?;
-        Ok(SartMethod { shared: Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)?, updates })
+        let shared = self.shared()?;
+        let limited = shared.stop.change.is_some();
+        let text = format!("sart: {subsets}, relaxation {relaxation} times {decay} per pass");
+        let method = OnVoxels::new("sart", shared, text, move |space, x, _| {
+            let before = limited.then(|| space.volume()).transpose()?;
+            Ok(Box::new(SartIterate { before, sweep: Sweep::new(updates, space, x)? }))
+        });
+        Ok(OnVoxels { subsets, ..method })
     }
 }
 
@@ -108,56 +67,6 @@ impl Updates {
         ensure(r > 0.0 && r < 2.0, "spec", "relaxation", r, "a number above 0 and below 2")?;
         let d = self.decay;
         ensure(d > 0.0 && d <= 1.0, "spec", "decay", d, "a number above 0 and at most 1")
-    }
-}
-
-/// The stages that [`Sart`] builds.
-struct SartMethod {
-    shared: Shared,
-    updates: Updates,
-}
-
-impl SartMethod {
-    fn iterate(&self, space: &Space, x: Array) -> Result<SartIterate> {
-        let before = self.shared.stop.change.map(|_| space.volume()).transpose()?;
-        Ok(SartIterate { before, sweep: Sweep::new(self.updates, space, x)? })
-    }
-}
-
-impl Iterative for SartMethod {
-    fn kind(&self) -> &'static str {
-        "sart"
-    }
-
-    fn shared(&self) -> &Shared {
-        &self.shared
-    }
-
-    fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
-        let begun = Instant::now();
-        let opened = self.shared.open(self, job, observer)?;
-        let job = &opened.job(job);
-        let mut problem = opened.problem(job);
-        let space = opened.space(job.scan.header());
-        let mut iterate = self.iterate(&space, self.shared.start(job, &problem, &space)?)?;
-        iterate.sweep.prepare(&problem)?;
-        problem.settle()?;
-        drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
-    }
-
-    fn subsets(&self) -> Subsets {
-        self.updates.subsets
-    }
-
-    fn bytes(&self, header: &ScanHeader) -> u64 {
-        let space = Space::tally(*header);
-        let _ = space.volume().and_then(|x| self.iterate(&space, x));
-        self.shared.price(&space, self.updates.subsets)
-    }
-
-    fn describe(&self) -> String {
-        let Updates { subsets, relaxation, decay, .. } = self.updates;
-        format!("sart: {subsets}, relaxation {relaxation} times {decay} per pass")
     }
 }
 
@@ -258,6 +167,10 @@ impl Iteration for SartIterate {
         Some("try a smaller relaxation")
     }
 
+    fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
+        self.sweep.prepare(problem)
+    }
+
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
         if let Some(before) = &mut self.before {
             copy(problem.place, &self.sweep.x, before)?;
@@ -267,15 +180,7 @@ impl Iteration for SartIterate {
         Ok(Pass { residual, change, prior: None })
     }
 
-    fn volume(&mut self, _: &Problem<'_>) -> Result<&Array> {
-        Ok(&self.sweep.x)
-    }
-
-    fn take(self: Box<Self>, _: &Problem<'_>) -> Result<Array> {
-        Ok(self.sweep.x)
-    }
-
-    fn state(&mut self) -> Vec<(String, StatePart<'_>)> {
-        vec![("x".into(), StatePart::Placed(&mut self.sweep.x))]
+    fn x(&mut self) -> &mut Array {
+        &mut self.sweep.x
     }
 }

@@ -23,6 +23,75 @@ use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
 use ndarray::Array3;
 use std::sync::Arc;
 
+/// Defines the settings of a method: those that all iterative methods have, the method's own stages and settings with
+/// their defaults, and [`Method`](conefield_core::method::Method) by its function `built`.
+macro_rules! settings {
+    (
+        $(#[$about:meta])*
+        $name:ident {
+            $(stages { $($(#[$stage_about:meta])* $stage:ident: $stage_type:ty = $stage_default:expr,)* })?
+            $(#[$start_about:meta])*
+            start,
+            stop: $stop:expr,
+            $($(#[$own_about:meta])* $own:ident: $own_type:ty = $own_default:expr,)*
+        }
+    ) => {
+        $(#[$about])*
+        #[derive(serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct $name {
+            /// Voxel projector.
+            #[schemars(
+                schema_with = "conefield_core::spec::stage::schema::<dyn conefield_core::voxel::VoxelProjectorSpec>"
+            )]
+            pub projector: Box<dyn conefield_core::voxel::VoxelProjectorSpec>,
+            $($($(#[$stage_about])* pub $stage: $stage_type,)*)?
+            /// Support of the object, and attenuation beyond the volume.
+            pub scene: conefield_core::scene::VoxelScene,
+            $(#[$start_about])*
+            #[serde(skip_serializing_if = "Option::is_none")]
+            pub start: Option<conefield_core::input_file::InputFile>,
+            /// Stopping criteria.
+            pub stop: $crate::iterative::Stop,
+            $($(#[$own_about])* pub $own: $own_type,)*
+        }
+
+        impl Default for $name {
+            fn default() -> Self {
+                Self {
+                    projector: Box::new(conefield_projectors::voxel::Joseph {}),
+                    $($($stage: $stage_default,)*)?
+                    scene: Default::default(),
+                    start: None,
+                    stop: $stop,
+                    $($own: $own_default,)*
+                }
+            }
+        }
+
+        impl $name {
+            /// The settings that all iterative methods have, built.
+            fn shared(&self) -> conefield_core::Result<$crate::iterative::shared::Shared> {
+                $crate::iterative::shared::Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)
+            }
+        }
+
+        impl conefield_core::method::Method for $name {
+            fn plan(
+                &self,
+                _: &conefield_core::method::Context<'_>,
+            ) -> conefield_core::Result<Box<dyn conefield_core::method::Plan>> {
+                Ok(Box::new($crate::iterative::plan::IterativePlan(Box::new(self.built()?))))
+            }
+
+            fn start_setting(&self, file: &conefield_core::method::StartFile) -> Option<(String, serde_json::Value)> {
+                file.as_volume()
+            }
+        }
+    };
+}
+pub(super) use settings;
+
 /// The common settings, built.
 pub(super) struct Shared {
     pub(super) projector: Arc<dyn VoxelProjector>,
@@ -69,23 +138,15 @@ impl Shared {
 
     /// The known volume, in 1/mm; 0 if there is none.
     pub(super) fn known(&self, job: &Job<'_>, space: &Space) -> Result<Array> {
-        let volume = match (job.start, &self.start) {
-            (Some(given), _) => in_mm(job, "start", given.clone())?,
-            (None, Some(path)) => start_volume(job, path)?,
-            (None, None) => return space.volume(),
-        };
+        let named = self.start.as_ref().map(|file| KnownVolume { path: file.0.clone(), steps: 0 });
+        let Some((volume, ..)) = known_volume(job, named)? else { return space.volume() };
         space.hold(4 * space.header().voxels());
         space.place().adopt(volume.data)
     }
 
-    /// Validates the scan, logs `method` and its projector, and finds the object's support.
-    pub(super) fn open(&self, method: &dyn Iterative, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Opened> {
-        self.open_on(job.scan.geometry.volume, 1, &method.describe(), method, job, observer)
-    }
-
-    /// Like [`Shared::open`], with `grid` as the grid of the unknowns and `bin` × `bin` pixels averaged to one; `text`
-    /// describes the method.
-    pub(super) fn open_on(
+    /// Validates the scan, logs `text`, which describes `method`, and its projector, and finds the object's support.
+    /// `grid` is the grid of the unknowns; `bin` × `bin` pixels are averaged to one.
+    pub(super) fn open(
         &self,
         grid: VoxelGrid,
         bin: usize,
@@ -123,7 +184,8 @@ impl Shared {
         if let (None, Some(solid)) = (self.scene.bounds.high, &solid) {
             bounds.high = solid.attenuation as f32;
         }
-        Ok(Opened { place, projector: self.projector.clone(), bounds, regions, inside, corrected, binned, geometry })
+        let (projector, started) = (self.projector.clone(), self.has_start(job));
+        Ok(Opened { place, projector, started, bounds, regions, inside, corrected, binned, geometry })
     }
 
     /// The backend's place, if it has room for all arrays of `method`; else one that streams them.
@@ -159,6 +221,8 @@ impl Shared {
 pub(super) struct Opened {
     place: Arc<dyn Place>,
     projector: Arc<dyn VoxelProjector>,
+    /// Whether there is a start volume.
+    started: bool,
     bounds: Bounds,
     regions: Regions,
     /// The object's support, if known.
@@ -191,6 +255,7 @@ impl Opened {
             place: self.place.as_ref(),
             projector: self.projector.as_ref(),
             seed: job.seed,
+            started: self.started,
             bounds: self.bounds,
             regions: &self.regions,
             inside: self.inside.as_ref(),
@@ -208,14 +273,9 @@ pub fn known_volume(job: &Job<'_>, named: Option<KnownVolume>) -> Result<Option<
             let steps = named.map_or(KnownVolume::STEPS, |n| n.steps);
             Ok(Some((in_mm(job, "start", given.clone())?, steps, "the volume of the previous method".into())))
         }
-        (None, Some(KnownVolume { path, steps })) => Ok(Some((start_volume(job, &path)?, steps, path))),
+        (None, Some(KnownVolume { path, steps })) => Ok(Some((in_mm(job, &path, (job.volumes)(&path)?)?, steps, path))),
         (None, None) => Ok(None),
     }
-}
-
-/// Reads a volume that matches the scan, in 1/mm.
-fn start_volume(job: &Job<'_>, path: &str) -> Result<Volume> {
-    in_mm(job, path, (job.volumes)(path)?)
 }
 
 /// Converts a volume from 1/unit of the scan to 1/mm. Refuses one that does not match the scan.

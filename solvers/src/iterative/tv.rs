@@ -148,7 +148,7 @@ fn less<V: SimdFloat<S>, S: Simd>(m: [V; 3], share: V, v: [V; 3]) -> [V; 3] {
 /// `argmin_{l ≤ u ≤ h} ½‖u − v‖² + τ·TV(u)`, with `u = min(h, max(l, v − τ·∇ᵀp))` and `|p_j| ≤ 1` (Beck and Teboulle, IEEE Trans.
 /// Image Process. 18(11), 2009; without their momentum, which a warm start does not need).
 ///
-/// All steps pass through the volume in one sweep (`Sweep::sweep`), so that memory is read and written once for all of
+/// All steps pass through the volume in one sweep (`Sweep`), so that memory is read and written once for all of
 /// them.
 pub struct TvProx {
     shape: [usize; 3],
@@ -193,11 +193,8 @@ impl TvProx {
     /// the bounds.
     fn apply(&mut self, v: &[f32], tau: f32, steps: usize, u: &mut [f32]) {
         if tau < f32::MIN_POSITIVE {
-            let bounds = self.bounds;
-            return match &self.each {
-                None => bounds.clip_to(u, v),
-                Some(each) => clip_each(v, each, u),
-            };
+            self.bounds.clip_to(u, v);
+            return clip_each(u, self.each.as_deref());
         }
         let mut left = steps;
         loop {
@@ -226,6 +223,8 @@ impl TvProx {
         let [nz, y, z] = along(self.shape);
         let plane = self.shape[1] * self.shape[2];
         let bounds = split.bounds(self.shape[0]);
+        let limited = self.limited.map(|limited| limited.turned([0, y, z]));
+        let scale = Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.bounds, limited);
         let edges = self.edges.as_ref().map(Edges::vectors).map(|n| [n[0], n[y], n[z]]);
         let [px, py, pz] = self.dual.each_mut().map(Array::slice_mut);
         let dual = if y == 1 { [px, py, pz] } else { [px, pz, py] };
@@ -268,11 +267,9 @@ impl TvProx {
             let edges = edges.map(|n| n.map(|n| &n[first..first + planes.0[0].len() * plane]));
             let part = first..first + planes.0[0].len() * plane;
             let each = self.each.as_ref().map(|each| each.each_ref().map(|x| &x[part.clone()]));
-            slabs.push(Sweep { planes, own, lines, v, edges, each, line: nz, steps: split.reach });
+            slabs.push(Sweep { planes, own, lines, v, edges, each, line: nz, steps: split.reach, scale });
         }
-        let limited = self.limited.map(|limited| limited.turned([0, y, z]));
-        let scale = Scale { limited, ..Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.bounds) };
-        parallel::over(slabs, |_, slab| run(Sweeping(slab, scale)));
+        parallel::over(slabs, |_, slab| run(slab));
     }
 }
 
@@ -351,11 +348,11 @@ impl Penalty for TvProx {
     }
 }
 
-/// Overwrites each `u` with the number within its bounds that is closest to `v`.
-pub(super) fn clip_each(v: &[f32], [low, high]: &[Vec<f32>; 2], u: &mut [f32]) {
-    parallel::change(u, [v, low, high], |u, [v, low, high]| {
-        let all = u.iter_mut().zip(v).zip(low).zip(high);
-        all.for_each(|(((u, v), low), high)| *u = v.max(*low).min(*high));
+/// Clips each `u` to its own bounds, if it has some.
+pub(super) fn clip_each(u: &mut [f32], each: Option<&[Vec<f32>; 2]>) {
+    let Some([low, high]) = each else { return };
+    parallel::change(u, [low, high], |u, [low, high]| {
+        u.iter_mut().zip(low).zip(high).for_each(|((u, low), high)| *u = u.max(*low).min(*high));
     });
 }
 
@@ -405,9 +402,9 @@ struct Scale {
 }
 
 impl Scale {
-    fn new(g: [f32; 3], tau: f32, bounds: Bounds) -> Self {
+    fn new(g: [f32; 3], tau: f32, bounds: Bounds, limited: Option<Limited>) -> Self {
         let bound = Dual::bound(g);
-        Self { down: g.map(|g| g * tau), up: g.map(|g| g / (bound * tau)), bounds, limited: None }
+        Self { down: g.map(|g| g * tau), up: g.map(|g| g / (bound * tau)), bounds, limited }
     }
 }
 
@@ -476,25 +473,17 @@ struct Sweep<'a, L> {
     /// Numbers per line along z.
     line: usize,
     steps: usize,
+    scale: Scale,
 }
 
-struct Sweeping<'a, L>(Sweep<'a, L>, Scale);
-
-impl<L: Lines> Op for Sweeping<'_, L> {
+impl<L: Lines> Op for Sweep<'_, L> {
     type Number = f32;
     type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        self.0.sweep(s, self.1);
-    }
-}
-
-impl<L: Lines> Sweep<'_, L> {
     /// Step k runs one plane behind step k − 1, line by line: once a line's primal is known, the dual of the line one
     /// plane before can advance, whose primal the next step then uses. So one plane per step is kept.
     #[inline(always)]
-    fn sweep<S: Simd>(mut self, s: S, scale: Scale) {
-        let nz = self.line;
+    fn call<S: Simd>(mut self, s: S) {
+        let (nz, scale) = (self.line, self.scale);
         let plane = self.planes.0[0].first().map_or(0, |p| p.len());
         let (ny, count) = (plane / nz, self.planes.0[0].len());
         // The primal of every step, with each line's last number doubled: no difference across the far face. A line
@@ -548,7 +537,9 @@ impl<L: Lines> Sweep<'_, L> {
             }
         }
     }
+}
 
+impl<L: Lines> Sweep<'_, L> {
     /// Clips line `j` of plane `i` to the bounds of its voxels.
     #[inline(always)]
     fn clip(&self, i: usize, j: usize, u: &mut [f32]) {

@@ -39,7 +39,7 @@ fn the_second_goes_on_where_the_first_ended() {
 
 /// A trivial field that takes seconds to train.
 const FIELD: &str = "type = \"neural-field\"\nencoder = \"identity\"\nfield = { type = \"voxel-grid\", resolution = 24 }\n\
-    projector = { type = \"ray-march\", samples = 48 }\ntraining = { steps = 60, rays = 256, report_every = 25 }\noptimizer.lr = 0.05\n";
+    projector = { type = \"ray-march\", samples = 48 }\ntraining = { steps = 60, rays = 64, report_every = 25 }\noptimizer.lr = 0.05\n";
 
 #[test]
 fn a_field_is_refined_and_kept() {

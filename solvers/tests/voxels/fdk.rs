@@ -98,12 +98,23 @@ fn fdk(scan: &Scan, settings: &str) -> (Volume, Heard) {
     Case::of(scan).volume(&format!("type = \"fdk\"\n{settings}"))
 }
 
+/// Whether FDK takes each orbit for what it is, and the means are right.
+fn are_right<const N: usize>(orbits: [(&str, Orbiting); N]) {
+    for (kind, orbit) in orbits {
+        let scan = scan(orbit);
+        assert_eq!(scan.geometry.is_parallel(0), orbit.radius > 1e6);
+        let (volume, heard) = fdk(&scan, "");
+        println!("{orbit:?}: {:?}", means(&volume));
+        assert!(heard.said(kind), "{orbit:?}: {:?}", heard.notes);
+        assert!(off(&volume) < EXACT, "{orbit:?}: {:?}", means(&volume));
+    }
+}
+
 #[test]
 fn means_are_right_for_every_orbit_magnification_and_detector() {
-    let mut worst = 0.0f64;
     for (radius, magnification) in [(80.0, 1.2), (100.0, 1.5), (200.0, 3.0)] {
         let full = Orbiting { radius, magnification, ..CENTRED };
-        for (kind, orbit) in [
+        are_right([
             ("full turn", full),
             ("full turn", full.backwards()),
             ("offset detector", full.aside(5.2, true)),
@@ -113,14 +124,8 @@ fn means_are_right_for_every_orbit_magnification_and_detector() {
             ("short scan", full.short(0.0)),
             ("short scan", full.short(0.0).backwards()),
             ("short scan", full.short(1.0)),
-        ] {
-            let (volume, heard) = fdk(&scan(orbit), "");
-            assert!(heard.said(kind), "{orbit:?}: {:?}", heard.notes);
-            assert!(off(&volume) < EXACT, "{orbit:?}: {:?}", means(&volume));
-            worst = worst.max(off(&volume));
-        }
+        ]);
     }
-    println!("the worst mean is off by {:.3} %", 100.0 * worst);
 }
 
 /// In a parallel beam, half a turn measures every line once. A detector that is offset by half sees each in one of two
@@ -128,22 +133,15 @@ fn means_are_right_for_every_orbit_magnification_and_detector() {
 #[test]
 fn a_parallel_beam_is_backprojected_with_its_scale() {
     let full = Orbiting { radius: 1e7, magnification: 1.00001, ..CENTRED };
-    for (orbit, kind) in [
-        (full, "full turn"),
-        (full.backwards(), "full turn"),
-        (full.aside(5.2, true), "offset detector"),
-        (full.aside(5.2, false).backwards(), "offset detector"),
-        (Orbiting { arc: PI, views: 360, ..full }, "short scan"),
-        (Orbiting { arc: -PI, views: 360, ..full }, "short scan"),
-        (Orbiting { arc: 1.2 * PI, ..full }, "short scan"),
-    ] {
-        let scan = scan(orbit);
-        assert!(scan.geometry.is_parallel(0));
-        let (volume, heard) = fdk(&scan, "");
-        println!("{orbit:?}: {:?}", means(&volume));
-        assert!(heard.said(kind), "{orbit:?}: {:?}", heard.notes);
-        assert!(off(&volume) < EXACT, "{orbit:?}: {:?}", means(&volume));
-    }
+    are_right([
+        ("full turn", full),
+        ("full turn", full.backwards()),
+        ("offset detector", full.aside(5.2, true)),
+        ("offset detector", full.aside(5.2, false).backwards()),
+        ("short scan", Orbiting { arc: PI, views: 360, ..full }),
+        ("short scan", Orbiting { arc: -PI, views: 360, ..full }),
+        ("short scan", Orbiting { arc: 1.2 * PI, ..full }),
+    ]);
 }
 
 /// A detector from the axis outwards measures every line once: half weights would give half the density.
@@ -214,20 +212,14 @@ fn unweighted(scan: &Scan) -> Scan {
     scan
 }
 
-/// The means above detect a scale that is 1 % wrong, and the absence of each kind of weights.
+/// The means above detect a scale that is 1 % wrong, and weights for the other side.
 #[test]
-fn wrong_scales_and_weights_are_seen() {
+fn wrong_scales_and_sides_are_seen() {
     let views = 360;
     let mut scaled = scan(Orbiting { views, ..CENTRED });
     assert!(off(&fdk(&scaled, "").0) < EXACT);
     scaled.projections.par_mapv_inplace(|x| 1.01 * x);
     assert!(off(&fdk(&scaled, "").0) > EXACT);
-    for orbit in [CENTRED.aside(5.2, true), CENTRED.short(0.0), CENTRED.short(1.0)] {
-        let scan = scan(Orbiting { views, ..orbit });
-        assert!(off(&fdk(&scan, "").0) < EXACT);
-        let without = fdk(&unweighted(&scan), "").0;
-        assert!(off(&without) > 4.0 * EXACT, "{orbit:?}: {:?}", means(&without));
-    }
     // The detector's side confused with the other one.
     let mut bad = scan(Orbiting { views, ..CENTRED.aside(5.2, true) });
     bad.geometry = geometry(Orbiting { views, ..CENTRED.aside(5.2, false) });

@@ -9,6 +9,7 @@ mod kit;
 mod references;
 mod refusals;
 mod solid;
+mod support;
 mod surround;
 mod sweep;
 mod warm_start;

@@ -48,10 +48,11 @@ fn method(kind: &str, surround: &str) -> String {
 }
 
 #[test]
-fn every_method_loses_the_rim_that_the_outside_leaves() {
+fn methods_lose_the_rim_that_the_outside_leaves() {
     let (scan, truth) = (scan(), ellipsoids(&bodies(), &geometry(false).volume));
     let rim = |p: [f64; 3]| (17.0..19.0).contains(&p[0].hypot(p[1])) && p[2].abs() < 15.0;
-    for kind in ["fdk", "os-sart", "mlem", "cgls", "lsqr", "asd-pocs", "fista-tv"] {
+    // The others subtract it where `os-sart` and `cgls` do.
+    for kind in ["fdk", "os-sart", "cgls", "fista-tv"] {
         let (without, _) = Case::of(&scan).volume(&method(kind, ""));
         let (with, heard) = Case::of(&scan).volume(&method(kind, SURROUND));
         assert!(heard.said("beyond the volume"), "{:?}", heard.notes);
@@ -93,8 +94,11 @@ fn what_is_left_is_the_inside() {
 fn a_scan_that_shows_all_of_the_object_is_left_alone() {
     let volume = VoxelGrid { shape: [40; 3], spacing: [3.0; 3], center: [0.0; 3] };
     let scan = scan_ellipsoids(&bodies(), Geometry { volume, ..geometry(true) });
-    let (without, _) = Case::of(&scan).volume(&method("os-sart", ""));
-    let (with, heard) = Case::of(&scan).volume(&method("os-sart", SURROUND));
+    let of = |surround: &str| {
+        let text = crate::kit::method("os-sart", &format!("{surround}stop = {{ passes = 2 }}\n"));
+        Case::of(&scan).volume(&text)
+    };
+    let ((without, _), (with, heard)) = (of(""), of(SURROUND));
     assert!(heard.said("surround: nothing, as the object reaches the sides of no view"), "{:?}", heard.notes);
     assert_eq!(with.data, without.data);
 }

@@ -4,13 +4,9 @@
 //! the edges come from another image of the object. Here they come from the volume itself and are updated before each
 //! pass.
 
-use super::total_variation::{are_equal, halo, is_one, lambda, said, validate, weighted};
-use crate::iterative::edges::Edges;
-use crate::iterative::tv::TvProx;
+use super::total_variation::{Variation, are_equal, is_one};
 use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::VoxelGrid;
-use conefield_core::regularizer::{Penalty, Regularizer, RegularizerSpec, Weight};
-use conefield_core::space::Space;
+use conefield_core::regularizer::{Regularizer, RegularizerSpec, Weight};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -51,34 +47,12 @@ conefield_core::stage_type!(
 
 impl RegularizerSpec for DirectionalTotalVariation {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
-        validate(self.weight, self.inner, self.weights, self.arc)?;
-        let strength = self.strength;
+        let Self { weight, inner, strength, edge, weights, arc } = *self;
+        let edges = Some([strength, edge]);
+        let built = Variation { name: "directional-total-variation", weight, inner, weights, arc, edges };
+        built.validate()?;
         ensure((0.0..=0.999).contains(&strength), "spec", "strength", strength, "0 to 0.999")?;
-        ensure((1e-3..=1e3).contains(&self.edge), "spec", "edge", self.edge, "0.001 to 1000")?;
-        Ok(Box::new(*self))
-    }
-}
-
-impl Regularizer for DirectionalTotalVariation {
-    fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
-        let g = weighted(grid, self.weights);
-        let edges = Edges::new(grid.shape, self.strength as f32, self.edge, space)?;
-        Ok(Box::new(TvProx::new(grid.shape, g, self.inner, self.arc, space)?.with_edges(edges)))
-    }
-
-    fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
-        Ok(lambda(self.weight, grid, noise))
-    }
-
-    fn halo(&self) -> Option<usize> {
-        Some(halo(self.inner))
-    }
-
-    fn describe(&self) -> String {
-        let Self { weight, inner, strength, edge, weights, arc } = self;
-        let axes = said(*weights, *arc);
-        format!(
-            "directional-total-variation: weight {weight}{axes}, {inner} dual steps per update, strength {strength}, edge {edge}"
-        )
+        ensure((1e-3..=1e3).contains(&edge), "spec", "edge", edge, "0.001 to 1000")?;
+        Ok(Box::new(built))
     }
 }

@@ -57,10 +57,8 @@ impl Penalty for BoundsPenalty {
     }
 
     fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
-        match &self.each {
-            None => self.bounds.clip_to(u, v),
-            Some(each) => clip_each(v, each, u),
-        }
+        self.bounds.clip_to(u, v);
+        clip_each(u, self.each.as_deref());
     }
 
     fn divide(&mut self, slab: Slab) {

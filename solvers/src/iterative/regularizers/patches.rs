@@ -14,6 +14,7 @@
 //! group, `Σ_g σ_g·P_gᵀ·P_g ≤ 1`, so that it converges.
 
 use super::total_variation::lambda;
+use crate::iterative::tv::clip_each;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parallel;
@@ -275,11 +276,7 @@ impl PatchesPenalty {
         parallel::change(u, [v, &self.sum], |u, [v, sum]| {
             u.iter_mut().zip(v).zip(sum).for_each(|((u, v), sum)| *u = bounds.clip(v - tau * sum));
         });
-        if let Some([low, high]) = self.each.as_deref() {
-            parallel::change(u, [low, high], |u, [low, high]| {
-                u.iter_mut().zip(low).zip(high).for_each(|((u, low), high)| *u = u.max(*low).min(*high));
-            });
-        }
+        clip_each(u, self.each.as_deref());
     }
 }
 

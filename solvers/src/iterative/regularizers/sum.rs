@@ -188,49 +188,20 @@ impl Penalty for SumPenalty {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::Result;
     use conefield_core::scan::ScanHeader;
     use std::collections::BTreeSet;
 
-    /// A prior from elsewhere, whose state has the name that a sum could use itself.
-    struct Foreign(Vec<f32>);
-
-    impl Regularizer for Foreign {
-        fn on(&self, _: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
-            Ok(Box::new(Self(vec![0.0; 3])))
-        }
-
-        fn weight(&self, _: &VoxelGrid, _: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
-            Ok(1.0)
-        }
-
-        fn describe(&self) -> String {
-            "foreign".into()
-        }
-    }
-
-    impl Penalty for Foreign {
-        fn value(&self, _: ArrayView3<'_, f32>) -> f64 {
-            0.0
-        }
-
-        fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
-            u.copy_from_slice(v);
-        }
-
-        fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
-            vec![("dual", StatePart::Host(&mut self.0))]
-        }
-    }
-
+    /// Those of a prior's own state begin with its number, so that they are none of the sum's.
     #[test]
     fn the_state_has_a_name_for_each_part() {
-        let part = || Box::new(Foreign(vec![])) as Box<dyn Regularizer>;
+        let part = || TotalVariation::default().build().unwrap();
         let grid = VoxelGrid { shape: [2; 3], spacing: [1.0; 3], center: [0.0; 3] };
         let header = ScanHeader { views: 2, detector: [2; 2], volume: [2; 3] };
-        let mut sum =
-            SumRegularizer { parts: vec![part(), part()], turns: 1 }.on(&grid, &Space::tally(header)).unwrap();
-        let names: BTreeSet<&str> = sum.state().into_iter().map(|(name, _)| name).collect();
-        assert_eq!(names, BTreeSet::from(["0.dual", "1.dual", "dual.0", "dual.1"]));
+        let sum = SumRegularizer { parts: vec![part(), part()], turns: 1 };
+        let mut sum = sum.on(&grid, &Space::tally(header)).unwrap();
+        let names: BTreeSet<String> = sum.state().into_iter().map(|(name, _)| name.to_owned()).collect();
+        let own = |i: usize| ["x", "y", "z"].map(|axis| format!("{i}.dual.{axis}"));
+        let duals = [0, 1].map(|i| format!("dual.{i}"));
+        assert_eq!(names, own(0).into_iter().chain(own(1)).chain(duals).collect());
     }
 }

@@ -1,5 +1,6 @@
 //! Total variation: attenuation is piecewise constant with few edges.
 
+use crate::iterative::edges::Edges;
 use crate::iterative::tv::{TvProx, anisotropy};
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
@@ -36,24 +37,6 @@ pub(super) fn are_equal(weights: &[f64; 3]) -> bool {
     *weights == [1.0; 3]
 }
 
-/// Weights of differences along x, y and z on `grid`, with factors for the axes.
-pub(super) fn weighted(grid: &VoxelGrid, weights: [f64; 3]) -> [f32; 3] {
-    let g = anisotropy(grid);
-    std::array::from_fn(|k| weights[k] as f32 * g[k])
-}
-
-/// Refuses an invalid weight, number of dual steps, or factor.
-pub(super) fn validate(weight: Weight, inner: usize, weights: [f64; 3], arc: f64) -> Result<()> {
-    ensure((1e-3..=1.0).contains(&arc), "spec", "arc", arc, "a number from 0.001 to 1")?;
-    let some = weights.iter().any(|w| *w > 0.0);
-    for w in weights {
-        let expected = "three numbers from 0.001 to 1000 or 0, not all 0";
-        ensure(some && (w == 0.0 || (1e-3..=1e3).contains(&w)), "spec", "weights", w, expected)?;
-    }
-    ensure((1..=1000).contains(&inner), "spec", "inner", inner, "1 to 1000")?;
-    weight.validate()
-}
-
 /// λ on `grid`. Attenuation per voxel is x̂ = x·h and lengths in voxels are Â = A/h, so that λ̂·TV(x̂) = λ̂·h·TV(x).
 pub(super) fn lambda(weight: Weight, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> f64 {
     weight.lambda(grid.spacing.iter().product::<f64>().cbrt(), noise)
@@ -69,38 +52,63 @@ conefield_core::stage_type!(RegularizerSpec, "total-variation", TotalVariation, 
 
 impl RegularizerSpec for TotalVariation {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
-        validate(self.weight, self.inner, self.weights, self.arc)?;
-        Ok(Box::new(*self))
+        let Self { weight, inner, weights, arc } = *self;
+        let built = Variation { name: "total-variation", weight, inner, weights, arc, edges: None };
+        built.validate()?;
+        Ok(Box::new(built))
     }
 }
 
-impl Regularizer for TotalVariation {
+/// Total variation, or directional total variation with the `strength` and `edge` of its settings.
+pub(super) struct Variation {
+    pub(super) name: &'static str,
+    pub(super) weight: Weight,
+    pub(super) inner: usize,
+    pub(super) weights: [f64; 3],
+    pub(super) arc: f64,
+    pub(super) edges: Option<[f64; 2]>,
+}
+
+impl Variation {
+    /// Refuses an invalid weight, number of dual steps, or factor.
+    pub(super) fn validate(&self) -> Result<()> {
+        ensure((1e-3..=1.0).contains(&self.arc), "spec", "arc", self.arc, "a number from 0.001 to 1")?;
+        let some = self.weights.iter().any(|w| *w > 0.0);
+        for w in self.weights {
+            let expected = "three numbers from 0.001 to 1000 or 0, not all 0";
+            ensure(some && (w == 0.0 || (1e-3..=1e3).contains(&w)), "spec", "weights", w, expected)?;
+        }
+        ensure((1..=1000).contains(&self.inner), "spec", "inner", self.inner, "1 to 1000")?;
+        self.weight.validate()
+    }
+}
+
+impl Regularizer for Variation {
     fn on(&self, grid: &VoxelGrid, space: &Space) -> Result<Box<dyn Penalty>> {
-        Ok(Box::new(TvProx::new(grid.shape, weighted(grid, self.weights), self.inner, self.arc, space)?))
+        let g = anisotropy(grid);
+        let g = std::array::from_fn(|k| self.weights[k] as f32 * g[k]);
+        let edges = self.edges.map(|[strength, edge]| Edges::new(grid.shape, strength as f32, edge, space));
+        let prox = TvProx::new(grid.shape, g, self.inner, self.arc, space)?;
+        Ok(Box::new(match edges.transpose()? {
+            Some(edges) => prox.with_edges(edges),
+            None => prox,
+        }))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {
         Ok(lambda(self.weight, grid, noise))
     }
 
+    /// One plane per dual step, with the dual's before the first and the slopes by which edges are found.
     fn halo(&self) -> Option<usize> {
-        Some(halo(self.inner))
+        Some(self.inner + 2)
     }
 
     fn describe(&self) -> String {
-        let axes = said(self.weights, self.arc);
-        format!("total-variation: weight {}{axes}, {} dual steps per update", self.weight, self.inner)
+        let Self { name, weight, inner, weights, arc, edges } = self;
+        let axes = if are_equal(weights) { String::new() } else { format!(" times {weights:?} along x, y, z") };
+        let arc = if is_one(arc) { String::new() } else { format!(" times {arc} along the middle of a limited arc") };
+        let edges = edges.map_or(String::new(), |[strength, edge]| format!(", strength {strength}, edge {edge}"));
+        format!("{name}: weight {weight}{axes}{arc}, {inner} dual steps per update{edges}")
     }
-}
-
-/// Planes beyond a slab that `inner` dual steps reach, one per step, with the dual's before the first and the slopes by
-/// which edges are found.
-pub(super) fn halo(inner: usize) -> usize {
-    inner + 2
-}
-
-/// The factors for `explain`, if they are not 1.
-pub(super) fn said(weights: [f64; 3], arc: f64) -> String {
-    let axes = if are_equal(&weights) { String::new() } else { format!(" times {weights:?} along x, y, z") };
-    if is_one(&arc) { axes } else { format!("{axes} times {arc} along the middle of a limited arc") }
 }
