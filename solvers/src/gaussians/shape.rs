@@ -70,6 +70,14 @@ impl Shape {
         Self { centre: [n(0), n(1), n(2)], inverse, deviations, density }
     }
 
+    /// `ρ·exp(-½|M(x - c)|²)` at `x`; 0 beyond `extent` standard deviations.
+    #[inline]
+    pub fn value(&self, x: V3, extent: f64) -> f64 {
+        let m = apply(&self.inverse, std::array::from_fn(|k| x[k] - self.centre[k]));
+        let e = dot(m, m);
+        if e <= extent * extent { self.density * (-0.5 * e).exp() } else { 0.0 }
+    }
+
     /// The largest standard deviation.
     pub fn longest(&self) -> f64 {
         self.deviations[0].max(self.deviations[1]).max(self.deviations[2])
