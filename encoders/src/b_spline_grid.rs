@@ -7,12 +7,8 @@
 //! has two continuous derivatives; a trilinear grid has none.
 
 use crate::levels::{self, BLOCK, Cells, Levels, Rows, cube, fold, fours, grid, stretch};
-use conefield_core::error::Result;
-use conefield_core::settings::EncoderSpec;
-use conefield_core::simd::{Real, Simd, SimdBase, SimdFloat};
-use conefield_core::stage::{Encoder, Tile};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Simd, SimdBase, SimdFloat};
 use std::ops::{Range, RangeInclusive};
 
 /// Settings of `b-spline-grid`.
@@ -259,7 +255,6 @@ impl levels::Level for SplineLevel {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::stage::{Kernel, Stage, TileMut};
 
     type BSplineGridStage = Levels<SplineLevel>;
 

@@ -6,14 +6,10 @@
 //! `p = clamp(x, 0, 1)·r`.
 
 use crate::levels::{self, BLOCK, Levels, Rows, cube, grid};
-use conefield_core::error::Result;
-use conefield_core::settings::EncoderSpec;
-use conefield_core::simd::{Real, Simd};
-use conefield_core::stage::{Encoder, Tile};
+use conefield_core::prelude::*;
+use conefield_core::simd::Simd;
 use conefield_core::trilinear::{Grid, Located};
 use conefield_core::wgsl::TRILINEAR;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 use std::ops::{Range, RangeInclusive};
 
 /// Settings of `dense-grid`.
@@ -132,7 +128,6 @@ impl levels::Level for DenseLevel {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::stage::{Kernel, Stage, TileMut};
 
     type DenseGridStage = Levels<DenseLevel>;
 

@@ -5,12 +5,10 @@
 //! requested part of the gradients, names the parameters, removes channels, and calls `stage_level_forward` and
 //! `stage_level_backward` in WGSL, with the levels' settings as constants.
 
-use conefield_core::error::{Result, ensure};
-use conefield_core::random::{mix, unit};
-use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::trilinear::slabs;
-use conefield_core::wgsl::{self, Fragment};
+use conefield_core::wgsl;
 use std::fmt::Write;
 use std::ops::{Range, RangeInclusive};
 

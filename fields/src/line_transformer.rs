@@ -9,13 +9,9 @@ use crate::linear::Linear;
 use crate::normalizers::line_attention::{LineAttention, LineAttentionStage};
 use conefield_core::activation::{Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
-use conefield_core::error::{Result, ensure};
-use conefield_core::random::{mix, uniform};
-use conefield_core::settings::FieldSpec;
-use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::random::uniform;
+use conefield_core::simd::{Op, Simd, run};
 use std::ops::Range;
 
 /// Settings of `line-transformer`.

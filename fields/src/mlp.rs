@@ -8,14 +8,9 @@ mod wgsl;
 use crate::linear::Linear;
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
-use conefield_core::error::{Result, ensure};
+use conefield_core::prelude::*;
 use conefield_core::random::uniform;
-use conefield_core::settings::FieldSpec;
-use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
-use conefield_core::wgsl::Fragment;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::simd::{Op, Simd, run};
 use std::ops::Range;
 
 /// Initialization of weights and biases.

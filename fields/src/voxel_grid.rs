@@ -4,14 +4,10 @@
 //! surface. The activation follows the interpolation, so that edges can lie between voxels.
 
 use conefield_core::activation::{self, Activation, activate};
-use conefield_core::error::{Error, Result, ensure};
-use conefield_core::settings::FieldSpec;
-use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Simd, run};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
-use conefield_core::wgsl::{Fragment, TRILINEAR};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::wgsl::TRILINEAR;
 use std::ops::Range;
 
 /// Number of voxels along the unit cube's sides.

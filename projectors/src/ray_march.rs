@@ -5,13 +5,8 @@
 //! end. Samples are in the middle of their interval (midpoint rule, second order) or at a random position in it
 //! (stratified, unbiased). The published sum, which gives the last sample no weight, is available for comparisons.
 
-use conefield_core::error::{Error, Result, ensure};
-use conefield_core::random::{mix, unit};
-use conefield_core::settings::ProjectorSpec;
-use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
-use conefield_core::wgsl::Fragment;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::stage::Lengths;
 
 /// Sample positions within the intervals during training. Rendering uses the middle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

@@ -1,11 +1,7 @@
 //! All weights from a file, to continue training or rendering a model of an earlier run.
 
-use conefield_core::arena::{Arena, InitReport, Layout, Weights};
-use conefield_core::error::{Result, ensure};
 use conefield_core::input_file::InputFile;
-use conefield_core::settings::{Initializer, InitializerSpec};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Settings of `checkpoint`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]

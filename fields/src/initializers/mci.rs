@@ -4,12 +4,8 @@
 //! Loads the weights of the normalizers and the field, that is every block whose name does not start with `encoder.`.
 //! Refuses a file that lacks a block or has it in another shape.
 
-use conefield_core::arena::{Arena, InitReport, Layout, Weights};
-use conefield_core::error::{Error, Result, ensure};
 use conefield_core::input_file::InputFile;
-use conefield_core::settings::{Initializer, InitializerSpec};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Settings of `mci`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -7,13 +7,9 @@
 //! changes only the influence of `eps`, which is then far below rounding.
 
 use conefield_core::dense::total;
-use conefield_core::error::{Result, ensure};
-use conefield_core::settings::NormalizerSpec;
-use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Stage, Tile, TileMut};
-use conefield_core::wgsl::{Fragment, Sum, declare};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::wgsl::{Sum, declare};
 
 /// Settings of `layer-norm`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -10,14 +10,9 @@
 //! additional training target of the attention (from gradients of the attenuation, and uncertainty) is not included.
 
 use conefield_core::dense::{Output as Into, WeightMatrix, affine, affine_input, affine_weights};
-use conefield_core::error::{Result, ensure};
-use conefield_core::random::{mix, unit};
-use conefield_core::settings::NormalizerSpec;
-use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Stage, Tile, TileMut};
-use conefield_core::wgsl::{Fragment, Sum, declare, functions};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::wgsl::{Sum, declare, functions};
 use std::fmt::Write;
 
 /// Settings of `level-attention`.

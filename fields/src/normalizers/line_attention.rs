@@ -15,15 +15,9 @@
 use crate::normalizers::layer_norm::{LayerNorm, LayerNormStage};
 use conefield_core::activation::{Activation, activate};
 use conefield_core::dense::{Output as Into, WeightMatrix, affine, affine_input, affine_weights};
-use conefield_core::error::{Result, ensure};
-use conefield_core::random::{mix, uniform, unit};
-use conefield_core::settings::NormalizerSpec;
-use conefield_core::simd::{Op, Real, Simd, SimdBase, V, load, run, store};
-use conefield_core::stage::{
-    GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
-};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::random::uniform;
+use conefield_core::simd::{Op, Simd, SimdBase, V, load, run, store};
 use std::f64::consts::TAU;
 use std::ops::Range;
 

@@ -7,15 +7,12 @@
 
 use crate::training::run::{HINT, Run};
 use crate::training::{Callback, CallbackSpec, Kept, State};
-use conefield_core::arena::Layout;
-use conefield_core::error::{Error, Result, ensure};
 use conefield_core::host;
 use conefield_core::method::DriftRecord;
+use conefield_core::prelude::*;
 use conefield_core::random::stream;
 use conefield_core::scene::Scene;
 use rand::RngExt;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
 /// Its name in specs and checkpoints, and the names of its tensors.
 const NAME: &str = "drift";

@@ -15,13 +15,9 @@
 
 use crate::training::run::Run;
 use crate::training::{Callback, CallbackSpec, Kept, State};
-use conefield_core::arena::Layout;
-use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::random::{mix, unit};
+use conefield_core::prelude::*;
 use conefield_fourier::{Complex, Fft, forward_f64};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// Its name in specs and checkpoints.

@@ -3,13 +3,10 @@
 use crate::training::run::{Run, strayed};
 use crate::training::{Callback, CallbackSpec, Kept, State};
 use crate::waiting::Waited;
-use conefield_core::arena::Layout;
 use conefield_core::checkpoint::tensors_of;
-use conefield_core::error::{Result, ensure};
 use conefield_core::method::Record;
 use conefield_core::pages::{Pages, copy};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Its name in specs and checkpoints, and the prefix of its tensors.
 const NAME: &str = "patience";
