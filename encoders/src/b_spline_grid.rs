@@ -276,15 +276,4 @@ mod tests {
             assert!((y[0] - want).abs() < 1e-12 && y[1] == 0.0, "{x:?}: {y:?} {want}");
         }
     }
-
-    #[test]
-    fn too_many_parameters_are_refused_with_words() {
-        for s in [
-            BSplineGrid { levels: 8, ..BSplineGrid::default() },
-            BSplineGrid { levels: 32, growth: 16.0, base_resolution: 1 << 20, ..BSplineGrid::default() },
-        ] {
-            let e = BSplineGridStage::new(&s).unwrap_err().to_string();
-            assert!(e.contains("levels") && e.contains("2^31") && e.contains("hash-grid"), "{e}");
-        }
-    }
 }

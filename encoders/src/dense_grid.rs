@@ -147,15 +147,4 @@ mod tests {
         stage.forward(&params, Tile::new(&x, 1), TileMut::new(&mut y, 1), TileMut::new(&mut [], 1));
         assert!((y[0] - (150.0 + 10.0 + 0.25)).abs() < 1e-12 && y[1] == 0.0, "{y:?}");
     }
-
-    #[test]
-    fn too_many_parameters_are_refused_with_words() {
-        for s in [
-            DenseGrid { levels: 8, ..DenseGrid::default() },
-            DenseGrid { levels: 32, growth: 16.0, base_resolution: 1 << 20, ..DenseGrid::default() },
-        ] {
-            let e = DenseGridStage::new(&s).unwrap_err().to_string();
-            assert!(e.contains("levels") && e.contains("2^31") && e.contains("hash-grid"), "{e}");
-        }
-    }
 }

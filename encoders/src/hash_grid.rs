@@ -496,12 +496,6 @@ mod tests {
     }
 
     #[test]
-    fn a_level_past_single_precision_is_refused() {
-        let e = HashGridStage::new(&HashGrid { levels: 32, ..HashGrid::default() }).unwrap_err().to_string();
-        assert!(e.contains("levels") && e.contains("2^23"), "{e}");
-    }
-
-    #[test]
     fn levels_of_which_nothing_is_read_leave_the_stage() {
         let stage = HashGridStage::new(&HashGrid { levels: 3, ..HashGrid::default() }).unwrap();
         let r = stage.keep_outputs(&[0, 5]).unwrap();

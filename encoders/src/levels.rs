@@ -811,3 +811,31 @@ pub fn prefetch<'a, T>(table: &[T], indices: impl Iterator<Item = &'a [u32; BLOC
     #[cfg(not(target_arch = "x86_64"))]
     let _ = (table, indices, n);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::b_spline_grid::BSplineGrid;
+    use crate::dense_grid::DenseGrid;
+    use crate::hash_grid::HashGrid;
+    use crate::permutohedral::Permutohedral;
+    use crate::planes::Planes;
+
+    #[test]
+    fn levels_too_fine_or_too_large_are_refused_with_words() {
+        let (large, growth) = (1 << 20, 16.0);
+        let all: [(&dyn EncoderSpec, &[&str]); 7] = [
+            (&DenseGrid { levels: 8, ..Default::default() }, &["2^31", "hash-grid"]),
+            (&DenseGrid { levels: 32, growth, base_resolution: large, ..Default::default() }, &["2^31"]),
+            (&BSplineGrid { levels: 8, ..Default::default() }, &["2^31", "hash-grid"]),
+            (&BSplineGrid { levels: 32, growth, base_resolution: large, ..Default::default() }, &["2^31"]),
+            (&HashGrid { levels: 32, ..Default::default() }, &["2^23"]),
+            (&Permutohedral { levels: 32, ..Default::default() }, &["2^22"]),
+            (&Planes { levels: 12, ..Default::default() }, &["8192"]),
+        ];
+        for (settings, words) in all {
+            let e = settings.build().err().unwrap().to_string();
+            assert!(e.contains("levels") && words.iter().all(|word| e.contains(word)), "{e}");
+        }
+    }
+}

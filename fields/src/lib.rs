@@ -8,6 +8,4 @@ pub mod line_transformer;
 mod linear;
 pub mod mlp;
 pub mod normalizers;
-#[cfg(test)]
-mod testing;
 pub mod voxel_grid;

@@ -665,25 +665,6 @@ mod tests {
     }
 
     #[test]
-    fn the_published_block_has_its_parameter_count() {
-        let stage = LineAttentionStage::new(&LineAttention::default(), 32).unwrap();
-        // Two norms, q, k and v, positions, output with bias, three matrices of the feed-forward part.
-        let want = 2 * 64 + 3 * 32 * 32 + 8 * 4 + 32 * 33 + 128 * 32 + 128 * 128 + 32 * 128;
-        assert_eq!(stage.info().params, want);
-    }
-
-    #[test]
-    fn dropped_inputs_take_their_parameters_along() {
-        let settings = LineAttention { heads: 2, ..LineAttention::default() };
-        let stage = LineAttentionStage::new(&settings, 4).unwrap();
-        let reduced = stage.keep_inputs(&[0, 3]).unwrap();
-        let kept: usize = reduced.params.iter().map(Range::len).sum();
-        assert_eq!(kept, reduced.stage.info().params);
-        assert_eq!(reduced.channels, [0, 1]);
-        assert!(stage.keep_inputs(&[]).is_err());
-    }
-
-    #[test]
     fn settings_out_of_range_are_refused() {
         for (name, settings) in [
             ("segment", LineAttention { segment: 65, ..LineAttention::default() }),

@@ -175,17 +175,6 @@ fn a_view_is_its_rays_in_both_precisions() {
     assert!(unlike <= 4 && apart < 3e-3 * most, "{unlike} pixels, {apart:e}");
 }
 
-#[test]
-fn threads_change_no_bit() {
-    let (p, by) = (parameters(), weights(&beam()));
-    let run = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| (project(&p), gradient(&p, &by).0))
-    };
-    let one = run(1);
-    assert!(one == run(2) && one == run(3));
-}
-
 fn points() -> UnitGrid {
     UnitGrid { first: [0.21, 0.2, 0.13], spacing: [0.06, 0.05, 0.045], shape: [9, 11, 17] }
 }
