@@ -87,16 +87,6 @@ impl VoxelGridStage {
         ensure(settings.init.is_finite(), "spec", "init", settings.init, "a finite number")?;
         Ok(Self { grid: Grid::centres(axes.map(|n| n as usize)), output: settings.output, init: settings.init as f32 })
     }
-
-    /// Voxels along x, y, z.
-    pub fn side(&self) -> [usize; 3] {
-        self.grid.side()
-    }
-
-    /// Disjoint ranges of voxels, of at least about `most` each.
-    pub fn slabs(&self, most: usize) -> Vec<Range<usize>> {
-        self.grid.slabs(most)
-    }
 }
 
 struct VoxelGridForward<'a, R> {
