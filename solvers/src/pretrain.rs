@@ -41,7 +41,8 @@ impl Default for Pretraining {
 impl Pretraining {
     /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
-        ensure((1..=1 << 22).contains(&self.points), "spec", "points", self.points, "1 to 2^22")
+        ensure((1..=1 << 22).contains(&self.points), "spec", "points", self.points, "1 to 2^22")?;
+        ensure(self.steps > 0, "spec", "steps", 0, "at least 1: without a step the field stays untrained")
     }
 }
 
@@ -179,5 +180,22 @@ fn draw(volume: &Volume, scene: &Scene, seed: u64, step: u64, count: usize, out:
     for _ in 0..count {
         let index: [usize; 3] = std::array::from_fn(|k| rng.random_range(0..shape[k]));
         out.push((scene.voxel(index), (f64::from(volume.data[index]) / scene.attenuation) as f32));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_that_train_nothing_are_refused() {
+        let settings = Pretraining::default();
+        assert!(settings.validate().is_ok());
+        for (wrong, key) in
+            [(Pretraining { points: 0, ..settings.clone() }, "points"), (Pretraining { steps: 0, ..settings }, "steps")]
+        {
+            let e = wrong.validate().unwrap_err().to_string();
+            assert!(e.contains(key), "{e}");
+        }
     }
 }
