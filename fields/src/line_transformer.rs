@@ -10,7 +10,6 @@ use crate::normalizers::line_attention::{LineAttention, LineAttentionStage};
 use conefield_core::activation::{Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
 use conefield_core::prelude::*;
-use conefield_core::random::uniform;
 use conefield_core::simd::{Op, Simd, run};
 use std::ops::Range;
 
@@ -302,8 +301,7 @@ impl Stage for LineTransformerStage {
     fn parameters(&self) -> Vec<Parameter> {
         let mut all = vec![];
         for (name, l) in self.linear() {
-            all.push(Parameter { name: format!("{name}.weight"), shape: vec![l.output, l.ld()], start: l.start });
-            all.push(Parameter { name: format!("{name}.bias"), shape: vec![l.output], start: l.bias().start });
+            all.extend(l.parameters(name));
         }
         for (k, start) in self.blocks.iter().enumerate() {
             let of = |p: Parameter| Parameter { name: format!("blocks.{k}.{}", p.name), start: start + p.start, ..p };
@@ -316,10 +314,7 @@ impl Stage for LineTransformerStage {
     /// Linear maps are initialized as in PyTorch.
     fn init(&self, seed: u64, params: &mut [f32]) {
         for (_, l) in self.linear() {
-            let bound = 1.0 / (l.ld() as f64).sqrt();
-            for i in l.all() {
-                params[i] = uniform(seed, i, bound);
-            }
+            l.init(seed, params, [1.0 / (l.ld() as f64).sqrt(); 2]);
         }
         for &start in &self.blocks {
             self.block.init(mix(seed, start as u64), &mut params[self.of_block(start)]);

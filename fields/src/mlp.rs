@@ -9,7 +9,6 @@ use crate::linear::Linear;
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
 use conefield_core::prelude::*;
-use conefield_core::random::uniform;
 use conefield_core::simd::{Op, Simd, run};
 use std::ops::Range;
 
@@ -237,27 +236,18 @@ impl Stage for MlpStage {
     }
 
     fn parameters(&self) -> Vec<Parameter> {
-        let mut all = vec![];
-        for (i, l) in self.layers.iter().enumerate() {
-            all.push(Parameter { name: format!("{i}.weight"), shape: vec![l.output, l.ld()], start: l.start });
-            all.push(Parameter { name: format!("{i}.bias"), shape: vec![l.output], start: l.bias().start });
-        }
-        all
+        self.layers.iter().enumerate().flat_map(|(i, l)| l.parameters(&i.to_string())).collect()
     }
 
     fn init(&self, seed: u64, params: &mut [f32]) {
         for l in &self.layers {
             let (fan_in, fan_out) = (l.ld() as f64, l.output as f64);
-            let (w, b) = match self.settings.init {
-                Scheme::Torch => (1.0 / fan_in.sqrt(), 1.0 / fan_in.sqrt()),
-                Scheme::He => ((6.0 / fan_in).sqrt(), 0.0),
-                Scheme::Glorot => ((6.0 / (fan_in + fan_out)).sqrt(), 0.0),
+            let bounds = match self.settings.init {
+                Scheme::Torch => [1.0 / fan_in.sqrt(); 2],
+                Scheme::He => [(6.0 / fan_in).sqrt(), 0.0],
+                Scheme::Glorot => [(6.0 / (fan_in + fan_out)).sqrt(), 0.0],
             };
-            for (range, bound) in [(l.weights(), w), (l.bias(), b)] {
-                for i in range {
-                    params[i] = uniform(seed, i, bound);
-                }
-            }
+            l.init(seed, params, bounds);
         }
     }
 
