@@ -1,4 +1,4 @@
-//! The plan of methods that train a field by stochastic gradients.
+//! The plan of a neural field, which is trained by stochastic gradients.
 //!
 //! Every step draws rays, compares their integrals with the measurement by a loss (L1 in the published codes), adds the
 //! priors on small random blocks of neighbouring points, and takes an Adam step.
@@ -11,7 +11,7 @@ use crate::losses::L1;
 use crate::neural_field::NeuralField;
 use crate::pretrain::{Pretraining, learn, pretrain};
 use crate::priors::Places;
-use crate::rays::{Pixels, RayChoice, RaySource, Views, Windows};
+use crate::rays::{Pixels, RaySource, Views, Windows};
 use crate::schedule::{Clock, Ends};
 use crate::surround::Corrected;
 use crate::training::callbacks::Rollback;
@@ -21,7 +21,7 @@ use conefield_core::backend::{Executable, TrainRay};
 use conefield_core::error::{Result, ensure};
 use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::method::{
-    Context, Findings, Job, Line, Needs, Observer, Outline, Plan, PretrainJob, Solution, StageLine,
+    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, PretrainJob, Solution, StageLine, StartFile,
 };
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::registry::Registered;
@@ -29,20 +29,22 @@ use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::Scene;
 use conefield_core::settings::{Initializer, InitializerSpec, LossSpec};
 use conefield_core::trained::{Placement, TrainedField};
+use conefield_fields::initializers::mci::Mci;
 use conefield_fields::initializers::random::Random;
+use conefield_fields::initializers::volume::FromVolume;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-impl NeuralField {
-    /// Builds the remaining parts and compiles `pipeline`. `stages` describes its stages, `beside` everything else.
-    pub(crate) fn train(
-        &self,
-        pipeline: Pipeline,
-        stages: Vec<StageLine>,
-        mut beside: Vec<Line>,
-        context: &Context<'_>,
-    ) -> Result<Box<dyn Plan>> {
+impl Method for NeuralField {
+    fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
+        let pipeline = self.pipeline()?;
+        let mut stages = vec![StageLine::new("encoder", self.encoder.type_name(), pipeline.encoder.as_ref())];
+        for (i, (n, spec)) in pipeline.normalizers.iter().zip(&self.normalizers).enumerate() {
+            stages.push(StageLine::new(&format!("normalizers.{i}"), spec.type_name(), n.as_ref()));
+        }
+        stages.push(StageLine::new("field", self.field.type_name(), pipeline.field.as_ref()));
+        let mut beside = vec![Line::new("projector", self.projector.type_name(), &pipeline.projector.describe())];
         let Self { scene, optimizer, loss, priors, callbacks, .. } = self;
         let (parts, lines) = FieldParts::build(scene, optimizer, pipeline, loss.as_ref(), priors, callbacks)?;
         self.training.validate().map_err(|e| e.within("training"))?;
@@ -67,6 +69,14 @@ impl NeuralField {
             compiled: Some(exe),
             outline: Outline { method, stages, beside, compiled: Some(compiled), links: vec![] },
         }))
+    }
+
+    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
+        let initializer: Box<dyn InitializerSpec> = match file {
+            StartFile::Weights(file) => Box::new(Mci { weights: file.clone() }),
+            StartFile::Volume(file) => Box::new(FromVolume::new(file.clone())),
+        };
+        Some(("initializer".into(), serde_json::to_value(initializer).ok()?))
     }
 }
 
@@ -185,8 +195,7 @@ impl Plan for FieldPlan {
         found.iter().for_each(|line| observer.note(line));
         let corrected = Corrected::of(job, settings.surround, solid.as_ref(), observer)?;
         let job = &Corrected::job(corrected.as_ref(), job);
-        let Training { views, pixels, margin, windows, .. } = self.training;
-        let source = RaySource::new(job.scan, &scene, &pipeline, RayChoice { views, pixels, margin, windows })?;
+        let source = RaySource::new(job.scan, &scene, &pipeline, &self.training)?;
         observer.note(&format!("training uses {:.0}% of the pixels", 100.0 * source.share()));
         if let Some(whole) = source.whole_windows() {
             let none = if whole == 0 { ": all rays are single pixels" } else { "" };
