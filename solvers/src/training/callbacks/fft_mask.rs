@@ -13,6 +13,7 @@
 //!
 //! Features are evaluated at the encoder's output: channels are removed from the encoder and all later stages.
 
+use super::needs_features;
 use crate::training::run::Run;
 use crate::training::{Callback, CallbackSpec, Kept, State};
 use conefield_core::pipeline::Pipeline;
@@ -123,6 +124,7 @@ impl Callback for Masker {
     }
 
     fn check(&self, pipeline: &Pipeline) -> Result<()> {
+        needs_features(NAME, pipeline)?;
         let width = pipeline.encoder.info().output;
         if let Some(keep) = &self.settings.keep {
             let fits = keep.is_sorted_by(|a, b| a < b) && keep.last().is_some_and(|&c| c < width);
