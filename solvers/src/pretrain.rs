@@ -163,8 +163,7 @@ fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
             sums.extend(volume.data.sum_axis(Axis(axis)).iter().map(|&s| f64::from(s) * spacing));
         }
         let k = ((sums.len() as f64 * 0.995) as usize).min(sums.len() - 1);
-        let (_, top, _) = sums.select_nth_unstable_by(k, f64::total_cmp);
-        Ok(*top)
+        Ok(*sums.select_nth_unstable_by(k, f64::total_cmp).1)
     })?;
     if !(attenuation.is_finite() && attenuation > 0.0) {
         return Err(Error::invalid("volume", "values", "no attenuation", "a volume of an object that absorbs"));
