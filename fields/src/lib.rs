@@ -8,4 +8,5 @@ pub mod line_transformer;
 mod linear;
 pub mod mlp;
 pub mod normalizers;
+mod passes;
 pub mod voxel_grid;

@@ -6,6 +6,7 @@
 mod wgsl;
 
 use crate::linear::Linear;
+use crate::passes::{Backward, Forward};
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
 use conefield_core::prelude::*;
@@ -108,21 +109,13 @@ impl MlpStage {
     }
 }
 
-struct MlpForward<'a, R> {
-    stage: &'a MlpStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-    tape: TileMut<'a, R>,
-}
-
 /// Splits `data` into `[..at]` and the channels `range` after it.
 fn split<R>(data: &mut [R], range: Range<usize>, rows: usize) -> (&[R], &mut [R]) {
     let (before, rest) = data.split_at_mut(range.start * rows);
     (before, &mut rest[..range.len() * rows])
 }
 
-impl<R: Real> Op for MlpForward<'_, R> {
+impl<R: Real> Op for Forward<'_, MlpStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -148,17 +141,7 @@ impl<R: Real> Op for MlpForward<'_, R> {
     }
 }
 
-struct MlpBackward<'a, R> {
-    stage: &'a MlpStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    tape: TileMut<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
-}
-
-impl<R: Real> Op for MlpBackward<'_, R> {
+impl<R: Real> Op for Backward<'_, MlpStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -206,7 +189,7 @@ impl<R: Real> Op for MlpBackward<'_, R> {
 
 impl<R: Real> Kernel<R> for MlpStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        run(MlpForward { stage: self, params, x, y, tape });
+        run(Forward { stage: self, params, x, y, tape });
     }
 
     fn backward(
@@ -218,7 +201,7 @@ impl<R: Real> Kernel<R> for MlpStage {
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(MlpBackward { stage: self, params, x, tape, dy, grads, dx });
+        run(Backward { stage: self, params, x, tape, dy, grads, dx });
     }
 }
 

@@ -3,6 +3,7 @@
 //! Values are given at the voxel centres and interpolated trilinearly; they are constant within half a voxel of the
 //! surface. The activation follows the interpolation, so that edges can lie between voxels.
 
+use crate::passes::{Backward, Forward};
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::prelude::*;
 use conefield_core::simd::{Op, Simd, run};
@@ -89,14 +90,7 @@ impl VoxelGridStage {
     }
 }
 
-struct VoxelGridForward<'a, R> {
-    stage: &'a VoxelGridStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-}
-
-impl<R: Real> Op for VoxelGridForward<'_, R> {
+impl<R: Real> Op for Forward<'_, VoxelGridStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -116,16 +110,7 @@ impl<R: Real> Op for VoxelGridForward<'_, R> {
     }
 }
 
-struct VoxelGridBackward<'a, R> {
-    stage: &'a VoxelGridStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
-}
-
-impl<R: Real> Op for VoxelGridBackward<'_, R> {
+impl<R: Real> Op for Backward<'_, VoxelGridStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -172,20 +157,20 @@ impl<R: Real> Op for VoxelGridBackward<'_, R> {
 }
 
 impl<R: Real> Kernel<R> for VoxelGridStage {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(VoxelGridForward { stage: self, params, x, y });
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        run(Forward { stage: self, params, x, y, tape });
     }
 
     fn backward(
         &self,
         params: &[R],
         x: Tile<'_, R>,
-        _: TileMut<'_, R>,
+        tape: TileMut<'_, R>,
         dy: Tile<'_, R>,
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(VoxelGridBackward { stage: self, params, x, dy, grads, dx });
+        run(Backward { stage: self, params, x, tape, dy, grads, dx });
     }
 }
 
