@@ -105,15 +105,6 @@ pub struct Slope {
 }
 
 impl Slope {
-    /// Adds `times` another slope.
-    pub fn add(&mut self, other: &Self, times: f64) {
-        for i in 0..3 {
-            self.centre[i] += times * other.centre[i];
-            (0..3).for_each(|j| self.inverse[i][j] += times * other.inverse[i][j]);
-        }
-        self.density += times * other.density;
-    }
-
     /// Derivatives with respect to the parameters `p` of `shape`.
     pub fn by_parameters<R: Real>(&self, p: &[R], shape: &Shape) -> [f64; NUMBERS] {
         let mut out = [0.0; NUMBERS];
