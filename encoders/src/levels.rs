@@ -114,9 +114,7 @@ pub trait Level: Clone + Send + Sync + 'static {
     }
 
     /// Initializes what does not start like features. `params` are those of the level.
-    fn init(&self, features: usize, params: &mut [f32]) {
-        let _ = (features, params);
-    }
+    fn init(&self, _features: usize, _params: &mut [f32]) {}
 
     /// Multiply-adds per row.
     fn macs(features: usize) -> usize;
@@ -145,14 +143,12 @@ pub trait Level: Clone + Send + Sync + 'static {
     fn code(&self) -> String;
 
     /// Constants in WGSL besides `stage_FEATURES`.
-    fn constants(settings: &Self::Settings) -> String {
-        let _ = settings;
+    fn constants(_settings: &Self::Settings) -> String {
         String::new()
     }
 
     /// For [`Stage::describe`]: what has the features of a level, unless it is the level itself.
-    fn of(settings: &Self::Settings) -> &'static str {
-        let _ = settings;
+    fn of(_settings: &Self::Settings) -> &'static str {
         ""
     }
 
