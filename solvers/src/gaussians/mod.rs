@@ -132,7 +132,7 @@ pub struct Steps {
     pub seconds: Option<f64>,
     /// Views per step.
     pub views: usize,
-    /// Steps between records of the metrics.
+    /// Most steps between two records of the metrics; a run has at least ten.
     pub report_every: u64,
 }
 
