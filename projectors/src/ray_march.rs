@@ -39,7 +39,7 @@ pub struct RayMarch {
     /// Samples per ray; 192 if no step is given either.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<usize>,
-    /// Distance between samples in mm, instead of a count.
+    /// Distance between samples in mm, instead of a count. However short it is, a ray has at most 65,536 samples.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub step_mm: Option<f64>,
     /// Distance between samples in (shortest) voxel sides, instead of a count: the number of samples depends on a ray's
@@ -67,7 +67,7 @@ conefield_core::stage_type!(ProjectorSpec, "ray-march", RayMarch, "equal interva
 
 /// Default number of samples per ray.
 const SAMPLES: usize = 192;
-/// More samples per ray must be an error in units.
+/// More samples per ray must be an error in units: such a count is refused, and a shorter step adds no more.
 const MOST_SAMPLES: usize = 65_536;
 
 impl ProjectorSpec for RayMarch {
