@@ -82,20 +82,17 @@ impl ProjectorSpec for RayMarch {
             "end-to-end",
             "2 or more for `samples` beside it",
         )?;
-        let positive = |step: Option<f64>| step.is_none_or(|s| s.is_finite() && s > 0.0);
-        let shown = |step: Option<f64>| step.map_or(String::new(), |s| s.to_string());
         let steps = [
             ("step_mm", self.step_mm, "mm"),
             ("step_voxels", self.step_voxels, "voxels"),
             ("step_cells", self.step_cells, "cells"),
         ];
+        let mut said: Vec<&str> = self.samples.map(|_| "samples").into_iter().collect();
         for (name, step, unit) in steps {
-            let expected = format!("a positive number of {unit}");
-            ensure(positive(step), "spec", name, shown(step), expected)?;
+            let Some(step) = step else { continue };
+            ensure(step.is_finite() && step > 0.0, "spec", name, step, format!("a positive number of {unit}"))?;
+            said.push(name);
         }
-        let said =
-            self.samples.map(|_| "samples").into_iter().chain(steps.iter().filter(|s| s.1.is_some()).map(|s| s.0));
-        let said: Vec<&str> = said.collect();
         let expected = "one of samples, step_mm, step_voxels and step_cells";
         ensure(said.len() <= 1, "spec", "projector", said.join(" and "), expected)?;
         Ok(Box::new(self.clone()))
