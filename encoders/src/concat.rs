@@ -1,15 +1,8 @@
 //! Several encoders side by side: points `[n, 3]` to the channels of the first part, then of the second, and so on.
 
-use conefield_core::error::{Error, Result, ensure};
-use conefield_core::random::mix;
-use conefield_core::settings::EncoderSpec;
-use conefield_core::simd::Real;
-use conefield_core::stage::{
-    Encoder, GradKind, Grads, Info, Kernel, Parameter, Precision, Reduced, Stage, Tile, TileMut,
-};
-use conefield_core::wgsl::{Fragment, functions, hosted};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::stage::Precision;
+use conefield_core::wgsl::{functions, hosted};
 use std::fmt::Write;
 use std::ops::Range;
 use std::sync::Arc;

@@ -1,12 +1,7 @@
 //! The position itself: points `[n, 3]` to `[n, 3]`, for fields that keep their own grid and for [`crate::concat`].
 
-use conefield_core::error::{Result, ensure};
-use conefield_core::settings::EncoderSpec;
-use conefield_core::simd::Real;
-use conefield_core::stage::{Encoder, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
-use conefield_core::wgsl::{Fragment, functions};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::wgsl::functions;
 
 /// Settings of `identity`: there are none.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]

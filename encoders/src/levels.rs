@@ -5,12 +5,10 @@
 //! requested part of the gradients, names the parameters, removes channels, and calls `stage_level_forward` and
 //! `stage_level_backward` in WGSL, with the levels' settings as constants.
 
-use conefield_core::error::{Result, ensure};
-use conefield_core::random::{mix, unit};
-use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, V, load, run, store};
 use conefield_core::trilinear::slabs;
-use conefield_core::wgsl::{self, Fragment};
+use conefield_core::wgsl;
 use std::fmt::Write;
 use std::ops::{Range, RangeInclusive};
 
@@ -116,9 +114,7 @@ pub trait Level: Clone + Send + Sync + 'static {
     }
 
     /// Initializes what does not start like features. `params` are those of the level.
-    fn init(&self, features: usize, params: &mut [f32]) {
-        let _ = (features, params);
-    }
+    fn init(&self, _features: usize, _params: &mut [f32]) {}
 
     /// Multiply-adds per row.
     fn macs(features: usize) -> usize;
@@ -147,14 +143,12 @@ pub trait Level: Clone + Send + Sync + 'static {
     fn code(&self) -> String;
 
     /// Constants in WGSL besides `stage_FEATURES`.
-    fn constants(settings: &Self::Settings) -> String {
-        let _ = settings;
+    fn constants(_settings: &Self::Settings) -> String {
         String::new()
     }
 
     /// For [`Stage::describe`]: what has the features of a level, unless it is the level itself.
-    fn of(settings: &Self::Settings) -> &'static str {
-        let _ = settings;
+    fn of(_settings: &Self::Settings) -> &'static str {
         ""
     }
 
@@ -812,4 +806,32 @@ pub fn prefetch<'a, T>(table: &[T], indices: impl Iterator<Item = &'a [u32; BLOC
     }
     #[cfg(not(target_arch = "x86_64"))]
     let _ = (table, indices, n);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::b_spline_grid::BSplineGrid;
+    use crate::dense_grid::DenseGrid;
+    use crate::hash_grid::HashGrid;
+    use crate::permutohedral::Permutohedral;
+    use crate::planes::Planes;
+
+    #[test]
+    fn levels_too_fine_or_too_large_are_refused_with_words() {
+        let (large, growth) = (1 << 20, 16.0);
+        let all: [(&dyn EncoderSpec, &[&str]); 7] = [
+            (&DenseGrid { levels: 8, ..Default::default() }, &["2^31", "hash-grid"]),
+            (&DenseGrid { levels: 32, growth, base_resolution: large, ..Default::default() }, &["2^31"]),
+            (&BSplineGrid { levels: 8, ..Default::default() }, &["2^31", "hash-grid"]),
+            (&BSplineGrid { levels: 32, growth, base_resolution: large, ..Default::default() }, &["2^31"]),
+            (&HashGrid { levels: 32, ..Default::default() }, &["2^23"]),
+            (&Permutohedral { levels: 32, ..Default::default() }, &["2^22"]),
+            (&Planes { levels: 12, ..Default::default() }, &["8192"]),
+        ];
+        for (settings, words) in all {
+            let e = settings.build().err().unwrap().to_string();
+            assert!(e.contains("levels") && words.iter().all(|word| e.contains(word)), "{e}");
+        }
+    }
 }

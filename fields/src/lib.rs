@@ -8,6 +8,5 @@ pub mod line_transformer;
 mod linear;
 pub mod mlp;
 pub mod normalizers;
-#[cfg(test)]
-mod testing;
+mod passes;
 pub mod voxel_grid;

@@ -9,13 +9,8 @@ use crate::linear::Linear;
 use crate::normalizers::line_attention::{LineAttention, LineAttentionStage};
 use conefield_core::activation::{Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
-use conefield_core::error::{Result, ensure};
-use conefield_core::random::{mix, uniform};
-use conefield_core::settings::FieldSpec;
-use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Simd, run};
 use std::ops::Range;
 
 /// Settings of `line-transformer`.
@@ -306,8 +301,7 @@ impl Stage for LineTransformerStage {
     fn parameters(&self) -> Vec<Parameter> {
         let mut all = vec![];
         for (name, l) in self.linear() {
-            all.push(Parameter { name: format!("{name}.weight"), shape: vec![l.output, l.ld()], start: l.start });
-            all.push(Parameter { name: format!("{name}.bias"), shape: vec![l.output], start: l.bias().start });
+            all.extend(l.parameters(name));
         }
         for (k, start) in self.blocks.iter().enumerate() {
             let of = |p: Parameter| Parameter { name: format!("blocks.{k}.{}", p.name), start: start + p.start, ..p };
@@ -320,10 +314,7 @@ impl Stage for LineTransformerStage {
     /// Linear maps are initialized as in PyTorch.
     fn init(&self, seed: u64, params: &mut [f32]) {
         for (_, l) in self.linear() {
-            let bound = 1.0 / (l.ld() as f64).sqrt();
-            for i in l.all() {
-                params[i] = uniform(seed, i, bound);
-            }
+            l.init(seed, params, [1.0 / (l.ld() as f64).sqrt(); 2]);
         }
         for &start in &self.blocks {
             self.block.init(mix(seed, start as u64), &mut params[self.of_block(start)]);
@@ -359,7 +350,6 @@ impl Field for LineTransformerStage {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::left_out_inputs_are_zeros;
 
     #[test]
     fn the_published_network_has_its_parameter_count() {
@@ -368,12 +358,6 @@ mod tests {
         assert_eq!(stage.info().params, 33 * 32 + block + 65 * 32 + 33);
         let named: usize = stage.parameters().iter().map(|p| p.range().len()).sum();
         assert_eq!(named, stage.info().params);
-    }
-
-    #[test]
-    fn a_field_without_inputs_equals_one_that_sees_zeros_there() {
-        let settings = LineTransformer { width: 8, blocks: 2, ..Default::default() };
-        left_out_inputs_are_zeros(&LineTransformerStage::new(&settings, 6).unwrap(), &[0, 3, 4]);
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! A linear map of a field.
 
 use conefield_core::dense::WeightMatrix;
+use conefield_core::random::uniform;
+use conefield_core::stage::Parameter;
 use std::ops::Range;
 
 /// A linear map: `[output][skip + input]` weights, then biases.
@@ -34,6 +36,19 @@ impl Linear {
     /// Weights and biases.
     pub fn all(&self) -> Range<usize> {
         self.start..self.bias().end
+    }
+
+    /// Its two blocks of parameters, named after `name`.
+    pub fn parameters(&self, name: &str) -> [Parameter; 2] {
+        let block = |part: &str, shape, start| Parameter { name: format!("{name}.{part}"), shape, start };
+        [block("weight", vec![self.output, self.ld()], self.start), block("bias", vec![self.output], self.bias().start)]
+    }
+
+    /// Initializes weights and biases uniformly within these bounds.
+    pub fn init(&self, seed: u64, params: &mut [f32], bounds: [f64; 2]) {
+        for (range, bound) in [self.weights(), self.bias()].into_iter().zip(bounds) {
+            range.for_each(|i| params[i] = uniform(seed, i, bound));
+        }
     }
 
     /// The columns of the weights from `column` on.

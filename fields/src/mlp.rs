@@ -6,16 +6,11 @@
 mod wgsl;
 
 use crate::linear::Linear;
+use crate::passes::{Backward, Forward};
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
-use conefield_core::error::{Result, ensure};
-use conefield_core::random::uniform;
-use conefield_core::settings::FieldSpec;
-use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
-use conefield_core::wgsl::Fragment;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Simd, run};
 use std::ops::Range;
 
 /// Initialization of weights and biases.
@@ -114,21 +109,13 @@ impl MlpStage {
     }
 }
 
-struct MlpForward<'a, R> {
-    stage: &'a MlpStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-    tape: TileMut<'a, R>,
-}
-
 /// Splits `data` into `[..at]` and the channels `range` after it.
 fn split<R>(data: &mut [R], range: Range<usize>, rows: usize) -> (&[R], &mut [R]) {
     let (before, rest) = data.split_at_mut(range.start * rows);
     (before, &mut rest[..range.len() * rows])
 }
 
-impl<R: Real> Op for MlpForward<'_, R> {
+impl<R: Real> Op for Forward<'_, MlpStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -154,17 +141,7 @@ impl<R: Real> Op for MlpForward<'_, R> {
     }
 }
 
-struct MlpBackward<'a, R> {
-    stage: &'a MlpStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    tape: TileMut<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
-}
-
-impl<R: Real> Op for MlpBackward<'_, R> {
+impl<R: Real> Op for Backward<'_, MlpStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -212,7 +189,7 @@ impl<R: Real> Op for MlpBackward<'_, R> {
 
 impl<R: Real> Kernel<R> for MlpStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        run(MlpForward { stage: self, params, x, y, tape });
+        run(Forward { stage: self, params, x, y, tape });
     }
 
     fn backward(
@@ -224,7 +201,7 @@ impl<R: Real> Kernel<R> for MlpStage {
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(MlpBackward { stage: self, params, x, tape, dy, grads, dx });
+        run(Backward { stage: self, params, x, tape, dy, grads, dx });
     }
 }
 
@@ -242,27 +219,18 @@ impl Stage for MlpStage {
     }
 
     fn parameters(&self) -> Vec<Parameter> {
-        let mut all = vec![];
-        for (i, l) in self.layers.iter().enumerate() {
-            all.push(Parameter { name: format!("{i}.weight"), shape: vec![l.output, l.ld()], start: l.start });
-            all.push(Parameter { name: format!("{i}.bias"), shape: vec![l.output], start: l.bias().start });
-        }
-        all
+        self.layers.iter().enumerate().flat_map(|(i, l)| l.parameters(&i.to_string())).collect()
     }
 
     fn init(&self, seed: u64, params: &mut [f32]) {
         for l in &self.layers {
             let (fan_in, fan_out) = (l.ld() as f64, l.output as f64);
-            let (w, b) = match self.settings.init {
-                Scheme::Torch => (1.0 / fan_in.sqrt(), 1.0 / fan_in.sqrt()),
-                Scheme::He => ((6.0 / fan_in).sqrt(), 0.0),
-                Scheme::Glorot => ((6.0 / (fan_in + fan_out)).sqrt(), 0.0),
+            let bounds = match self.settings.init {
+                Scheme::Torch => [1.0 / fan_in.sqrt(); 2],
+                Scheme::He => [(6.0 / fan_in).sqrt(), 0.0],
+                Scheme::Glorot => [(6.0 / (fan_in + fan_out)).sqrt(), 0.0],
             };
-            for (range, bound) in [(l.weights(), w), (l.bias(), b)] {
-                for i in range {
-                    params[i] = uniform(seed, i, bound);
-                }
-            }
+            l.init(seed, params, bounds);
         }
     }
 
@@ -302,7 +270,6 @@ impl Field for MlpStage {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::left_out_inputs_are_zeros;
 
     #[test]
     fn the_published_shapes_have_their_parameter_counts() {
@@ -312,65 +279,5 @@ mod tests {
         assert_eq!(count(&naf, 32), 33 * 32 + 33 * 32 + 65 * 32 + 33);
         let m = MlpStage::new(&Mlp::default(), 20).unwrap();
         assert_eq!(m.describe(), "mlp: 20→32→32→(+20)→32→1, gelu and squareplus");
-    }
-
-    #[test]
-    fn a_field_without_inputs_equals_one_that_sees_zeros_there() {
-        left_out_inputs_are_zeros(&MlpStage::new(&Mlp { width: 9, ..Mlp::default() }, 6).unwrap(), &[0, 3, 4]);
-    }
-
-    /// Output and gradients against central differences of the f64 kernel, for every activation.
-    #[test]
-    fn gradients_match_finite_differences() {
-        use Activation::*;
-        for act in [None, Gelu, Squareplus, Softplus, Sigmoid, LeakyRelu] {
-            let m = MlpStage::new(
-                &Mlp { width: 5, depth: 4, skips: vec![1, 2], activation: act, output: act, init: Scheme::He },
-                3,
-            )
-            .unwrap();
-            let info = m.info();
-            let mut p32 = vec![0.0; info.params];
-            m.init(11, &mut p32);
-            let mut p: Vec<f64> = p32.iter().map(|&v| f64::from(v)).collect();
-            let n = 4;
-            let mut x: Vec<f64> = (0..3 * n).map(|i| (i as f64 * 1.3).cos()).collect();
-            let dy: Vec<f64> = (0..n).map(|i| 1.0 + i as f64).collect();
-            let k = m.reference().unwrap();
-            let loss = |p: &[f64], x: &[f64]| {
-                let (mut y, mut tape) = (vec![0.0; n], vec![0.0; info.tape * n]);
-                k.forward(p, Tile::new(x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
-                (y.iter().zip(&dy).map(|(a, b)| a * b).sum::<f64>(), tape)
-            };
-            let (_, mut tape) = loss(&p, &x);
-            let (mut g, mut dx) = (vec![0.0; info.params], vec![0.0; 3 * n]);
-            k.backward(
-                &p,
-                Tile::new(&x, n),
-                TileMut::new(&mut tape, n),
-                Tile::new(&dy, n),
-                Grads::all(&mut g),
-                Some(TileMut::new(&mut dx, n)),
-            );
-            let h = 1e-6;
-            for i in 0..info.params {
-                let keep = p[i];
-                p[i] = keep + h;
-                let up = loss(&p, &x).0;
-                p[i] = keep - h;
-                let want = (up - loss(&p, &x).0) / (2.0 * h);
-                p[i] = keep;
-                assert!((g[i] - want).abs() < 1e-6 * (1.0 + want.abs()), "{act:?} param {i}: {} {want}", g[i]);
-            }
-            for i in 0..3 * n {
-                let keep = x[i];
-                x[i] = keep + h;
-                let up = loss(&p, &x).0;
-                x[i] = keep - h;
-                let want = (up - loss(&p, &x).0) / (2.0 * h);
-                x[i] = keep;
-                assert!((dx[i] - want).abs() < 1e-6 * (1.0 + want.abs()), "{act:?} input {i}: {} {want}", dx[i]);
-            }
-        }
     }
 }

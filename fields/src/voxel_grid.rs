@@ -3,15 +3,12 @@
 //! Values are given at the voxel centres and interpolated trilinearly; they are constant within half a voxel of the
 //! surface. The activation follows the interpolation, so that edges can lie between voxels.
 
+use crate::passes::{Backward, Forward};
 use conefield_core::activation::{self, Activation, activate};
-use conefield_core::error::{Error, Result, ensure};
-use conefield_core::settings::FieldSpec;
-use conefield_core::simd::{Op, Real, Simd, run};
-use conefield_core::stage::{Field, GradKind, Grads, Info, Kernel, Parameter, Reduced, Stage, Tile, TileMut};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Simd, run};
 use conefield_core::trilinear::{BLOCK, Grid, Located};
-use conefield_core::wgsl::{Fragment, TRILINEAR};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::wgsl::TRILINEAR;
 use std::ops::Range;
 
 /// Number of voxels along the unit cube's sides.
@@ -91,26 +88,9 @@ impl VoxelGridStage {
         ensure(settings.init.is_finite(), "spec", "init", settings.init, "a finite number")?;
         Ok(Self { grid: Grid::centres(axes.map(|n| n as usize)), output: settings.output, init: settings.init as f32 })
     }
-
-    /// Voxels along x, y, z.
-    pub fn side(&self) -> [usize; 3] {
-        self.grid.side()
-    }
-
-    /// Disjoint ranges of voxels, of at least about `most` each.
-    pub fn slabs(&self, most: usize) -> Vec<Range<usize>> {
-        self.grid.slabs(most)
-    }
 }
 
-struct VoxelGridForward<'a, R> {
-    stage: &'a VoxelGridStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-}
-
-impl<R: Real> Op for VoxelGridForward<'_, R> {
+impl<R: Real> Op for Forward<'_, VoxelGridStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -130,16 +110,7 @@ impl<R: Real> Op for VoxelGridForward<'_, R> {
     }
 }
 
-struct VoxelGridBackward<'a, R> {
-    stage: &'a VoxelGridStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
-}
-
-impl<R: Real> Op for VoxelGridBackward<'_, R> {
+impl<R: Real> Op for Backward<'_, VoxelGridStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -186,20 +157,20 @@ impl<R: Real> Op for VoxelGridBackward<'_, R> {
 }
 
 impl<R: Real> Kernel<R> for VoxelGridStage {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(VoxelGridForward { stage: self, params, x, y });
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
+        run(Forward { stage: self, params, x, y, tape });
     }
 
     fn backward(
         &self,
         params: &[R],
         x: Tile<'_, R>,
-        _: TileMut<'_, R>,
+        tape: TileMut<'_, R>,
         dy: Tile<'_, R>,
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(VoxelGridBackward { stage: self, params, x, dy, grads, dx });
+        run(Backward { stage: self, params, x, tape, dy, grads, dx });
     }
 }
 

@@ -12,6 +12,7 @@
 
 pub mod chain;
 pub mod fdk;
+mod field_parts;
 pub mod field_plan;
 pub mod fit;
 pub mod gaussians;

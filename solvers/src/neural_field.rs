@@ -5,16 +5,13 @@ use crate::optimizer::Optimizer;
 use crate::pretrain::Pretraining;
 use crate::training::CallbackSpec;
 use conefield_core::error::Result;
-use conefield_core::method::StartFile;
-use conefield_core::method::{Context, Line, Method, Plan, StageLine};
+use conefield_core::method::Method;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::scene::SceneSettings;
 use conefield_core::settings::{
     EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
 };
 use conefield_core::spec::stage;
-use conefield_fields::initializers::mci::Mci;
-use conefield_fields::initializers::volume::FromVolume;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -67,30 +64,9 @@ pub struct NeuralField {
 
 conefield_core::stage_type!(Method, "neural-field", NeuralField, "a neural attenuation field, trained on rays");
 
-impl Method for NeuralField {
-    fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
-        let pipeline = self.pipeline()?;
-        let mut stages = vec![StageLine::new("encoder", self.encoder.type_name(), pipeline.encoder.as_ref())];
-        for (i, (n, spec)) in pipeline.normalizers.iter().zip(&self.normalizers).enumerate() {
-            stages.push(StageLine::new(&format!("normalizers.{i}"), spec.type_name(), n.as_ref()));
-        }
-        stages.push(StageLine::new("field", self.field.type_name(), pipeline.field.as_ref()));
-        let projector = Line::new("projector", self.projector.type_name(), &pipeline.projector.describe());
-        self.train(pipeline, stages, vec![projector], context)
-    }
-
-    fn start_setting(&self, file: &StartFile) -> Option<(String, serde_json::Value)> {
-        let initializer: Box<dyn InitializerSpec> = match file {
-            StartFile::Weights(file) => Box::new(Mci { weights: file.clone() }),
-            StartFile::Volume(file) => Box::new(FromVolume::new(file.clone())),
-        };
-        Some(("initializer".into(), serde_json::to_value(initializer).ok()?))
-    }
-}
-
 impl NeuralField {
     /// Builds the stages and connects them.
-    fn pipeline(&self) -> Result<Pipeline> {
+    pub(crate) fn pipeline(&self) -> Result<Pipeline> {
         let encoder = self.encoder.build().map_err(|e| e.within("encoder"))?;
         let mut width = encoder.info().output;
         let mut normalizers = vec![];

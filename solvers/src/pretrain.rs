@@ -41,7 +41,8 @@ impl Default for Pretraining {
 impl Pretraining {
     /// Refuses invalid settings.
     pub fn validate(&self) -> Result<()> {
-        ensure((1..=1 << 22).contains(&self.points), "spec", "points", self.points, "1 to 2^22")
+        ensure((1..=1 << 22).contains(&self.points), "spec", "points", self.points, "1 to 2^22")?;
+        ensure(self.steps > 0, "spec", "steps", 0, "at least 1: without a step the field stays untrained")
     }
 }
 
@@ -162,8 +163,7 @@ fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
             sums.extend(volume.data.sum_axis(Axis(axis)).iter().map(|&s| f64::from(s) * spacing));
         }
         let k = ((sums.len() as f64 * 0.995) as usize).min(sums.len() - 1);
-        let (_, top, _) = sums.select_nth_unstable_by(k, f64::total_cmp);
-        Ok(*top)
+        Ok(*sums.select_nth_unstable_by(k, f64::total_cmp).1)
     })?;
     if !(attenuation.is_finite() && attenuation > 0.0) {
         return Err(Error::invalid("volume", "values", "no attenuation", "a volume of an object that absorbs"));
@@ -179,5 +179,22 @@ fn draw(volume: &Volume, scene: &Scene, seed: u64, step: u64, count: usize, out:
     for _ in 0..count {
         let index: [usize; 3] = std::array::from_fn(|k| rng.random_range(0..shape[k]));
         out.push((scene.voxel(index), (f64::from(volume.data[index]) / scene.attenuation) as f32));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_that_train_nothing_are_refused() {
+        let settings = Pretraining::default();
+        assert!(settings.validate().is_ok());
+        for (wrong, key) in
+            [(Pretraining { points: 0, ..settings.clone() }, "points"), (Pretraining { steps: 0, ..settings }, "steps")]
+        {
+            let e = wrong.validate().unwrap_err().to_string();
+            assert!(e.contains(key), "{e}");
+        }
     }
 }

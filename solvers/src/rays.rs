@@ -1,5 +1,6 @@
 //! Selection of the rays of a training step.
 
+use crate::field_plan::Training;
 use crate::shadow::{air_level, shadow};
 use conefield_core::backend::TrainRay;
 use conefield_core::error::{Error, Result, ensure};
@@ -91,19 +92,6 @@ impl Windows {
     }
 }
 
-/// Selection of the training rays of a scan.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RayChoice {
-    /// Views from which rays are taken.
-    pub views: Views,
-    /// Pixels that may be used.
-    pub pixels: Pixels,
-    /// Pixels by which the support is wider than the shadow.
-    pub margin: usize,
-    /// Windows, if some rays are drawn in windows.
-    pub windows: Option<Windows>,
-}
-
 /// The training rays of a scan.
 pub struct RaySource<'a> {
     scan: &'a Scan,
@@ -125,8 +113,8 @@ impl<'a> RaySource<'a> {
     }
 
     /// Finds the usable pixels.
-    pub fn new(scan: &'a Scan, scene: &'a Scene, pipeline: &Pipeline, choice: RayChoice) -> Result<Self> {
-        let RayChoice { views, pixels: which, margin, windows } = choice;
+    pub fn new(scan: &'a Scan, scene: &'a Scene, pipeline: &Pipeline, training: &Training) -> Result<Self> {
+        let Training { views, pixels: which, margin, windows, .. } = *training;
         let level = (which == Pixels::Support).then(|| air_level(scan));
         let pixels: Vec<Vec<u32>> = parallel::map(0..scan.geometry.views.len(), |_, v| {
             let view = scan.view(v);

@@ -2,47 +2,45 @@
 
 use conefield_core::finite::range;
 use conefield_core::scan::Scan;
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, ArrayView2, s};
 
 /// Upper limit of smoothed pixels in air: the noise's standard deviation, estimated from differences of neighbouring
 /// pixels, or 1/500 of the largest values, whichever is larger.
 pub fn air_level(scan: &Scan) -> f32 {
     let top = range(&scan.projections)[1].max(0.0);
-    let mut differences: Vec<f32> = scan
-        .projections
-        .outer_iter()
-        .flat_map(|view| {
-            let low = move |x: f32| x < 0.1 * top;
-            view.rows()
-                .into_iter()
-                .flat_map(|row| row.windows(2).into_iter().map(|w| (w[0], w[1])).collect::<Vec<_>>())
-                .filter(|&(a, b)| low(a) && low(b))
-                .map(|(a, b)| (a - b).abs())
-                .step_by(7)
-                .collect::<Vec<_>>()
-        })
-        .collect();
+    let some = |view| dark_differences(view, top).into_iter().step_by(7);
+    let mut differences: Vec<f32> = scan.projections.outer_iter().flat_map(some).collect();
     let sigma = if differences.len() < 100 {
         0.0
     } else {
         // The median of |a − b| of two equal normals is 0.6745·√2·σ, but pixels clipped at zero cause ties at 0. So the
         // 75th percentile is used: 1.150·√2·σ.
         let k = differences.len() * 3 / 4;
-        let (_, q, _) = differences.select_nth_unstable_by(k, f32::total_cmp);
-        *q / (1.150 * std::f32::consts::SQRT_2)
+        *differences.select_nth_unstable_by(k, f32::total_cmp).1 / (1.150 * std::f32::consts::SQRT_2)
     };
     sigma.max(top / 500.0)
+}
+
+/// Differences of neighbours along the rows of `image` that are both below a tenth of `top`.
+pub fn dark_differences(image: ArrayView2<'_, f32>, top: f32) -> Vec<f32> {
+    let dark = |x: f32| x < 0.1 * top;
+    let pairs = image.slice(s![.., ..-1]).into_iter().zip(image.slice(s![.., 1..]));
+    pairs.filter(|&(a, b)| dark(*a) && dark(*b)).map(|(a, b)| (a - b).abs()).collect()
 }
 
 /// Pixels whose 7 × 7 neighbourhood has a mean above `level`, dilated by `margin` pixels.
 pub fn shadow(view: ArrayView2<'_, f32>, level: f32, margin: usize) -> Array2<bool> {
     let smooth = box_filter(view.to_owned(), 3, |window| window.iter().sum::<f32>() / window.len() as f32);
-    let hit = smooth.mapv(|x| f32::from(u8::from(x > level)));
-    box_filter(hit, margin, |window| window.iter().copied().fold(0.0, f32::max)).mapv(|x| x > 0.0)
+    dilated(smooth.mapv(|x| x > level), margin)
+}
+
+/// The marked pixels and all within ± `margin` of them along rows and columns.
+pub fn dilated(marked: Array2<bool>, margin: usize) -> Array2<bool> {
+    box_filter(marked, margin, |window| window.contains(&true))
 }
 
 /// Applies `f` to windows of ± `reach` along rows, then along columns; windows are clipped at the border.
-pub fn box_filter(mut image: Array2<f32>, reach: usize, f: impl Fn(&[f32]) -> f32) -> Array2<f32> {
+fn box_filter<T: Copy>(mut image: Array2<T>, reach: usize, f: impl Fn(&[T]) -> T) -> Array2<T> {
     for axis in [1, 0] {
         for mut lane in image.lanes_mut(ndarray::Axis(axis)) {
             let line = lane.to_vec();

@@ -6,7 +6,7 @@
 //! noise hides in some views stays. A view whose borders the object reaches is ignored, because its air level is
 //! unknown. Neighbours of remaining cells stay too.
 
-use crate::shadow::box_filter;
+use crate::shadow::{dark_differences, dilated};
 use conefield_core::geometry::{Vec3, VoxelGrid};
 use conefield_core::parallel;
 use conefield_core::scan::Scan;
@@ -110,7 +110,6 @@ pub fn carve(scan: &Scan) -> CarvedSupport {
     let half = 0.5 * cells.spacing.iter().map(|s| s * s).sum::<f64>().sqrt();
     let views: Vec<ViewShadow> = parallel::map(&blocks.means, |v, means| {
         let pinhole = Pinhole::of(g, v);
-        let object = means.mapv(|m| m > level);
         let nearest = corners(&cells).into_iter().map(|p| pinhole.project(p).1).fold(f64::INFINITY, f64::min);
         if blocks.cut(v, 1) || nearest <= 0.0 {
             return None;
@@ -118,10 +117,7 @@ pub fn carve(scan: &Scan) -> CarvedSupport {
         let w = &g.views[v];
         let pitch = [w.u, w.v].map(|a| a.iter().map(|x| x * x).sum::<f64>().sqrt());
         let reach = half * pinhole.distance / nearest / (pitch[0].min(pitch[1]) * size as f64);
-        let wide = box_filter(object.mapv(|o| f32::from(u8::from(o))), 1 + reach.ceil() as usize, |window| {
-            window.iter().copied().fold(0.0, f32::max)
-        });
-        Some(ViewShadow { pinhole, object: wide.mapv(|x| x > 0.0) })
+        Some(ViewShadow { pinhole, object: dilated(means.mapv(|m| m > level), 1 + reach.ceil() as usize) })
     })
     .into_iter()
     .flatten()
@@ -191,35 +187,27 @@ fn reached(side: ArrayView1<'_, f32>, air: f32, deviation: f32, top: f32) -> boo
 /// The standard deviation of block means in air, from the median difference of dark neighbours, which edges hardly
 /// change. Block means are nearly normal even if noise was clipped at 0.
 fn deviation(blocks: &[Array2<f32>], top: f32) -> f32 {
-    let dark = |x: f32| x < 0.1 * top;
-    let pairs = blocks.iter().flat_map(|b| b.rows()).flat_map(|row| {
-        let next = row.to_vec();
-        row.into_iter().copied().zip(next.into_iter().skip(1)).collect::<Vec<_>>()
-    });
-    let mut all: Vec<f32> = pairs.filter(|&(a, b)| dark(a) && dark(b)).map(|(a, b)| (a - b).abs()).collect();
+    let mut all: Vec<f32> = blocks.iter().flat_map(|b| dark_differences(b.view(), top)).collect();
     if all.is_empty() {
         return 0.0;
     }
     let k = all.len() / 2;
-    let (_, middle, _) = all.select_nth_unstable_by(k, f32::total_cmp);
     // The median of |a − b| of two normals with deviation s is 0.954·s.
-    *middle / 0.954
+    *all.select_nth_unstable_by(k, f32::total_cmp).1 / 0.954
 }
 
 /// The air level of block means, if there is air: the median of the values close to the lowest one.
 fn air(blocks: &[Array2<f32>], deviation: f32, top: f32) -> Option<f32> {
     let mut all: Vec<f32> = blocks.iter().flatten().copied().collect();
     let k = all.len() / 20;
-    let (_, low, _) = all.select_nth_unstable_by(k, f32::total_cmp);
-    let low = *low;
+    let low = *all.select_nth_unstable_by(k, f32::total_cmp).1;
     // Noise clipped at 0 has a mean above 0, but well below its standard deviation over single pixels.
     if !(low.is_finite() && top > 0.0) || low > 2.0 * deviation + 0.01 * top {
         return None;
     }
     let mut close: Vec<f32> = all.into_iter().filter(|m| *m <= low + 4.0 * deviation + 1e-3 * top).collect();
     let k = close.len() / 2;
-    let (_, middle, _) = close.select_nth_unstable_by(k, f32::total_cmp);
-    Some(*middle)
+    Some(*close.select_nth_unstable_by(k, f32::total_cmp).1)
 }
 
 /// Nearly cubic cells that fill the volume.

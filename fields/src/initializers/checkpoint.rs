@@ -1,11 +1,7 @@
 //! All weights from a file, to continue training or rendering a model of an earlier run.
 
-use conefield_core::arena::{Arena, InitReport, Layout, Weights};
-use conefield_core::error::{Result, ensure};
 use conefield_core::input_file::InputFile;
-use conefield_core::settings::{Initializer, InitializerSpec};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Settings of `checkpoint`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -25,29 +21,56 @@ conefield_core::stage_type!(
 
 impl InitializerSpec for CheckpointSettings {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
-        ensure(!self.weights.is_empty(), "spec", "weights", "no name", "a weights file")?;
-        Ok(Box::new(CheckpointInitializer { path: self.weights.to_string(), weights: weights(&self.weights)? }))
+        FromWeights::read(&self.weights, weights, true)
     }
 }
 
-/// The initializer that [`CheckpointSettings`] builds.
-#[derive(Debug, Clone, PartialEq)]
-pub struct CheckpointInitializer {
+/// Fills parameters from a weights file: all, or all but those of the encoder.
+pub(crate) struct FromWeights {
     path: String,
     weights: Weights,
+    encoder: bool,
 }
 
-impl Initializer for CheckpointInitializer {
+impl FromWeights {
+    /// Reads `file`; `encoder` says whether the encoder is filled, too.
+    pub fn read(
+        file: &InputFile,
+        weights: &dyn Fn(&str) -> Result<Weights>,
+        encoder: bool,
+    ) -> Result<Box<dyn Initializer>> {
+        ensure(!file.is_empty(), "spec", "weights", "no name", "a weights file")?;
+        Ok(Box::new(Self { path: file.to_string(), weights: weights(file)?, encoder }))
+    }
+
+    /// Whether a block of this name is filled.
+    fn takes(&self, name: &str) -> bool {
+        self.encoder || !name.starts_with("encoder.")
+    }
+}
+
+impl Initializer for FromWeights {
     fn check(&self, layout: &Layout) -> Result<()> {
-        self.weights.check(&self.path, layout, |_| true).map(drop)
+        if !self.encoder && !layout.blocks.iter().any(|b| self.takes(&b.name)) {
+            return Err(Error::unsupported("mci", "neither normalizers nor field of this pipeline have weights"));
+        }
+        self.weights.check(&self.path, layout, |name| self.takes(name)).map(drop)
     }
 
     fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {
-        self.weights.load(&self.path, layout, &mut arena.params, |_| true)
+        self.check(layout)?;
+        let mut report = self.weights.load(&self.path, layout, &mut arena.params, |name| self.takes(name))?;
+        for (_, why) in &mut report.fresh {
+            *why = "the encoder starts afresh".into();
+        }
+        Ok(report)
     }
 
     fn describe(&self) -> String {
-        format!("checkpoint: every weight from {}", self.path)
+        match (self.encoder, &self.path) {
+            (true, path) => format!("checkpoint: every weight from {path}"),
+            (false, path) => format!("mci: normalizers and field from {path}, a fresh encoder"),
+        }
     }
 }
 
@@ -55,7 +78,6 @@ impl Initializer for CheckpointInitializer {
 mod tests {
     use super::*;
     use conefield_core::arena::Block;
-    use conefield_core::error::Error;
 
     #[test]
     fn everything_is_loaded_and_a_missing_file_is_reported() {

@@ -4,12 +4,9 @@
 //! Loads the weights of the normalizers and the field, that is every block whose name does not start with `encoder.`.
 //! Refuses a file that lacks a block or has it in another shape.
 
-use conefield_core::arena::{Arena, InitReport, Layout, Weights};
-use conefield_core::error::{Error, Result, ensure};
+use super::checkpoint::FromWeights;
 use conefield_core::input_file::InputFile;
-use conefield_core::settings::{Initializer, InitializerSpec};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Settings of `mci`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -29,42 +26,7 @@ conefield_core::stage_type!(
 
 impl InitializerSpec for Mci {
     fn build(&self, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {
-        ensure(!self.weights.is_empty(), "spec", "weights", "no name", "a weights file")?;
-        Ok(Box::new(MciInitializer { path: self.weights.to_string(), weights: weights(&self.weights)? }))
-    }
-}
-
-/// Whether a block of this name is loaded.
-fn takes(name: &str) -> bool {
-    !name.starts_with("encoder.")
-}
-
-/// The initializer that [`Mci`] builds.
-#[derive(Debug, Clone, PartialEq)]
-pub struct MciInitializer {
-    path: String,
-    weights: Weights,
-}
-
-impl Initializer for MciInitializer {
-    fn check(&self, layout: &Layout) -> Result<()> {
-        if !layout.blocks.iter().any(|b| takes(&b.name)) {
-            return Err(Error::unsupported("mci", "neither normalizers nor field of this pipeline have weights"));
-        }
-        self.weights.check(&self.path, layout, takes).map(drop)
-    }
-
-    fn apply(&self, layout: &Layout, arena: &mut Arena) -> Result<InitReport> {
-        self.check(layout)?;
-        let mut report = self.weights.load(&self.path, layout, &mut arena.params, takes)?;
-        for (_, why) in &mut report.fresh {
-            *why = "the encoder starts afresh".into();
-        }
-        Ok(report)
-    }
-
-    fn describe(&self) -> String {
-        format!("mci: normalizers and field from {}, a fresh encoder", self.path)
+        FromWeights::read(&self.weights, weights, false)
     }
 }
 

@@ -1,10 +1,6 @@
 //! Seeded random initialization of every stage by its own scheme.
 
-use conefield_core::arena::{Arena, InitReport, Layout, Weights};
-use conefield_core::error::Result;
-use conefield_core::settings::{Initializer, InitializerSpec};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Settings of `random`: none, as the schemes belong to the stages.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]

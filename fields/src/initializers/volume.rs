@@ -1,12 +1,9 @@
 //! A known volume as the start: another method's result, or an earlier scan of the same object. The field is trained on
 //! it voxel by voxel for some steps before it sees the scan.
 
-use conefield_core::arena::{Arena, InitReport, Layout, Weights};
-use conefield_core::error::{Result, ensure};
 use conefield_core::input_file::InputFile;
-use conefield_core::settings::{Initializer, InitializerSpec, KnownVolume};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::settings::KnownVolume;
 
 /// Settings of `volume`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -6,14 +6,11 @@
 //! rounding. A row whose largest magnitude would overflow when squared is first scaled down by a power of two. This
 //! changes only the influence of `eps`, which is then far below rounding.
 
+use crate::passes::Forward;
 use conefield_core::dense::total;
-use conefield_core::error::{Result, ensure};
-use conefield_core::settings::NormalizerSpec;
-use conefield_core::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Stage, Tile, TileMut};
-use conefield_core::wgsl::{Fragment, Sum, declare};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::wgsl::{Sum, declare};
 
 /// Settings of `layer-norm`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -80,15 +77,7 @@ fn huge<R: Real>() -> [R; 3] {
     powers.map(|p| R::of(f64::powi(2.0, p)))
 }
 
-struct LayerNormForward<'a, R> {
-    stage: &'a LayerNormStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-    tape: TileMut<'a, R>,
-}
-
-impl<R: Real> Op for LayerNormForward<'_, R> {
+impl<R: Real> Op for Forward<'_, LayerNormStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -215,7 +204,7 @@ impl<R: Real> Op for LayerNormBackward<'_, R> {
 
 impl<R: Real> Kernel<R> for LayerNormStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        run(LayerNormForward { stage: self, params, x, y, tape });
+        run(Forward { stage: self, params, x, y, tape });
     }
 
     fn backward(

@@ -9,15 +9,11 @@
 //! levels are combined. Here the input is a linear map of the features, and levels stay separate. The publication's
 //! additional training target of the attention (from gradients of the attenuation, and uncertainty) is not included.
 
+use crate::passes::{Backward, Forward};
 use conefield_core::dense::{Output as Into, WeightMatrix, affine, affine_input, affine_weights};
-use conefield_core::error::{Result, ensure};
-use conefield_core::random::{mix, unit};
-use conefield_core::settings::NormalizerSpec;
-use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
-use conefield_core::stage::{GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Stage, Tile, TileMut};
-use conefield_core::wgsl::{Fragment, Sum, declare, functions};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, V, load, run, store};
+use conefield_core::wgsl::{Sum, declare, functions};
 use std::fmt::Write;
 
 /// Settings of `level-attention`.
@@ -84,16 +80,8 @@ impl LevelAttentionStage {
     }
 }
 
-struct LevelAttentionForward<'a, R> {
-    stage: &'a LevelAttentionStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-    /// The weights of the levels.
-    tape: TileMut<'a, R>,
-}
-
-impl<R: Real> Op for LevelAttentionForward<'_, R> {
+/// The tape holds the weights of the levels.
+impl<R: Real> Op for Forward<'_, LevelAttentionStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -128,17 +116,7 @@ impl<R: Real> Op for LevelAttentionForward<'_, R> {
     }
 }
 
-struct LevelAttentionBackward<'a, R> {
-    stage: &'a LevelAttentionStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    tape: TileMut<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
-}
-
-impl<R: Real> Op for LevelAttentionBackward<'_, R> {
+impl<R: Real> Op for Backward<'_, LevelAttentionStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
@@ -182,7 +160,7 @@ impl<R: Real> Op for LevelAttentionBackward<'_, R> {
 
 impl<R: Real> Kernel<R> for LevelAttentionStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        run(LevelAttentionForward { stage: self, params, x, y, tape });
+        run(Forward { stage: self, params, x, y, tape });
     }
 
     fn backward(
@@ -194,7 +172,7 @@ impl<R: Real> Kernel<R> for LevelAttentionStage {
         grads: Grads<'_, R>,
         dx: Option<TileMut<'_, R>>,
     ) {
-        run(LevelAttentionBackward { stage: self, params, x, tape, dy, grads, dx });
+        run(Backward { stage: self, params, x, tape, dy, grads, dx });
     }
 }
 

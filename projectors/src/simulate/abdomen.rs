@@ -1,6 +1,6 @@
 //! The abdomen phantom, painted from the skin inwards. The unit is 200 mm; the belly faces -y, the liver is at -x.
 
-use super::paint::{Paint, ball, block, cone, ellipsoid, path, tube};
+use super::paint::{Paint, ball, block, both, cone, ellipsoid, path, tube};
 use conefield_core::geometry::Vec3;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -17,10 +17,6 @@ const CORTICAL: f64 = 0.75;
 pub(super) fn abdomen() -> Vec<Paint> {
     let mut random = ChaCha8Rng::seed_from_u64(0x6162_646f);
     [wall(), bowel(&mut random), organs(), spine_and_ribs(), vessels(&mut random)].concat()
-}
-
-fn both(make: impl Fn(f64) -> Vec<Paint>) -> Vec<Paint> {
-    [make(-1.0), make(1.0)].concat()
 }
 
 fn wall() -> Vec<Paint> {

@@ -1,6 +1,6 @@
 //! The head phantom, painted from the skin inwards. The unit is about 128 mm; the face is towards -y.
 
-use super::paint::{Paint, ball, block, cone, ellipsoid, path, tube};
+use super::paint::{Paint, ball, block, both, cone, ellipsoid, path, tube};
 use conefield_core::geometry::Vec3;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -35,11 +35,6 @@ pub(super) fn head() -> Vec<Paint> {
         inserts(),
     ]
     .concat()
-}
-
-/// Makes a part on the right (-x) and on the left.
-fn both(make: impl Fn(f64) -> Vec<Paint>) -> Vec<Paint> {
-    [make(-1.0), make(1.0)].concat()
 }
 
 fn skin_and_neck() -> Vec<Paint> {

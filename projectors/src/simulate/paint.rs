@@ -57,6 +57,11 @@ pub(super) fn path(points: &[Vec3], radius: f64, value: f64) -> Vec<Paint> {
     points.windows(2).map(|p| tube(p[0], p[1], radius, value)).collect()
 }
 
+/// Makes a part on the right (-x) and on the left.
+pub(super) fn both(make: impl Fn(f64) -> Vec<Paint>) -> Vec<Paint> {
+    [make(-1.0), make(1.0)].concat()
+}
+
 impl Paint {
     fn new(solid: Solid, value: f64) -> Self {
         Self { solid, turn: UPRIGHT, value, cuts: Vec::new(), wave: None, texture: Texture::Even }

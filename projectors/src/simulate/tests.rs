@@ -1,7 +1,7 @@
 //! Compares line integrals with closed forms and with an exact scan, and noise with its statistics.
 
 use super::*;
-use conefield_core::geometry::{Millimetres, Radians, Ray, Vec3, View, VoxelGrid};
+use conefield_core::geometry::{Millimetres, Radians, Vec3, View, VoxelGrid};
 use ndarray::{Array2, Array3};
 use std::path::PathBuf;
 
@@ -20,48 +20,18 @@ fn relative_error(found: &Array3<f32>, exact: &Array3<f32>) -> f64 {
     (error / exact.iter().copied().map(square).sum::<f64>()).sqrt()
 }
 
-const ELLIPSOIDS: [(Vec3, Vec3, f64); 2] =
-    [([0.1, -0.05, 0.0], [0.6, 0.45, 0.7], 0.8), ([-0.2, 0.1, 0.25], [0.2, 0.15, 0.25], -0.3)];
+const BODIES: [Ellipsoid; 2] = [
+    Ellipsoid { center: [0.1, -0.05, 0.0], axes: [0.6, 0.45, 0.7], value: 0.8 },
+    Ellipsoid { center: [-0.2, 0.1, 0.25], axes: [0.2, 0.15, 0.25], value: -0.3 },
+];
 
-fn chord(ray: &Ray, center: Vec3, radii: Vec3) -> f64 {
-    let (mut a, mut b, mut c) = (0.0, 0.0, -1.0);
-    for k in 0..3 {
-        let (o, d) = ((ray.origin[k] - center[k]) / radii[k], ray.direction[k] / radii[k]);
-        a += d * d;
-        b += o * d;
-        c += o * o;
-    }
-    2.0 * (b * b - a * c).max(0.0).sqrt() / a
-}
-
-/// Ellipsoids in voxels, each the mean of 4³ points.
-fn ellipsoids(n: usize) -> Volume {
-    let grid = grid(n);
-    let data = Array3::from_shape_fn(grid.shape, |(i, j, k)| {
-        let p = grid.voxel([i, j, k]);
-        let mut sum = 0.0;
-        for s in 0..64 {
-            let s = [s % 4, s / 4 % 4, s / 16].map(|s| (f64::from(s) + 0.5) / 4.0 - 0.5);
-            for (center, radii, value) in ELLIPSOIDS {
-                let r: f64 = (0..3).map(|a| ((p[a] + s[a] * grid.spacing[a] - center[a]) / radii[a]).powi(2)).sum();
-                sum += if r < 1.0 { value } else { 0.0 };
-            }
-        }
-        (sum / 64.0) as f32
-    });
-    Volume { data, grid, affine: None }
-}
-
-/// Relative error of the projections of `ellipsoids(n)`, moved by `shift` voxels, relative to the chords.
+/// Relative error of the projections of the bodies in `n³` voxels, moved by `shift` voxels, relative to the chords.
 fn chord_error(n: usize, shift: Vec3) -> f64 {
-    let mut volume = ellipsoids(n);
+    let mut volume = ellipsoids(&BODIES, &grid(n));
     let geometry = Protocol::r2(&volume.grid).with_detector([40, 48]).with_views(5).geometry(&volume.grid).unwrap();
     volume.grid.center = shift.map(|s| s * volume.grid.spacing[0]);
-    let exact = Array3::from_shape_fn((5, 40, 48), |(v, r, c)| {
-        let ray = geometry.ray(v, r, c);
-        ELLIPSOIDS.iter().map(|&(center, radii, value)| value * chord(&ray, center, radii)).sum::<f64>() as f32
-    });
-    relative_error(&project(&volume, &geometry, 2.0).unwrap(), &exact)
+    let found = project(&volume, &geometry, 2.0).unwrap();
+    relative_error(&found, &scan_ellipsoids(&BODIES, geometry).projections)
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use super::grid::EXTENT;
 use super::lists::Lists;
-use super::shape::{Shape, V3, apply, dot};
+use super::shape::{Shape, V3};
 
 /// Cells per side of the unit cube.
 const SIDE: usize = 48;
@@ -40,15 +40,7 @@ impl Cells {
     /// The value of `shapes` at a point of the unit cube; their densities may have changed since.
     pub fn value(&self, shapes: &[Shape], p: V3) -> f64 {
         let [x, y, z] = p.map(cell);
-        let mut sum = 0.0;
-        for &i in self.lists.of((x * SIDE + y) * SIDE + z) {
-            let shape = &shapes[i as usize];
-            let m = apply(&shape.inverse, std::array::from_fn(|k| p[k] - shape.centre[k]));
-            let e = dot(m, m);
-            if e <= EXTENT * EXTENT {
-                sum += shape.density * (-0.5 * e).exp();
-            }
-        }
-        sum
+        let near = self.lists.of((x * SIDE + y) * SIDE + z);
+        near.iter().fold(0.0, |sum, &i| sum + shapes[i as usize].value(p, EXTENT))
     }
 }

@@ -23,29 +23,26 @@ mod tests;
 
 use crate::fdk::Fdk;
 use crate::fdk::filter::Window;
-use crate::field_plan::{build_callbacks, l1, rollback};
+use crate::field_parts::{FieldParts, complete};
+use crate::field_plan::{l1, rollback};
 use crate::fit::{Fitted, fit};
 use crate::iterative::known_volume;
 use crate::optimizer::Optimizer;
 use crate::priors::Places;
 use crate::schedule::{Clock, Ends};
-use crate::solid;
-use crate::surround::{self, Corrected, Quiet};
-use crate::training::callbacks::{FieldMonitor, LiveSlices};
-use crate::training::{CallbackSpec, Callbacks, Draw, Run, Task, checkpoint, train};
-use conefield_core::backend::{Adam, Executable};
+use crate::surround::{Corrected, Quiet};
+use crate::training::{Callback, CallbackSpec, Draw, Run, Task};
+use conefield_core::backend::Executable;
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::loss::Loss;
 use conefield_core::method::{
-    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Solution, StageLine,
+    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Solution, StageLine,
 };
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::prior::Prior;
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::{Scene, SceneSettings};
 use conefield_core::settings::{LossSpec, PriorSpec};
 use conefield_core::spec::stage as stages;
-use conefield_core::trained::{FieldVoxels, Placement, TrainedField};
+use conefield_core::trained::{Placement, TrainedField};
 use control::{Control, DensityControl, Pulls};
 use device::training::DeviceTraining;
 use schemars::JsonSchema;
@@ -135,7 +132,7 @@ pub struct Steps {
     pub seconds: Option<f64>,
     /// Views per step.
     pub views: usize,
-    /// Steps between records of the metrics.
+    /// Most steps between two records of the metrics; a run has at least ten.
     pub report_every: u64,
 }
 
@@ -168,12 +165,10 @@ conefield_core::stage_type!(Method, "gaussians", Gaussians, "a sum of Gaussians,
 
 impl Method for Gaussians {
     fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
-        self.scene.validate()?;
         ensure((1..=64).contains(&self.bin), "spec", "bin", self.bin, "1 to 64 pixels")?;
         ensure((8..=MOST).contains(&self.most), "spec", "most", self.most, format!("8 to {MOST}"))?;
         self.start.validate(self.most).map_err(|e| e.within("start"))?;
         ensure(self.ssim.is_finite() && self.ssim >= 0.0, "spec", "ssim", self.ssim, "0 or more")?;
-        self.optimizer.validate().map_err(|e| e.within("optimizer"))?;
         let Rates { centre, scale, rotation } = self.rates;
         for (key, x) in [("rates.centre", centre), ("rates.scale", scale), ("rates.rotation", rotation)] {
             ensure(x.is_finite() && x >= 0.0, "spec", key, x, "a finite number, 0 or more")?;
@@ -183,24 +178,16 @@ impl Method for Gaussians {
             control.validate().map_err(|e| e.within("density_control"))?;
         }
         let pipeline = Pipeline::alone(Box::new(Mixture { most: self.most }))?;
-        let callbacks = build_callbacks(&self.callbacks)?;
-        for (i, callback) in callbacks.iter().enumerate() {
-            callback.check(&pipeline).map_err(|e| e.within(&format!("callbacks.{i}")))?;
-        }
-        let loss = self.loss.build().map_err(|e| e.within("loss"))?;
-        let learns = if loss.needs_scan() { "one that is fitted to the scan" } else { "" };
+        let Self { scene, optimizer, loss, priors, callbacks, start, training, .. } = self;
+        let (mut parts, beside) = FieldParts::build(scene, optimizer, pipeline, loss.as_ref(), priors, callbacks)?;
+        let learns = if parts.loss.needs_scan() { "one that is fitted to the scan" } else { "" };
         ensure(learns.is_empty(), "spec", "loss", learns, "a loss that does not depend on the scan, such as l1")?;
-        let mut priors = vec![];
-        for (i, spec) in self.priors.iter().enumerate() {
-            let prior = spec.build().and_then(|p| p.blocks().validate().map(|()| p));
-            priors.push(prior.map_err(|e| e.within(&format!("priors.{i}")))?);
-        }
         // Fails on a backend that does not support fields with their own line integrals.
-        let (exe, compiled) = context.backend.compile(&pipeline)?;
-        exe.admits(loss.as_ref(), &priors)?;
+        let (exe, compiled) = context.backend.compile(&parts.pipeline)?;
+        exe.admits(parts.loss.as_ref(), &parts.priors)?;
         let device = context.backend.device();
         if let Some(device) = &device {
-            DeviceTraining::check(device.as_ref(), loss.as_ref(), &priors, self.ssim)?;
+            DeviceTraining::check(device.as_ref(), parts.loss.as_ref(), &parts.priors, self.ssim)?;
         }
         let memory = match &device {
             None => Memory::Host,
@@ -208,37 +195,20 @@ impl Method for Gaussians {
             Some(_) => Memory::Device,
         };
         // The field has kernels of its own in place of a fragment.
-        let stages = vec![StageLine { wgsl: true, ..StageLine::new("field", "gaussians", pipeline.field.as_ref()) }];
-        let mut beside = vec![Line::new("loss", self.loss.type_name(), &loss.describe())];
-        for (i, (p, spec)) in priors.iter().zip(&self.priors).enumerate() {
-            beside.push(Line::new(&format!("priors.{i}"), spec.type_name(), &p.describe()));
-        }
-        for (i, (c, spec)) in callbacks.iter().zip(&self.callbacks).enumerate() {
-            let said = c.describe().unwrap_or_default();
-            beside.push(Line::new(&format!("callbacks.{i}"), spec.type_name(), &said));
-        }
-        let Self { start, training, optimizer, .. } = self;
+        let field = StageLine::new("field", "gaussians", parts.pipeline.field.as_ref());
+        let stages = vec![StageLine { wgsl: true, ..field }];
         let what = format!("{} from the start, {} views per step, Adam {}", start.count, training.views, optimizer.lr);
         let method = Line::new("method", "gaussians", &what);
-        let control = self.density_control.map_or(0, |_| DensityControl::bytes(self.most));
-        let kept = callbacks.iter().map(|c| c.bytes(pipeline.layout().len() as u64)).sum::<u64>() + control;
-        let held_out = callbacks.iter().position(|c| c.needs_held_out()).map(|i| format!("callbacks.{i}"));
+        parts.kept += self.density_control.map_or(0, |_| DensityControl::bytes(self.most));
         Ok(Box::new(GaussianPlan {
-            scene: self.scene.clone(),
+            parts,
             bin: self.bin,
             most: self.most,
             start: *start,
-            optimizer: optimizer.clone(),
             rates: [centre, scale, rotation],
             ssim: self.ssim,
             training: *training,
             control: self.density_control,
-            callbacks: self.callbacks.clone(),
-            loss: Arc::from(loss),
-            priors,
-            pipeline,
-            kept,
-            held_out,
             memory,
             outline: Outline { method, stages, beside, compiled: Some(compiled), links: vec![] },
         }))
@@ -247,23 +217,14 @@ impl Method for Gaussians {
 
 /// The plan of [`Gaussians`].
 struct GaussianPlan {
-    scene: SceneSettings,
+    parts: FieldParts,
     bin: usize,
     most: usize,
     start: Start,
-    optimizer: Optimizer,
     rates: [f64; 3],
     ssim: f64,
     training: Steps,
     control: Option<Control>,
-    callbacks: Vec<Box<dyn CallbackSpec>>,
-    loss: Arc<dyn Loss>,
-    priors: Vec<Box<dyn Prior>>,
-    pipeline: Pipeline,
-    /// Bytes that callbacks hold.
-    kept: u64,
-    /// The key of the callback that uses held-out views.
-    held_out: Option<String>,
     memory: Memory,
     outline: Outline,
 }
@@ -283,7 +244,6 @@ impl Plan for GaussianPlan {
     }
 
     fn needs(&self, scan: &ScanHeader) -> Needs {
-        let n = self.pipeline.layout().len() as u64;
         let seen = scan.binned(self.bin);
         let bins = if self.bin > 1 { 4 * seen.pixels() } else { 0 };
         let begun = first().needs(scan).working + self.start.bytes(scan.voxels());
@@ -295,20 +255,8 @@ impl Plan for GaussianPlan {
             Memory::Software => 2 * views + DeviceTraining::bytes(&seen, slots),
             Memory::Device => views,
         };
-        let [surround, corrected] = surround::bytes(self.scene.surround, scan);
-        let backend = self.outline.backend().scratch_bytes as u64;
-        Needs {
-            surround,
-            corrected: corrected + solid::bytes(&self.scene.support, scan),
-            model: 8 * n,
-            optimizer: 8 * n + self.kept,
-            backend,
-            // The first volume is freed before training begins.
-            working: bins + begun.max(training),
-            resume: 16 * n + self.kept,
-            volume: false,
-            evaluating: backend + FieldVoxels::BYTES,
-        }
+        // The first volume is freed before training begins.
+        self.parts.needs(scan, &self.outline, bins + begun.max(training))
     }
 
     fn passes(&self) -> Option<u64> {
@@ -316,21 +264,18 @@ impl Plan for GaussianPlan {
     }
 
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
-        let fitted = fit(scan, &self.scene, None, &mut self.pipeline.clone())?;
-        let mut lines = surround::found(scan, self.scene.surround)?;
-        lines.extend(fitted.found);
-        Ok(Findings { lines, attenuation: Some(fitted.scene.attenuation * scan.unit.mm), samples: None })
+        self.parts.inspect(scan)
     }
 
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         job.scan.validate("scan")?;
-        let mut pipeline = self.pipeline.clone();
-        let Fitted { scene, solid, found, .. } = fit(job.scan, &self.scene, Some(job.volumes), &mut pipeline)?;
+        let (mut pipeline, settings) = (self.parts.pipeline.clone(), &self.parts.scene);
+        let Fitted { scene, solid, found, .. } = fit(job.scan, settings, Some(job.volumes), &mut pipeline)?;
         found.iter().for_each(|line| observer.note(line));
         let [rows, columns] = job.scan.geometry.detector;
         let room = format!("1 to {}, the detector's longer side", rows.max(columns));
         ensure(self.bin <= rows.max(columns), "spec", "bin", self.bin, room)?;
-        let corrected = Corrected::of(job, self.scene.surround, solid.as_ref(), observer)?;
+        let corrected = Corrected::of(job, settings.surround, solid.as_ref(), observer)?;
         let job = &Corrected::job(corrected.as_ref(), job);
         let widths = [NARROWEST * scene.voxel_mm() / scene.side, WIDEST];
         let widths = [widths[0].min(WIDEST / 2.0), widths[1]];
@@ -356,7 +301,7 @@ impl Plan for GaussianPlan {
             Some(device) => {
                 let header = job.scan.header().binned(self.bin);
                 let bytes = DeviceTraining::bytes(&header, self.most as u64) + size_of_val(&*views.measured) as u64;
-                let parts = (self.loss.as_ref(), &self.priors[..]);
+                let parts = (self.parts.loss.as_ref(), &self.parts.priors[..]);
                 let resident = job.backend.place().holds(bytes);
                 if !resident {
                     observer.note("the views do not fit on the device beside the Gaussians: each step loads its own");
@@ -365,48 +310,34 @@ impl Plan for GaussianPlan {
             }
             None => Box::new(ViewTraining::new(rule, views, pulls.clone())),
         };
-        let mut callbacks = build_callbacks(&self.callbacks)?;
-        callbacks.insert(0, Box::new(FieldMonitor::new(job, &scene, &model.pipeline)));
-        if let Some(control) = self.control {
-            callbacks.push(Box::new(DensityControl::new(control, pulls, scale)));
-        }
-        callbacks.push(Box::new(LiveSlices));
-        let mut callbacks = Callbacks(callbacks);
+        let control =
+            self.control.map(|control| -> Box<dyn Callback> { Box::new(DensityControl::new(control, pulls, scale)) });
+        let callbacks = self.parts.callbacks(job, &scene, &model.pipeline, control)?;
         observer.note(&self.outline.backend().backend);
         let spent = job.resume.map_or(0.0, |r| r.standing.seconds);
         let ends = Ends { steps: self.training.steps, seconds: self.training.seconds };
         let views = job.scan.geometry.views.len();
-        let mut run = Run {
+        let run = Run {
             clock: Clock::new(ends, job.limits, spent),
-            loss: self.loss.clone(),
+            loss: self.parts.loss.clone(),
+            optimizer: self.parts.optimizer.clone(),
             steps_an_epoch: views.div_ceil(self.training.views) as u64,
             report_every: self.training.report_every,
             ..Run::new(job, &scene, observer, model, exe)
         };
-        if let Some(resume) = job.resume {
-            checkpoint::restore(&mut run, &mut callbacks, resume)?;
-            run.observer.note(&format!("resumed after step {}", run.step));
-        }
-        let loss = self.loss.clone();
-        let places = Places::new(&self.priors);
-        let mut task = Whole { optimizer: &self.optimizer, scene: &scene, loss: loss.as_ref(), places };
-        train(&mut run, &mut task, &mut callbacks)?;
-        let Run { model, clock, step, samples, tally, best, .. } = run;
-        let (train_s, rollbacks) = (clock.seconds(), tally.rollbacks);
-        let result = Reconstruction::Field(TrainedField { model, scene: scene.clone(), unit_mm: job.scan.unit.mm });
-        Ok(Solution { result, steps: step, train_s, samples, sampling_s: train_s, rollbacks, best })
+        complete(run, &mut Whole { scene: &scene, places: Places::new(&self.parts.priors) }, callbacks)
     }
 
     fn restore(&self, placement: &Placement, load: &mut dyn FnMut(&mut Model) -> Result<()>) -> Result<TrainedField> {
-        TrainedField::restore(self.pipeline.clone(), &self.scene, placement, load)
+        TrainedField::restore(self.parts.pipeline.clone(), &self.parts.scene, placement, load)
     }
 
     fn pipeline(&self) -> Option<&Pipeline> {
-        Some(&self.pipeline)
+        Some(&self.parts.pipeline)
     }
 
     fn needs_held_out(&self) -> Option<String> {
-        self.held_out.clone()
+        self.parts.held_out.clone()
     }
 }
 
@@ -434,19 +365,13 @@ impl GaussianPlan {
 
 /// Training on whole views.
 struct Whole<'a> {
-    optimizer: &'a Optimizer,
     scene: &'a Scene,
-    loss: &'a dyn Loss,
     places: Places<'a>,
 }
 
 impl Task for Whole<'_> {
     fn draw(&mut self, seed: u64, step: u64) -> Draw<'_> {
         let priors = self.places.draw(self.scene, seed, step);
-        Draw { loss: self.loss, rays: &[], priors, ahead: Box::new(|| ()) }
-    }
-
-    fn adam(&self, epoch: f64, share: f64) -> Adam {
-        self.optimizer.adam(1, epoch, share)
+        Draw { rays: &[], priors, ahead: Box::new(|| ()) }
     }
 }

@@ -70,6 +70,14 @@ impl Shape {
         Self { centre: [n(0), n(1), n(2)], inverse, deviations, density }
     }
 
+    /// `ρ·exp(-½|M(x - c)|²)` at `x`; 0 beyond `extent` standard deviations.
+    #[inline]
+    pub fn value(&self, x: V3, extent: f64) -> f64 {
+        let m = apply(&self.inverse, std::array::from_fn(|k| x[k] - self.centre[k]));
+        let e = dot(m, m);
+        if e <= extent * extent { self.density * (-0.5 * e).exp() } else { 0.0 }
+    }
+
     /// The largest standard deviation.
     pub fn longest(&self) -> f64 {
         self.deviations[0].max(self.deviations[1]).max(self.deviations[2])
@@ -97,15 +105,6 @@ pub struct Slope {
 }
 
 impl Slope {
-    /// Adds `times` another slope.
-    pub fn add(&mut self, other: &Self, times: f64) {
-        for i in 0..3 {
-            self.centre[i] += times * other.centre[i];
-            (0..3).for_each(|j| self.inverse[i][j] += times * other.inverse[i][j]);
-        }
-        self.density += times * other.density;
-    }
-
     /// Derivatives with respect to the parameters `p` of `shape`.
     pub fn by_parameters<R: Real>(&self, p: &[R], shape: &Shape) -> [f64; NUMBERS] {
         let mut out = [0.0; NUMBERS];

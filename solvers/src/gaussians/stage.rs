@@ -5,10 +5,11 @@
 
 use super::device::DeviceMixture;
 use super::grid::{self, Grid};
-use super::shape::{DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, Slope, V3, apply, cross, dot};
+use super::shape::{DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, V3, apply, cross, dot};
 use super::view;
 use conefield_core::device::Device;
 use conefield_core::error::Result;
+use conefield_core::geometry::{norm, sub};
 use conefield_core::parallel;
 use conefield_core::simd::Real;
 use conefield_core::stage::{
@@ -44,26 +45,9 @@ pub fn reshape<R: Real>(params: &[R], all: &mut Vec<Shape>) {
     });
 }
 
-/// Adds the part of `slope`, of the Gaussian `index`, that falls into `grads`.
-fn add<R: Real>(grads: &mut Grads<'_, R>, params: &[R], shape: &Shape, index: usize, slope: &Slope) {
-    let own = index * NUMBERS..(index + 1) * NUMBERS;
-    let by = slope.by_parameters(&params[own.clone()], shape);
-    for (at, by) in own.zip(by) {
-        if grads.range.contains(&at) {
-            grads.values[at - grads.range.start] += R::of(by);
-        }
-    }
-}
-
-/// The Gaussians with a parameter in `range`.
-fn touched(range: &Range<usize>) -> Range<usize> {
-    range.start / NUMBERS..range.end.div_ceil(NUMBERS)
-}
-
-/// The Gaussians of `which` whose slots are in use.
-fn present<R: Real>(params: &[R], which: Range<usize>) -> impl Iterator<Item = (usize, &[R])> {
-    let all = which.map(|i| (i, &params[i * NUMBERS..(i + 1) * NUMBERS]));
-    all.filter(|(_, p)| p[DENSITY].f64() > f64::from(FREE))
+/// The parameters of each slot in use.
+fn present<R: Real>(params: &[R]) -> impl Iterator<Item = &[R]> {
+    params.chunks_exact(NUMBERS).filter(|p| p[DENSITY].f64() > f64::from(FREE))
 }
 
 /// A bound on the reach of a Gaussian, cheaper than its shape.
@@ -73,10 +57,6 @@ fn far<R: Real>(p: &[R], extent: f64) -> f64 {
 
 fn place<R: Real>(p: &[R]) -> V3 {
     [p[0].f64(), p[1].f64(), p[2].f64()]
-}
-
-fn less(a: V3, b: V3) -> V3 {
-    std::array::from_fn(|k| a[k] - b[k])
 }
 
 /// The points of a tile, and their bounding box.
@@ -102,65 +82,30 @@ impl Points {
     }
 }
 
-/// `exp(-½|M(x - c)|²)` at a point, with the displacement; `None` beyond the Gaussian's extent.
-fn fall(shape: &Shape, x: V3) -> Option<(f64, V3)> {
-    let d = less(x, shape.centre);
-    let m = apply(&shape.inverse, d);
-    let e = dot(m, m);
-    (e <= grid::EXTENT * grid::EXTENT).then(|| ((-0.5 * e).exp(), d))
-}
-
 impl<R: Real> Kernel<R> for Mixture {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
         let points = Points::of(x);
         let mut sums = vec![0.0; x.rows];
-        for (_, p) in present(params, 0..self.most).filter(|(_, p)| points.near(p)) {
+        for p in present(params).filter(|p| points.near(p)) {
             let shape = Shape::of(p);
             for (sum, x) in sums.iter_mut().zip(&points.all) {
-                *sum += fall(&shape, *x).map_or(0.0, |(w, _)| shape.density * w);
+                *sum += shape.value(*x, grid::EXTENT);
             }
         }
         y.data.iter_mut().zip(sums).for_each(|(y, sum)| *y = R::of(sum));
     }
 
+    /// Never called: the method differentiates whole views and grids, and backends refuse its steps.
     fn backward(
         &self,
-        params: &[R],
-        x: Tile<'_, R>,
+        _: &[R],
+        _: Tile<'_, R>,
         _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        mut grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
+        _: Tile<'_, R>,
+        _: Grads<'_, R>,
+        _: Option<TileMut<'_, R>>,
     ) {
-        let points = Points::of(x);
-        let mut by_points = vec![[0.0; 3]; x.rows];
-        let own = touched(&grads.range);
-        // Derivatives with respect to positions need all Gaussians.
-        let which = if dx.is_some() { 0..self.most } else { own.clone() };
-        for (index, p) in present(params, which).filter(|(_, p)| points.near(p)) {
-            let shape = Shape::of(p);
-            let (mut sum, mut first, mut second) = (0.0, [0.0; 3], [0.0; 6]);
-            for (i, x) in points.all.iter().enumerate() {
-                let Some((w, d)) = fall(&shape, *x) else { continue };
-                let w = w * dy.data[i].f64();
-                sum += w;
-                let more = [d[0] * d[0], d[0] * d[1], d[0] * d[2], d[1] * d[1], d[1] * d[2], d[2] * d[2]];
-                (0..3).for_each(|k| first[k] += w * d[k]);
-                (0..6).for_each(|k| second[k] += w * more[k]);
-                let m = apply(&shape.inverse, d);
-                for k in 0..3 {
-                    by_points[i][k] -= shape.density * w * (0..3).map(|j| shape.inverse[j][k] * m[j]).sum::<f64>();
-                }
-            }
-            if own.contains(&index) {
-                add(&mut grads, params, &shape, index, &grid::slope(&shape, sum, first, second));
-            }
-        }
-        if let Some(mut dx) = dx {
-            for k in 0..3 {
-                dx.channel(k).iter_mut().zip(&by_points).for_each(|(d, by)| *d = R::of(by[k]));
-            }
-        }
+        unreachable!("a mixture of Gaussians is trained by its method")
     }
 }
 
@@ -179,16 +124,13 @@ impl Bundle {
         // No Gaussian has its centre beyond the cube's far side.
         let far = rays.iter().map(|r| f64::from(r.inside[1])).fold(0.0, f64::max) + 2.0;
         let at = |(o, d): (V3, V3), t: f64| -> V3 { std::array::from_fn(|k| o[k] + t * d[k]) };
-        let apart = |r: &UnitRay, t: f64| {
-            let d = less(at(of(r), t), at((origin, direction), t));
-            dot(d, d).sqrt()
-        };
+        let apart = |r: &UnitRay, t: f64| norm(sub(at(of(r), t), at((origin, direction), t)));
         let spread = rays.iter().map(|r| apart(r, 0.0).max(apart(r, far))).fold(0.0, f64::max);
         Some(Self { origin, direction, spread })
     }
 
     fn near<R: Real>(&self, p: &[R]) -> bool {
-        let off = cross(less(place(p), self.origin), self.direction);
+        let off = cross(sub(place(p), self.origin), self.direction);
         dot(off, off) <= (self.spread + far(p, view::EXTENT)).powi(2)
     }
 }
@@ -199,9 +141,9 @@ fn along(shape: &Shape, ray: &UnitRay) -> Option<f64> {
         return None;
     }
     let d = ray.direction.map(f64::from);
-    let length = dot(d, d).sqrt();
+    let length = norm(d);
     let d = d.map(|x| x / length);
-    let y = less(shape.centre, ray.origin.map(f64::from));
+    let y = sub(shape.centre, ray.origin.map(f64::from));
     let (z, w) = (apply(&shape.inverse, y), apply(&shape.inverse, d));
     let (a, off) = (dot(w, w), cross(z, w));
     let e = dot(off, off) / a;
@@ -213,7 +155,7 @@ impl Mixture {
     pub(super) fn line_integrals<R: Real>(&self, params: &[R], rays: &[UnitRay], out: &mut [R]) {
         let mut sums = vec![0.0; rays.len()];
         if let Some(bundle) = Bundle::of(rays) {
-            for (_, p) in present(params, 0..self.most).filter(|(_, p)| bundle.near(p)) {
+            for p in present(params).filter(|p| bundle.near(p)) {
                 let shape = Shape::of(p);
                 for (sum, ray) in sums.iter_mut().zip(rays) {
                     *sum += along(&shape, ray).map_or(0.0, |line| shape.density * line);

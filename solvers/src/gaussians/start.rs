@@ -101,8 +101,7 @@ impl Start {
         let expected = "some positive attenuation";
         ensure(!positive.is_empty(), "start", "volume", "no positive voxel", expected)?;
         let at = ((positive.len() - 1) as f64 * TOP) as usize;
-        let (_, top, _) = positive.select_nth_unstable_by(at, f32::total_cmp);
-        let threshold = *top * self.threshold as f32;
+        let threshold = *positive.select_nth_unstable_by(at, f32::total_cmp).1 * self.threshold as f32;
         drop(positive);
         let mut begins = match self.sites {
             Sites::Cells => cells(volume, scene, threshold, self.count),

@@ -5,7 +5,7 @@ use super::grid::Grid;
 use super::shape::{FREE, NUMBERS, Slope, V3, apply, cross, dot};
 use super::stage::{Mixture, shapes};
 use super::view::{Beam, EXTENT, Sight};
-use conefield_core::stage::{Grads, Kernel, Tile, TileMut, UnitGrid, UnitRay};
+use conefield_core::stage::{Kernel, Tile, TileMut, UnitGrid, UnitRay};
 
 const ROWS: usize = 24;
 const COLUMNS: usize = 29;
@@ -175,17 +175,6 @@ fn a_view_is_its_rays_in_both_precisions() {
     assert!(unlike <= 4 && apart < 3e-3 * most, "{unlike} pixels, {apart:e}");
 }
 
-#[test]
-fn threads_change_no_bit() {
-    let (p, by) = (parameters(), weights(&beam()));
-    let run = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| (project(&p), gradient(&p, &by).0))
-    };
-    let one = run(1);
-    assert!(one == run(2) && one == run(3));
-}
-
 fn points() -> UnitGrid {
     UnitGrid { first: [0.21, 0.2, 0.13], spacing: [0.06, 0.05, 0.045], shape: [9, 11, 17] }
 }
@@ -199,7 +188,7 @@ fn painted(params: &[f64]) -> Vec<f64> {
 }
 
 #[test]
-fn a_grid_is_its_points_and_so_are_derivatives() {
+fn a_grid_is_its_points_and_its_derivatives_are_finite_differences() {
     let (p, grid) = (parameters(), points());
     let n: usize = grid.shape.iter().product();
     let by: Vec<f64> = (0..n).map(|i| ((i * 7919) % 1009) as f64 / 504.5 - 1.0).collect();
@@ -208,31 +197,15 @@ fn a_grid_is_its_points_and_so_are_derivatives() {
     let x: Vec<f64> = (0..3).flat_map(|k| (0..n).map(move |i| at(i, k))).collect();
     let mixture = Mixture { most: p.len() / NUMBERS };
     let mut y = vec![0.0; n];
-    let none = || TileMut { data: &mut [], rows: n };
-    mixture.forward(&p, Tile::new(&x, n), TileMut::new(&mut y, n), none());
+    mixture.forward(&p, Tile::new(&x, n), TileMut::new(&mut y, n), TileMut::new(&mut [], n));
     let values = painted(&p);
     let most = y.iter().fold(0.0f64, |m, y| m.max(*y));
     assert!(most > 0.2 && values.iter().zip(&y).all(|(a, b)| (a - b).abs() < 1e-12), "{most}");
-    let (mut g, mut dx) = (vec![0.0; p.len()], vec![0.0; 3 * n]);
-    let dx_tile = Some(TileMut::new(&mut dx, n));
-    mixture.backward(&p, Tile::new(&x, n), none(), Tile::new(&by, n), Grads::all(&mut g), dx_tile);
-    assert!(off(&p, &g, |p| dot_all(&painted(p), &by)) < 1e-7);
-    let (all, mut found) = (shapes(&p), Grid::default());
+    let (all, mut found, mut g) = (shapes(&p), Grid::default(), vec![0.0; p.len()]);
     found.look(&grid, &all);
     for (i, slope) in found.slopes(&grid, &all, &by) {
-        let own = slope.by_parameters(&p[i * NUMBERS..(i + 1) * NUMBERS], &all[i]);
-        let wanted = &g[i * NUMBERS..(i + 1) * NUMBERS];
-        assert!(own.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-9), "{i}: {own:?} {wanted:?}");
+        let own = i * NUMBERS..(i + 1) * NUMBERS;
+        g[own.clone()].copy_from_slice(&slope.by_parameters(&p[own], &all[i]));
     }
-    // Derivatives with respect to positions: moving a point changes the values.
-    let h = 1e-6;
-    for at in [5, n + 700, 2 * n + 811] {
-        let moved = |h: f64| {
-            let (mut x, mut y) = (x.clone(), vec![0.0; n]);
-            x[at] += h;
-            mixture.forward(&p, Tile::new(&x, n), TileMut::new(&mut y, n), none());
-            dot_all(&y, &by)
-        };
-        assert!(((moved(h) - moved(-h)) / (2.0 * h) - dx[at]).abs() < 1e-6, "{at}");
-    }
+    assert!(off(&p, &g, |p| dot_all(&painted(p), &by)) < 1e-7);
 }

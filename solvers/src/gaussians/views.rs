@@ -9,7 +9,7 @@ use super::stage::reshape;
 use super::view::{Beam, Sight};
 use conefield_core::backend::{Adam, BlockWork, Executable, StepStats, Work};
 use conefield_core::error::{Error, Result};
-use conefield_core::geometry::{Geometry, sub};
+use conefield_core::geometry::{Geometry, norm, sub};
 use conefield_core::loss::Loss;
 use conefield_core::parallel;
 use conefield_core::pipeline::Model;
@@ -78,7 +78,6 @@ impl Views {
     pub fn half_detector(&self) -> f64 {
         let beam = &self.beams[0];
         let [rows, columns] = beam.detector.map(|n| n as f64);
-        let norm = |v: V3| v.iter().map(|x| x * x).sum::<f64>().sqrt();
         let middle: V3 = std::array::from_fn(|k| beam.first[k] + 0.5 * (columns * beam.u[k] + rows * beam.v[k]));
         let to_cube = norm(std::array::from_fn(|k| 0.5 - beam.source[k]));
         0.5 * (columns * norm(beam.u)).max(rows * norm(beam.v)) * to_cube / norm(middle)

@@ -1,11 +1,7 @@
 //! Half the squared difference where it is small, linear where it is large.
 
-use conefield_core::error::{Result, ensure};
-use conefield_core::loss::Loss;
-use conefield_core::settings::LossSpec;
-use conefield_core::wgsl::{Fragment, is_positive};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::wgsl::is_positive;
 
 /// Settings of `huber`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -1,11 +1,6 @@
 //! Half the squared difference, as in NAF up to the factor.
 
-use conefield_core::error::Result;
-use conefield_core::loss::Loss;
-use conefield_core::settings::LossSpec;
-use conefield_core::wgsl::Fragment;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Settings of `l2`: there are none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -1,11 +1,6 @@
 //! Half the squared difference, weighted by the inverse noise variance of the measured value.
 
-use conefield_core::error::Result;
-use conefield_core::loss::{Loss, NoiseModel};
-use conefield_core::settings::LossSpec;
-use conefield_core::wgsl::Fragment;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Settings of `noise-weighted`: there are none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -1,11 +1,7 @@
 //! Isotropic total variation: the cost of a difference between neighbours is proportional to its size.
 
-use conefield_core::error::{Result, ensure};
-use conefield_core::prior::{Blocks, Prior};
-use conefield_core::settings::PriorSpec;
-use conefield_core::wgsl::{Fragment, is_positive};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
+use conefield_core::wgsl::is_positive;
 
 /// Settings of `total-variation`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]

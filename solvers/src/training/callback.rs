@@ -58,38 +58,32 @@ pub trait Callback: Send {
     fn name(&self) -> &'static str;
 
     /// Refuses an unsuitable pipeline before training.
-    fn check(&self, pipeline: &Pipeline) -> Result<()> {
-        let _ = pipeline;
+    fn check(&self, _pipeline: &Pipeline) -> Result<()> {
         Ok(())
     }
 
     /// Called before the first step of a run; in a resumed run, after [`Callback::restore`].
-    fn begin(&mut self, run: &mut Run<'_>) -> Result<()> {
-        let _ = run;
+    fn begin(&mut self, _run: &mut Run<'_>) -> Result<()> {
         Ok(())
     }
 
     /// Called between two steps, before a checkpoint. A resumed run calls it again.
-    fn between_steps(&mut self, run: &mut Run<'_>) -> Result<()> {
-        let _ = run;
+    fn between_steps(&mut self, _run: &mut Run<'_>) -> Result<()> {
         Ok(())
     }
 
     /// Called after the last step if the run reaches its limits, before the last record.
-    fn at_end(&mut self, run: &mut Run<'_>) -> Result<()> {
-        let _ = run;
+    fn at_end(&mut self, _run: &mut Run<'_>) -> Result<()> {
         Ok(())
     }
 
     /// Called for each record: may add to it, or end the run with it ([`Run::settled`]).
-    fn at_record(&mut self, record: &mut Record, run: &mut Run<'_>) -> Result<()> {
-        let _ = (record, run);
+    fn at_record(&mut self, _record: &mut Record, _run: &mut Run<'_>) -> Result<()> {
         Ok(())
     }
 
     /// Called before each step.
-    fn before_step(&mut self, run: &mut Run<'_>) -> Result<()> {
-        let _ = run;
+    fn before_step(&mut self, _run: &mut Run<'_>) -> Result<()> {
         Ok(())
     }
 
@@ -97,26 +91,22 @@ pub trait Callback: Send {
     fn masked(&mut self) {}
 
     /// Called between gradients and update.
-    fn after_gradients(&mut self, work: &Work<'_>, stats: &StepStats, run: &mut Run<'_>) -> Result<Update> {
-        let _ = (work, stats, run);
+    fn after_gradients(&mut self, _work: &Work<'_>, _stats: &StepStats, _run: &mut Run<'_>) -> Result<Update> {
         Ok(Update::Take)
     }
 
     /// Called after training: may change the result.
-    fn finish(&mut self, run: &mut Run<'_>) -> Result<()> {
-        let _ = run;
+    fn finish(&mut self, _run: &mut Run<'_>) -> Result<()> {
         Ok(())
     }
 
     /// The state for a checkpoint.
-    fn state<'a>(&'a self, layout: &'a Layout) -> Result<State<'a>> {
-        let _ = layout;
+    fn state<'a>(&'a self, _layout: &'a Layout) -> Result<State<'a>> {
         Ok(State::default())
     }
 
     /// Restores the result of [`Callback::state`].
-    fn restore(&mut self, kept: &Kept<'_>, run: &Run<'_>) -> Result<()> {
-        let _ = run;
+    fn restore(&mut self, kept: &Kept<'_>, _run: &Run<'_>) -> Result<()> {
         kept.value()
     }
 
@@ -126,8 +116,7 @@ pub trait Callback: Send {
     }
 
     /// Bytes for this many parameters.
-    fn bytes(&self, parameters: u64) -> u64 {
-        let _ = parameters;
+    fn bytes(&self, _parameters: u64) -> u64 {
         0
     }
 

@@ -14,13 +14,10 @@ pub use run::Run;
 
 use conefield_core::backend::{Adam, BlockWork, TrainRay, Work};
 use conefield_core::error::Result;
-use conefield_core::loss::Loss;
 use std::time::Instant;
 
 /// The random batch of a step.
 pub struct Draw<'a> {
-    /// The loss of rays and points.
-    pub loss: &'a dyn Loss,
     /// Rays with measured line integrals.
     pub rays: &'a [TrainRay],
     /// Priors of the field.
@@ -29,12 +26,10 @@ pub struct Draw<'a> {
     pub ahead: Box<dyn FnOnce() + Send + 'a>,
 }
 
-/// The data and the update rule of training.
+/// The data of training.
 pub trait Task {
     /// The batch of step `step` (from 0) of a run with `seed`.
     fn draw(&mut self, seed: u64, step: u64) -> Draw<'_>;
-    /// Adam's settings for an update after `epoch` passes over the views, at `share` of the run.
-    fn adam(&self, epoch: f64, share: f64) -> Adam;
 }
 
 /// Trains to the end of the run. The model of `run` is then the result.
@@ -49,7 +44,7 @@ pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) 
             callbacks.each(|c| c.at_end(run))?;
             run.check_finite()?;
         }
-        record(run, task, callbacks, over)?;
+        record(run, callbacks, over)?;
         if over || run.settled {
             break;
         }
@@ -73,9 +68,9 @@ pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) 
 
 /// One step: batch, gradients and, unless a callback refuses it, update.
 fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Result<()> {
-    let adam = task.adam(run.epoch(), run.clock.share(run.step));
-    let Draw { loss, rays, priors, ahead } = task.draw(run.job.seed, run.step);
-    let work = Work { step: run.step, seed: run.job.seed, loss, rays, points: &[], priors: &priors };
+    let (adam, loss) = (run.adam(), run.loss.clone());
+    let Draw { rays, priors, ahead } = task.draw(run.job.seed, run.step);
+    let work = Work { step: run.step, seed: run.job.seed, loss: loss.as_ref(), rays, points: &[], priors: &priors };
     let start = Instant::now();
     let stats = rayon::in_place_scope(|scope| {
         scope.spawn(|_| ahead());
@@ -107,7 +102,7 @@ fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Re
 const LONGEST_GAP: f64 = 0.1;
 
 /// Records the steps since the last record, if one is due.
-fn record(run: &mut Run<'_>, task: &dyn Task, callbacks: &mut Callbacks, over: bool) -> Result<()> {
+fn record(run: &mut Run<'_>, callbacks: &mut Callbacks, over: bool) -> Result<()> {
     let share = run.clock.done(run.step);
     // After one more step it would be too late.
     let late = share + share / run.step.max(1) as f64 > run.tally.recorded + LONGEST_GAP + 1e-9;
@@ -117,7 +112,7 @@ fn record(run: &mut Run<'_>, task: &dyn Task, callbacks: &mut Callbacks, over: b
     }
     run.tally.recorded = share;
     run.clock.pause();
-    let lr = run.tally.rate * task.adam(run.epoch(), run.clock.share(run.step)).lr;
+    let lr = run.tally.rate * run.adam().lr;
     let mut record = run.tally.window.record(run.step, run.clock.seconds(), lr);
     callbacks.each(|c| c.at_record(&mut record, run))?;
     if run.settled {

@@ -1,8 +1,9 @@
 //! A run: the state shared by the training loop and its callbacks.
 
+use crate::optimizer::Optimizer;
 use crate::schedule::{Clock, Ends};
 use conefield_core::arena::Arena;
-use conefield_core::backend::{Executable, StepStats};
+use conefield_core::backend::{Adam, Executable, StepStats};
 use conefield_core::error::{Error, Result};
 use conefield_core::finite::stray;
 use conefield_core::loss::Loss;
@@ -32,6 +33,8 @@ pub struct Run<'a> {
     pub clock: Clock,
     /// Loss between predicted and measured values.
     pub loss: Arc<dyn Loss>,
+    /// The update rule.
+    pub optimizer: Optimizer,
     /// Steps per pass over the views.
     pub steps_an_epoch: u64,
     /// Steps between two records.
@@ -88,6 +91,7 @@ impl<'a> Run<'a> {
             exe,
             clock: Clock::new(Ends::default(), job.limits, 0.0),
             loss: Arc::new(crate::losses::L1 {}),
+            optimizer: Optimizer::default(),
             steps_an_epoch: 1,
             report_every: 1,
             step: 0,
@@ -101,6 +105,11 @@ impl<'a> Run<'a> {
     /// Completed passes over the views.
     pub fn epoch(&self) -> f64 {
         self.step as f64 / self.steps_an_epoch as f64
+    }
+
+    /// Adam's settings for the next update, its number and the factor of the learning rate left out.
+    pub fn adam(&self) -> Adam {
+        self.optimizer.adam(1, self.epoch(), self.clock.share(self.step))
     }
 
     /// Reports an event, now and in the next record.

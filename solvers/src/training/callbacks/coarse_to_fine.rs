@@ -11,12 +11,9 @@
 
 use crate::training::run::Run;
 use crate::training::{Callback, CallbackSpec};
-use conefield_core::error::{Error, Result, ensure};
 use conefield_core::opened::Opened;
 use conefield_core::pipeline::Pipeline;
-use conefield_core::stage::Encoder;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Settings of `coarse-to-fine`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]

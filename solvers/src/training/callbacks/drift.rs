@@ -5,17 +5,16 @@
 //! normalizers and field; the mean absolute difference from the recorded attenuation is the drift (L1, in the scale
 //! that stages see). This includes a LayerNorm: features are recorded at the encoder's output, before it.
 
+use super::needs_features;
 use crate::training::run::{HINT, Run};
 use crate::training::{Callback, CallbackSpec, Kept, State};
-use conefield_core::arena::Layout;
-use conefield_core::error::{Error, Result, ensure};
 use conefield_core::host;
 use conefield_core::method::DriftRecord;
+use conefield_core::pipeline::Pipeline;
+use conefield_core::prelude::*;
 use conefield_core::random::stream;
 use conefield_core::scene::Scene;
 use rand::RngExt;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
 /// Its name in specs and checkpoints, and the names of its tensors.
 const NAME: &str = "drift";
@@ -79,6 +78,10 @@ struct Looked {
 impl Callback for Watch {
     fn name(&self) -> &'static str {
         NAME
+    }
+
+    fn check(&self, pipeline: &Pipeline) -> Result<()> {
+        needs_features(NAME, pipeline)
     }
 
     /// Draws points inside the object's support.

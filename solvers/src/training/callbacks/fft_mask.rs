@@ -13,15 +13,12 @@
 //!
 //! Features are evaluated at the encoder's output: channels are removed from the encoder and all later stages.
 
+use super::needs_features;
 use crate::training::run::Run;
 use crate::training::{Callback, CallbackSpec, Kept, State};
-use conefield_core::arena::Layout;
-use conefield_core::error::{Error, Result, ensure};
 use conefield_core::pipeline::Pipeline;
-use conefield_core::random::{mix, unit};
+use conefield_core::prelude::*;
 use conefield_fourier::{Complex, Fft, forward_f64};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// Its name in specs and checkpoints.
@@ -127,6 +124,7 @@ impl Callback for Masker {
     }
 
     fn check(&self, pipeline: &Pipeline) -> Result<()> {
+        needs_features(NAME, pipeline)?;
         let width = pipeline.encoder.info().output;
         if let Some(keep) = &self.settings.keep {
             let fits = keep.is_sorted_by(|a, b| a < b) && keep.last().is_some_and(|&c| c < width);

@@ -3,13 +3,10 @@
 use crate::training::run::{Run, strayed};
 use crate::training::{Callback, CallbackSpec, Kept, State};
 use crate::waiting::Waited;
-use conefield_core::arena::Layout;
 use conefield_core::checkpoint::tensors_of;
-use conefield_core::error::{Result, ensure};
 use conefield_core::method::Record;
 use conefield_core::pages::{Pages, copy};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use conefield_core::prelude::*;
 
 /// Its name in specs and checkpoints, and the prefix of its tensors.
 const NAME: &str = "patience";
@@ -84,6 +81,8 @@ impl Callback for Waiting {
     fn finish(&mut self, run: &mut Run<'_>) -> Result<()> {
         if let (Some(kept), Some(best)) = (&self.copy, self.waited.best) {
             copy(&mut run.model.arena.params, kept);
+            // What fetches parameters after this must not take the last ones from the device.
+            run.exe.renew();
             run.best = Some(best);
         }
         Ok(())
@@ -133,5 +132,80 @@ impl Waiting {
             None => self.copy = Some(params.clone()),
         }
         Ok(true)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gaussians::stage::Mixture;
+    use conefield_backend_cpu::Cpu;
+    use conefield_core::backend::{Adam, Executable, StepStats, Work};
+    use conefield_core::method::{Best, Job, Observer};
+    use conefield_core::pipeline::{Model, Pipeline};
+    use conefield_core::scan::Volume;
+    use conefield_core::scene::{Scene, SceneSettings};
+    use conefield_projectors::simulate::{Ellipsoid, Protocol, scan_ellipsoids};
+    use ndarray::Array3;
+
+    /// A device with an arena of its own, in which every parameter is 9.
+    struct Remote {
+        loaded: bool,
+    }
+
+    impl Executable for Remote {
+        fn step(&mut self, _: &mut Model, _: &Work<'_>) -> Result<StepStats> {
+            Ok(StepStats::default())
+        }
+        fn update(&mut self, _: &mut Model, _: &Adam) -> Result<()> {
+            Ok(())
+        }
+        fn evaluate(&mut self, _: &Model, _: &[[f32; 3]], _: &mut [f32]) -> Result<()> {
+            Ok(())
+        }
+        fn encode(&mut self, _: &Model, _: &[[f32; 3]]) -> Result<Vec<f32>> {
+            Ok(vec![])
+        }
+        fn render(&mut self, _: &Model, _: &[UnitRay], _: &mut [f32]) -> Result<()> {
+            Ok(())
+        }
+        fn fetch(&mut self, model: &mut Model) -> Result<()> {
+            if self.loaded {
+                model.arena.params.fill(9.0);
+            }
+            Ok(())
+        }
+        fn renew(&mut self) {
+            self.loaded = false;
+        }
+    }
+
+    struct Deaf;
+
+    impl Observer for Deaf {
+        fn progress(&mut self, _: u64, _: f64, _: f64) {}
+        fn record(&mut self, _: &Record) {}
+        fn note(&mut self, _: &str) {}
+    }
+
+    /// As a callback does that opens the closed levels at the end of a run.
+    #[test]
+    fn the_best_state_stays_when_parameters_are_fetched_after_it() {
+        let grid = Volume::centered(Array3::zeros((8, 8, 8)), [1.0; 3]).grid;
+        let geometry = Protocol::r2(&grid).with_detector([8, 8]).with_views(2).geometry(&grid).unwrap();
+        let ball = Ellipsoid { center: [0.0; 3], axes: [2.0; 3], value: 0.1 };
+        let (scan, backend) = (scan_ellipsoids(&[ball], geometry), Cpu::new());
+        let (job, scene) = (Job::new(&scan, &backend), Scene::new(&scan, &SceneSettings::default()).unwrap());
+        let pipeline = Pipeline::alone(Box::new(Mixture { most: 1 })).unwrap();
+        let (model, mut deaf) = (Model::random(pipeline, 1), Deaf);
+        let best = model.arena.params.clone();
+        let mut run = Run::new(&job, &scene, &mut deaf, model, Box::new(Remote { loaded: true }));
+        let found = Best { step: 1, held_out: 0.1 };
+        let waited = Waited { best: Some(found), since: 1 };
+        let mut waiting = Waiting { records: 1, waited, copy: Some(best.clone()) };
+        run.exe.fetch(&mut run.model).unwrap();
+        waiting.finish(&mut run).unwrap();
+        run.exe.fetch(&mut run.model).unwrap();
+        assert_eq!((&run.model.arena.params[..], run.best), (&best[..], Some(found)));
     }
 }

@@ -12,18 +12,14 @@
 use crate::training::culprit;
 use crate::training::run::{HINT, Run, strayed};
 use crate::training::{Callback, CallbackSpec, Kept, State, Update};
-use conefield_core::arena::{Arena, Layout};
 use conefield_core::backend::{StepStats, Work};
 use conefield_core::checkpoint::tensors_of;
-use conefield_core::error::{Error, Result, ensure};
-use conefield_core::loss::Loss;
 use conefield_core::pages::{Pages, copy};
 use conefield_core::parallel;
+use conefield_core::prelude::*;
 use conefield_core::scan::Scan;
 use conefield_core::scene::Scene;
 use ndarray::{ArrayView2, Axis};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// Steps per window.
