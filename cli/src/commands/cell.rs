@@ -7,6 +7,7 @@ use super::{EndOptions, General};
 use crate::out;
 use conefield::files;
 use conefield::plugins::{self, Used};
+use conefield::record::ScanRecord;
 use conefield::study::method::Method;
 use conefield::tradeoff::json::{LONGEST, read_json};
 use conefield::tradeoff::trial::TrialInput;
@@ -14,7 +15,7 @@ use conefield_core::Result;
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// How a run starts, given the content of its folder.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,10 +33,10 @@ pub enum Start {
 /// A method on a scan.
 pub struct Cell<'a> {
     pub method: &'a Method,
-    pub scan: &'a Path,
+    pub scan: PathBuf,
     /// The run's folder.
-    pub run: &'a Path,
-    pub protocol: &'a RunProtocol,
+    pub run: PathBuf,
+    pub protocol: RunProtocol,
 }
 
 /// Whether `folder` holds a finished run.
@@ -55,8 +56,7 @@ impl Cell<'_> {
         }
         let mut now = identity(&method.loaded, protocol, &input.held, &input.scan)?;
         if is_done(run) {
-            let reference = protocol.reference.as_ref().map(|r| r.display().to_string());
-            now.insert("reference".into(), Value::from(reference).to_string());
+            now.insert("reference".into(), Value::from(protocol.named_reference()).to_string());
             now.insert("peak".into(), input.peak.to_string());
             files::same_run(&run.join("record.json").display().to_string(), &recorded(run)?, &now)?;
             return Ok(Start::Done);
@@ -91,7 +91,7 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
     struct Known {
         version: String,
         seed: u64,
-        scan: KnownScan,
+        scan: ScanRecord,
         held_out_views: Vec<usize>,
         limits: EndOptions,
         #[serde(default)]
@@ -100,11 +100,6 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         peak: f64,
         #[serde(default)]
         plugins: Vec<Used>,
-    }
-    #[derive(Deserialize)]
-    struct KnownScan {
-        projections_fnv1a64: String,
-        geometry_fnv1a64: String,
     }
     let known: Known = read_json(&folder.join("record.json"))?;
     let mut all = BTreeMap::from([

@@ -46,6 +46,11 @@ impl RunProtocol {
         reference.map_or(self.peak.unwrap_or(1.0), |r| score::peak(self.peak, r))
     }
 
+    /// The reference as it is named.
+    pub fn named_reference(&self) -> Option<String> {
+        self.reference.as_ref().map(|r| r.display().to_string())
+    }
+
     /// Indices of the held-out views, of `n`. Refuses a choice without any.
     pub fn held_out(&self, n: usize) -> Result<Vec<usize>> {
         input::held_out(self.hold_out.as_ref(), n, "command line", "--hold-out")

@@ -220,7 +220,7 @@ impl ReconstructArgs {
         }
         // A run resumed after its last pass adds no record.
         let last = progress.records().last().cloned().or(earlier);
-        let board = progress.take_board();
+        let board = progress.board.take();
         drop(progress);
 
         let (record, failed) =
@@ -259,11 +259,10 @@ impl ReconstructArgs {
             Ok(levels) => (levels.flatten(), None),
             Err(e) => (None, Some(e)),
         };
-        let path = |p: &PathBuf| p.display().to_string();
         let record = RunRecord {
             scan: Some(scan.clone()),
-            init: self.init.as_ref().map(path),
-            reference: self.protocol.reference.as_ref().map(path),
+            init: self.init.as_ref().map(|init| init.display().to_string()),
+            reference: self.protocol.named_reference(),
             hounsfield,
             ..run.record(solved, last, written)
         };
@@ -329,18 +328,17 @@ impl ReconstructArgs {
         run: BTreeMap<String, String>,
     ) -> Result<Progress> {
         let board = self.tensorboard.then(|| Board::new(&folder.file("events.out.tfevents.conefield"), &metrics.0));
-        let keeper = Keeper {
+        let mut progress = Progress::new("reconstruct", Some(metrics));
+        progress.keeper = Some(Keeper {
             path: folder.file(CHECKPOINT),
             every: Duration::from_secs_f64(self.protocol.checkpoint_every),
             run,
             last: Instant::now(),
-        };
-        Ok(Progress::new("reconstruct", Some(metrics))
-            .keeping(Some(keeper))
-            .showing(
-                self.live.or(self.watch.map(|_| WATCHED)).map(|seconds| Live::new(folder.file("live.png"), seconds)),
-            )
-            .reporting(board.transpose()?))
+        });
+        let interval = self.live.or(self.watch.map(|_| WATCHED));
+        progress.live = interval.map(|seconds| Live::new(folder.file("live.png"), seconds));
+        progress.board = board.transpose()?;
+        Ok(progress)
     }
 
     /// The requested spec and its changed settings. A resumed run reads its choice from its folder.

@@ -215,7 +215,7 @@ impl Work<'_> {
             // A missing scan is simulated again bit-identically, and is checked then.
             if self.scan(&cells[0]).exists() && cells.iter().any(|c| self.run(c).exists()) {
                 let input = self.input(&cells[0])?;
-                cells.iter().try_for_each(|c| self.start(c, &input).map(drop))?;
+                cells.iter().try_for_each(|c| self.process(c).start(&input).map(drop))?;
             }
         }
         Ok(())
@@ -232,7 +232,7 @@ impl Work<'_> {
                 number += 1;
                 let part = format!("{} ({number} of {})", self.name(cell), cells.len());
                 self.await_run(cell, &part)?;
-                let start = self.start(cell, &input)?;
+                let start = self.process(cell).start(&input)?;
                 if start == Start::Done {
                     info!("{part} is already finished");
                     continue;
@@ -249,15 +249,11 @@ impl Work<'_> {
 
     /// Does a run. A failure is recorded in its folder.
     fn make_run(&self, cell: &Cell, start: Start, part: String) -> Result<()> {
-        let (scan, run, protocol, failure) =
-            (self.scan(cell), self.run(cell), self.protocol(cell), self.failure_file(cell));
+        let failure = self.failure_file(cell);
         if failure.exists() {
             fs::remove_file(&failure).map_err(|e| Error::io(&failure, e))?;
         }
-        let method = &self.study.methods[cell.method];
-        let made =
-            cell::Cell { method, scan: &scan, run: &run, protocol: &protocol }.carry_out(start, part, self.general)?;
-        let Some(error) = made else { return Ok(()) };
+        let Some(error) = self.process(cell).carry_out(start, part, self.general)? else { return Ok(()) };
         let folder = failure.parent().unwrap_or(Path::new(""));
         fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         conefield_io::write_text_atomic(&failure, &error)
@@ -296,10 +292,10 @@ impl Work<'_> {
         })
     }
 
-    fn start(&self, cell: &Cell, input: &TrialInput) -> Result<Start> {
-        let (scan, run, protocol) = (self.scan(cell), self.run(cell), self.protocol(cell));
+    /// A run with its method, scan and options.
+    fn process(&self, cell: &Cell) -> cell::Cell<'_> {
         let method = &self.study.methods[cell.method];
-        cell::Cell { method, scan: &scan, run: &run, protocol: &protocol }.start(input)
+        cell::Cell { method, scan: self.scan(cell), run: self.run(cell), protocol: self.protocol(cell) }
     }
 
     /// The options of a run.
