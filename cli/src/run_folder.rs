@@ -160,10 +160,14 @@ impl RunFolder {
 
 /// A run read from its folder.
 pub struct RunOnDisk {
-    folder: PathBuf,
-    spec: String,
-    curves: Vec<Value>,
-    record: Option<Value>,
+    /// Its folder.
+    pub folder: PathBuf,
+    /// The spec with all settings; empty if it is missing.
+    pub spec: String,
+    /// The lines of `metrics.jsonl`.
+    pub curves: Vec<Value>,
+    /// `record.json` of a finished run.
+    pub record: Option<Value>,
     known: Option<Known>,
 }
 
@@ -198,26 +202,6 @@ impl RunOnDisk {
         // The last line of a killed run may be incomplete.
         let curves = text("metrics.jsonl")?.lines().filter_map(|l| serde_json::from_str(l).ok()).collect();
         Ok(Self { folder: folder.to_path_buf(), spec: text("spec.toml")?, curves, record, known })
-    }
-
-    /// The run's folder.
-    pub fn folder(&self) -> &Path {
-        &self.folder
-    }
-
-    /// The spec with all settings; empty if it is missing.
-    pub fn spec(&self) -> &str {
-        &self.spec
-    }
-
-    /// The lines of `metrics.jsonl`.
-    pub fn curves(&self) -> &[Value] {
-        &self.curves
-    }
-
-    /// `record.json` of a finished run.
-    pub fn record(&self) -> Option<&Value> {
-        self.record.as_ref()
     }
 
     /// Whether the run is finished.

@@ -74,17 +74,17 @@ fn run(path: &Path) -> Result<Value> {
     let files: Vec<&str> = run_folder::FILES.into_iter().filter(|f| path.join(f).exists()).collect();
     let run = RunOnDisk::read(path)?;
     let mut found = json!({ "kind": "run", "status": run.status(), "files": files });
-    if let Some(record) = run.record() {
+    if let Some(record) = &run.record {
         let mut record = record.clone();
         // Programs read the record from its own file.
         if let Some(map) = record.as_object_mut() {
             ["memory", "backend", "plan"].iter().for_each(|key| drop(map.remove(*key)));
         }
         found["record"] = record;
-    } else if let Some(last) = run.curves().last() {
+    } else if let Some(last) = run.curves.last() {
         found["last_record"] = last.clone();
     }
-    found["spec"] = json!(run.spec());
+    found["spec"] = json!(run.spec);
     Ok(found)
 }
 

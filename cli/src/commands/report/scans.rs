@@ -59,7 +59,7 @@ impl Group {
                     page.warnings.push(Notice {
                         found: format!(
                             "{}: the scan is {where_}; its geometry and projections are not shown",
-                            run.folder().display()
+                            run.folder.display()
                         ),
                         advice: "name it with conefield report --scan SCAN".into(),
                     });
@@ -86,7 +86,7 @@ impl Group {
             match voxels {
                 Some(voxels) => group.references.push((path, voxels)),
                 None => page.warnings.push(Notice {
-                    found: format!("{}: the reference {} is not there", run.folder().display(), path.display()),
+                    found: format!("{}: the reference {} is not there", run.folder.display(), path.display()),
                     advice: "name it with conefield report --reference VOLUME".into(),
                 }),
             }
@@ -195,7 +195,7 @@ fn read(path: &Path, run: &RunOnDisk, options: &Options, page: &mut Page) -> Res
     if run.is_of(&ScanRecord::of(path, &scan)?) {
         return Ok(Some(scan));
     }
-    let found = format!("another scan than the one of {}", run.folder().display());
+    let found = format!("another scan than the one of {}", run.folder.display());
     if options.scan.is_some() {
         return Err(Error::invalid(place, "--scan", found, "the scan that the run worked on"));
     }
