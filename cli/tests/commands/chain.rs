@@ -9,6 +9,8 @@ const SMALL: &str = "--set encoder.levels=3 --set encoder.log2_table_size=10 --s
 #[test]
 fn a_scan_becomes_a_volume_and_its_scores() {
     let d = Folder::after(&[SCAN]);
+    // The truth is that of the scan, whatever is called so here.
+    d.put("truth", "mine");
     let asked = "--reference truth --hold-out every:4 --seed 5";
     let record = d.json(&format!("reconstruct scan --spec naf -o run {SMALL} {asked} --json"));
     assert_eq!((&record["steps"], &record["seed"]), (&json!(12), &json!(5)));

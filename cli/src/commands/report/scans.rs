@@ -76,7 +76,7 @@ impl Group {
             group.runs.push((i, result));
             let reference = options.reference.map(Path::to_path_buf).or(run.reference().map(Path::to_path_buf));
             let Some(path) = reference.filter(|p| group.references.iter().all(|(r, _)| r != p)) else { continue };
-            let truth = path == Path::new("truth") && !path.exists();
+            let truth = input::is_truth(&path);
             let voxels = match &group.scan {
                 Some(scan) if truth => Some(conefield_io::scan_size(scan)?.voxels),
                 None if truth => None,
@@ -148,7 +148,7 @@ impl Group {
         for (path, _) in &self.references {
             let volume = match (&scan, &self.scan) {
                 (Some(scan), Some(place)) => input::reference(path, place, scan)?,
-                _ if path.exists() => conefield_io::read_volume(path)?,
+                _ if !input::is_truth(path) && path.exists() => conefield_io::read_volume(path)?,
                 // The truth in this scan is not the one of the run.
                 _ => continue,
             };
