@@ -284,11 +284,11 @@ impl ReconstructArgs {
     /// The requested spec, or the front within a budget.
     fn session<'a>(&self, backend: &'a dyn Backend, begin: Instant) -> Result<Session<'a>> {
         let asked = self.asked();
-        let read = asked.as_ref().map(|(spec, _)| |sets: &[String]| specs::read(spec, sets));
+        let read = asked.as_ref().map(|spec| |sets: &[String]| specs::read(spec, sets));
         let request = Request {
             spec: read.as_ref().map(|read| read as Read<'_>),
             front: self.front.as_deref().map(Front::read).transpose()?,
-            sets: asked.as_ref().map_or_else(|| self.protocol.sets.clone(), |(_, sets)| sets.clone()),
+            sets: self.protocol.sets.clone(),
             // A run resumed without a spec reads the start from its own spec.
             init: self.init.clone().filter(|_| self.spec.is_some() || !self.resume),
             limits: self.protocol.ends.limits(),
@@ -341,12 +341,10 @@ impl ReconstructArgs {
         Ok(progress)
     }
 
-    /// The requested spec and its changed settings. A resumed run reads its choice from its folder.
-    fn asked(&self) -> Option<(String, Vec<String>)> {
-        match &self.spec {
-            Some(spec) => Some((spec.clone(), self.protocol.sets.clone())),
-            None => self.resume.then(|| (self.output.join("spec.toml").display().to_string(), vec![])),
-        }
+    /// The requested spec. A resumed run reads its choice from its folder.
+    fn asked(&self) -> Option<String> {
+        let chosen = || self.output.join("spec.toml").display().to_string();
+        self.spec.clone().or_else(|| self.resume.then(chosen))
     }
 }
 

@@ -99,7 +99,9 @@ fn an_interrupted_run_goes_on_with_what_it_chose() {
     signal(&child, "INT");
     let output = child.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8(output.stderr).unwrap());
-    for (other, want) in [("--budget 7s", "budget"), ("--spec run/spec.toml", "budget")] {
+    for (other, want) in
+        [("--budget 7s", "budget"), ("--spec run/spec.toml", "budget"), ("--budget 6s --set relaxation=1.2", "spec")]
+    {
         let said = d.refused(1, &format!("reconstruct scan -o run --resume {other}"));
         assert!(said.contains(&format!("--resume: {want}")), "{said}");
     }
