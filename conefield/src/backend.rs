@@ -66,6 +66,14 @@ impl Serialize for BackendChoice {
 }
 
 impl BackendChoice {
+    /// The name with which the description of the opened backend begins.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Auto | Self::Cpu => "cpu",
+            Self::Wgpu { .. } => "wgpu",
+        }
+    }
+
     /// Opens the backend.
     pub fn open(&self) -> Result<Box<dyn Backend>> {
         // Each process takes one of the adapters in turn.

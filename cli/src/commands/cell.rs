@@ -58,6 +58,7 @@ impl Cell<'_> {
         if is_done(run) {
             now.insert("reference".into(), Value::from(protocol.named_reference()).to_string());
             now.insert("peak".into(), input.peak.to_string());
+            now.insert("backend".into(), protocol.backend.kind().into());
             files::same_run(&run.join("record.json").display().to_string(), &recorded(run)?, &now)?;
             return Ok(Start::Done);
         }
@@ -98,8 +99,13 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         budget_s: Option<f64>,
         reference: Value,
         peak: f64,
+        backend: KnownBackend,
         #[serde(default)]
         plugins: Vec<Used>,
+    }
+    #[derive(Deserialize)]
+    struct KnownBackend {
+        backend: String,
     }
     let known: Known = read_json(&folder.join("record.json"))?;
     let mut all = BTreeMap::from([
@@ -113,6 +119,7 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         ("limits".into(), out::to_json(&known.limits)?),
         ("reference".into(), known.reference.to_string()),
         ("peak".into(), known.peak.to_string()),
+        ("backend".into(), known.backend.backend.split(',').next().unwrap_or_default().into()),
     ]);
     all.extend(plugins::identity(&known.plugins));
     Ok(all)

@@ -88,6 +88,11 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
         assert!(said.contains(&format!("--resume: {want}")), "{said}");
     }
     assert_eq!(d.times("out/fdk"), before);
+    // A run on another backend is another run.
+    let record = d.text("out/fdk/record.json");
+    d.put("out/fdk/record.json", record.replace("\"backend\": \"cpu, ", "\"backend\": \"wgpu, "));
+    let said = d.refused(1, &compare("fdk", &format!("{all} --resume")));
+    assert!(said.contains("--resume: backend: found cpu, expected wgpu"), "{said}");
     let said = d.refused(1, &compare("fdk", all));
     assert!(said.contains("an earlier comparison") && said.contains("--resume"), "{said}");
     d.done(&compare("sirt", "--force"));
