@@ -24,7 +24,7 @@ pub struct RunProtocol {
     /// Time of the whole command, from start to last file, such as 60s or 10m.
     #[arg(long, value_name = "TIME", value_parser = parse::seconds, conflicts_with_all = ["steps", "seconds", "at_most"])]
     pub budget: Option<f64>,
-    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
+    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP_OF_A_RUN)]
     pub backend: BackendChoice,
     /// The reference volume to score against: a file, or "truth" for the one in the scan.
     #[arg(long, value_name = "VOLUME")]
