@@ -1,7 +1,6 @@
 //! The folder of a run: `metrics.jsonl`, `spec.toml`, `live.png` and `events.out.tfevents.conefield` if requested, and
 //! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `volume-hu.nii.gz` if requested,
-//! `weights.safetensors`, `slices.png` and, last
-//! and only for a finished run, `record.json`.
+//! `weights.safetensors`, `slices.png` and, last and only for a finished run, `record.json`.
 
 use crate::boundary;
 use conefield::plugins::Used;
@@ -121,31 +120,22 @@ impl RunFolder {
         Ok((path, file))
     }
 
-    /// Opens `metrics.jsonl` of an interrupted run without the records after `step`, which will be repeated.
-    pub fn metrics_until(&self, step: u64) -> Result<(PathBuf, File)> {
+    /// Opens `metrics.jsonl` of an interrupted run without the records after `step`, which will be repeated. Also returns
+    /// loss and held-out error of the last record that stays.
+    pub fn metrics_until(&self, step: u64) -> Result<((PathBuf, File), Option<Record>)> {
         let path = self.file("metrics.jsonl");
         let io = |e| Error::io(&path, e);
-        let before = |line: &&str| {
-            let record: Option<serde_json::Value> = serde_json::from_str(line).ok();
-            record.and_then(|r| r["step"].as_u64()).is_some_and(|s| s <= step)
-        };
-        // The last line may be incomplete.
         let text = fs::read(&path).map_err(io)?;
-        let kept: String = String::from_utf8_lossy(&text).lines().filter(before).flat_map(|l| [l, "\n"]).collect();
+        let text = String::from_utf8_lossy(&text);
+        // The last line may be incomplete.
+        let records = text.lines().filter_map(|line| Some((line, serde_json::from_str::<Value>(line).ok()?)));
+        let before: Vec<_> = records.filter(|(_, r)| r["step"].as_u64().is_some_and(|s| s <= step)).collect();
+        let kept: String = before.iter().flat_map(|(line, _)| [line, "\n"]).collect();
+        let [loss, held_out] = ["loss", "held_out"].map(|key| before.last().and_then(|(_, r)| r[key].as_f64()));
+        let last = before.last().map(|_| Record { loss, held_out, ..Record::default() });
         conefield_io::write_text_atomic(&path, &kept)?;
         let file = File::options().append(true).open(&path).map_err(io)?;
-        Ok((path, file))
-    }
-
-    /// Loss and held-out error of the last record of metrics.jsonl.
-    pub fn last_record(&self) -> Result<Option<Record>> {
-        let path = self.file("metrics.jsonl");
-        let text = fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
-        let last = text.lines().rev().find_map(|line| serde_json::from_str::<Value>(line).ok());
-        let number = |value: &Value| value.as_f64();
-        let known =
-            |r: Value| Record { loss: number(&r["loss"]), held_out: number(&r["held_out"]), ..Record::default() };
-        Ok(last.map(known))
+        Ok(((path, file), last))
     }
 
     /// Finishes the run: removes its checkpoint and the run it replaced.

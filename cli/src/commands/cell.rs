@@ -1,10 +1,9 @@
 //! A run as part of a comparison or a study: how it starts, and its process.
 
 use super::protocol::RunProtocol;
-use super::reconstruct::{budget, identity};
+use super::reconstruct::{conditions, identity};
 use super::trial::Trial;
 use super::{EndOptions, General};
-use crate::out;
 use conefield::files;
 use conefield::plugins::{self, Used};
 use conefield::record::ScanRecord;
@@ -112,15 +111,11 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         ("conefield".into(), known.version),
         ("seed".into(), known.seed.to_string()),
         ("spec".into(), conefield_core::files::read_text(&folder.join("spec.toml"), LONGEST)?),
-        ("projections".into(), known.scan.projections_fnv1a64),
-        ("geometry".into(), known.scan.geometry_fnv1a64),
-        ("budget".into(), budget(known.budget_s)),
-        ("held_out_views".into(), format!("{:?}", known.held_out_views)),
-        ("limits".into(), out::to_json(&known.limits)?),
         ("reference".into(), known.reference.to_string()),
         ("peak".into(), known.peak.to_string()),
         ("backend".into(), known.backend.backend.split(',').next().unwrap_or_default().into()),
     ]);
+    all.extend(conditions(&known.scan, &known.held_out_views, &known.limits, known.budget_s)?);
     all.extend(plugins::identity(&known.plugins));
     Ok(all)
 }

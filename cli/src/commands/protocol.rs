@@ -97,14 +97,12 @@ mod tests {
 
     #[test]
     fn a_child_gets_the_same_options() {
-        let full = "x --checkpoint-every 0.1m --set a=b --set c=[1,2] ENDS --backend wgpu:2 \
-                    --reference -v.nii --peak 2.5 --hold-out";
-        for (held, ends) in [("3,17", "--seconds 1h --steps 7 --at-most 1e-9s"), ("every:10", "--budget 2m")] {
-            // `--reference -v.nii` needs its equals sign.
-            let line: Vec<String> =
-                full.replace("ENDS", ends).replace("--reference ", "--reference=").split(' ').map(Into::into).collect();
-            let line: Vec<String> = line.into_iter().filter(|w| !w.is_empty()).chain([held.into()]).collect();
-            let first = Line::try_parse_from(line).unwrap().protocol;
+        for ends in ["3,17 --seconds 1h --steps 7 --at-most 1e-9s", "every:10 --budget 2m"] {
+            let line = format!(
+                "x --checkpoint-every 0.1m --set a=b --set c=[1,2] --backend wgpu:2 --reference=-v.nii --peak 2.5 \
+                 --hold-out {ends}"
+            );
+            let first = Line::try_parse_from(line.split(' ')).unwrap().protocol;
             let again = [OsString::from("x")].into_iter().chain(first.arguments());
             let second = Line::try_parse_from(again).unwrap().protocol;
             assert_eq!(format!("{first:?}"), format!("{second:?}"));

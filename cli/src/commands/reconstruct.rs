@@ -2,7 +2,7 @@
 
 use super::summary::summary;
 use super::units::HounsfieldOption;
-use super::{calibrate, protocol::RunProtocol, watch};
+use super::{EndOptions, calibrate, protocol::RunProtocol, watch};
 use crate::board::Board;
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
@@ -23,7 +23,7 @@ use conefield::{files, ranks, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
-use conefield_core::method::{Observer, Record};
+use conefield_core::method::Record;
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
@@ -102,21 +102,6 @@ const WATCHED: f64 = 5.0;
 /// A held-out error above this may be due to a wrong geometry.
 const DOUBTFUL: f64 = 0.05;
 
-/// The observer of a process that does not lead.
-struct Follower;
-
-impl Observer for Follower {
-    fn progress(&mut self, _: u64, _: f64, _: f64) {}
-
-    fn record(&mut self, _: &Record) {}
-
-    fn note(&mut self, _: &str) {}
-
-    fn cancelled(&self) -> bool {
-        signals::caught().is_some()
-    }
-}
-
 impl ReconstructArgs {
     pub fn run(self) -> Result<()> {
         if self.spec.is_none() && self.protocol.budget.is_none() {
@@ -154,7 +139,8 @@ impl ReconstructArgs {
         let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
         let mut run = session.plan(input, spent, &|| false)?;
         signals::listen()?;
-        match run.solve(None, resume.as_ref(), &mut Follower) {
+        // Such a process is quiet.
+        match run.solve(None, resume.as_ref(), &mut Progress::new("reconstruct", None)) {
             // The leading process writes the checkpoint and says so.
             Err(Error::Interrupted { .. }) => Ok(()),
             done => done.map(drop),
@@ -356,8 +342,7 @@ fn begin_or_go_on(
 ) -> Result<((PathBuf, File), Option<Record>)> {
     if let Some(resume) = resume {
         folder.go_on();
-        let metrics = folder.metrics_until(resume.standing.recorded)?;
-        return Ok((metrics, folder.last_record()?));
+        return folder.metrics_until(resume.standing.recorded);
     }
     folder.begin()?;
     conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
@@ -401,15 +386,22 @@ pub fn identity(
     scan: &ScanRecord,
 ) -> Result<BTreeMap<String, String>> {
     let mut all = specs::notes(loaded, protocol.seed)?;
-    all.insert("projections".into(), scan.projections_fnv1a64.clone());
-    all.insert("geometry".into(), scan.geometry_fnv1a64.clone());
-    all.insert("held_out_views".into(), format!("{held:?}"));
-    all.insert("limits".into(), out::to_json(&protocol.ends)?);
-    all.insert("budget".into(), budget(protocol.budget));
+    all.extend(conditions(scan, held, &protocol.ends, protocol.budget)?);
     Ok(all)
 }
 
-/// A budget as part of [`identity`].
-pub fn budget(seconds: Option<f64>) -> String {
-    seconds.map_or("none".into(), |s| s.to_string())
+/// The part of [`identity`] that is not in the spec.
+pub fn conditions(
+    scan: &ScanRecord,
+    held: &[usize],
+    ends: &EndOptions,
+    budget: Option<f64>,
+) -> Result<[(String, String); 5]> {
+    Ok([
+        ("projections".into(), scan.projections_fnv1a64.clone()),
+        ("geometry".into(), scan.geometry_fnv1a64.clone()),
+        ("held_out_views".into(), format!("{held:?}")),
+        ("limits".into(), out::to_json(ends)?),
+        ("budget".into(), budget.map_or("none".into(), |s| s.to_string())),
+    ])
 }
