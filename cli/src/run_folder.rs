@@ -66,24 +66,12 @@ impl RunFolder {
 
     /// Refuses a folder with other content than a run, and a run with progress unless `force`.
     pub fn may_begin(&self, force: bool) -> Result<()> {
-        let path = self.0.path();
-        let place = path.display().to_string();
-        let entries = match fs::read_dir(path) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
-            entries => entries.map_err(|e| Error::io(path, e))?,
-        };
-        let mut strange = vec![];
-        for entry in entries {
-            let path = entry.map_err(|e| Error::io(path, e))?.path();
-            // A spec without a record beside it is the user's.
-            let own = path.ends_with("spec.toml") && !self.0.path().join("metrics.jsonl").exists();
-            let is_strange = !known(&path) || own;
-            strange.extend(is_strange.then(|| path.file_name().unwrap_or_default().to_string_lossy().into_owned()));
-        }
-        if let Some(other) = strange.iter().min() {
-            let found = format!("a folder with {other} in it");
-            return Err(Error::invalid(place, "output", found, "a new or empty folder"));
-        }
+        let place = self.0.path().display().to_string();
+        CONTENTS.entries(self.0.path())?;
+        // A spec without a record beside it is the user's.
+        let has = |name: &str| self.file(name).exists();
+        let own = has("spec.toml") && !has("metrics.jsonl");
+        ensure(!own, &place, "output", "a folder with spec.toml in it", "a new or empty folder")?;
         let expected = "a new or empty folder, or --force to replace the run";
         ensure(force || self.0.progressed() == Progressed::Nothing, &place, "output", "an earlier run", expected)
     }

@@ -21,7 +21,6 @@ use conefield_evaluation::report::Table;
 use conefield_io::{Contents, Lease, Progressed};
 use serde::Serialize;
 use std::fs;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use tracing::info;
 
@@ -178,19 +177,10 @@ impl CompareArgs {
 
     /// Refuses a folder with files that no comparison writes, and an earlier comparison without --force or --resume.
     fn look_into_folder(&self) -> Result<()> {
-        let place = self.output.display().to_string();
-        let entries = match fs::read_dir(&self.output) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
-            entries => entries.map_err(|e| Error::io(&self.output, e))?,
-        };
-        for entry in entries {
-            let entry = entry.map_err(|e| Error::io(&self.output, e))?;
-            let found = format!("a folder with {} in it", entry.file_name().to_string_lossy());
-            ensure(known(&entry.path()), &place, "output", found, "a new or empty folder")?;
-        }
+        CONTENTS.entries(&self.output)?;
         let expected = "a new or empty folder, --resume to continue or --force to replace it";
         let free = self.force || self.resume || progressed(&self.output) == Progressed::Nothing;
-        ensure(free, &place, "output", "an earlier comparison", expected)
+        ensure(free, &self.output.display().to_string(), "output", "an earlier comparison", expected)
     }
 
     fn shared(&self, scan: ScanRecord, held_out_views: Vec<usize>, peak: f64, general: &General) -> Shared<'_> {
