@@ -79,7 +79,6 @@ impl Cell<'_> {
             Start::Anew => vec![],
         };
         more.extend(self.method.init.as_ref().map(|i| format!("--init={i}")));
-        let more: Vec<&str> = more.iter().map(String::as_str).collect();
         let Self { method, scan, run, protocol } = self;
         Trial { scan, spec: &method.spec, output: run, protocol, more: &more }.run(part, general)
     }

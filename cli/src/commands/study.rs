@@ -99,7 +99,7 @@ impl StudyArgs {
 
     /// Takes the folder. Refuses one with other files, or an earlier study without --force or --resume.
     fn take(&self, work: &Work<'_>, cells: &[Cell], inputs: &Inputs) -> Result<Hold> {
-        let mut lease = self.shard.is_none().then(|| Lease::take(&self.output, CONTENTS)).transpose()?;
+        let lease = self.shard.is_none().then(|| Lease::take(&self.output, CONTENTS)).transpose()?;
         let any = work.layout.look()?;
         inputs.spare_folder(&self.output)?;
         let goes_on = self.resume || self.shard.is_some();
@@ -115,12 +115,13 @@ impl StudyArgs {
             work.check_runs(cells)?;
         }
         signals::listen()?;
-        match &mut lease {
-            Some(lease) if goes_on && any => lease.go_on(),
-            Some(lease) => lease.replace()?,
-            None => return SharedLease::take(&self.output).map(Hold::Shared),
+        let Some(mut lease) = lease else { return SharedLease::take(&self.output).map(Hold::Shared) };
+        if goes_on && any {
+            lease.go_on();
+        } else {
+            lease.replace()?;
         }
-        lease.map(Hold::Alone).ok_or_else(|| Error::unsupported("study", "the folder is not held"))
+        Ok(Hold::Alone(lease))
     }
 
     /// Writes tables and pictures when all runs have ended, and reports the result.

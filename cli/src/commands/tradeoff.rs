@@ -187,7 +187,7 @@ impl TradeoffArgs {
             output,
             protocol: &protocol,
             // Replaces the remains of an interrupted trial.
-            more: &["--force"],
+            more: &["--force".into()],
         };
         trial.run(part.clone(), general)
     }

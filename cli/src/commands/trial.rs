@@ -21,7 +21,7 @@ pub struct Trial<'a> {
     pub output: &'a Path,
     pub protocol: &'a RunProtocol,
     /// Further options.
-    pub more: &'a [&'a str],
+    pub more: &'a [String],
 }
 
 impl Trial<'_> {
