@@ -59,45 +59,7 @@ fn explain_says_what_a_gpu_makes_of_a_spec() {
         (1, "wgpu:99", "conefield backends"),
         (1, "wgpu:0,0", "one adapter"),
     ] {
-        let e = d.refused(code, &format!("explain ni-naf --backend {backend}"));
-        assert!(e.contains(words), "{e}");
-    }
-}
-
-/// The published method, including its mask (after 250 steps), ends at the same PSNR.
-#[test]
-fn ni_naf_ends_where_the_cpu_ends() {
-    if !adapter("a run of ni-naf") {
-        return;
-    }
-    let d = Folder::after(&["simulate phantom:head:64 -o scan --views 25 --detector 64x64"]);
-    let small = "--steps=320 --set=training.rays=64 --set=projector.samples=48 --set=encoder.log2_table_size=14";
-    let [(cpu, parameters), (gpu, on_gpu)] = ["cpu", "wgpu"].map(|backend| {
-        let record = reconstruct(&d, backend, "ni-naf", backend, small);
-        (number(&record["scores"]["psnr"]), record["parameters"].as_u64().unwrap())
-    });
-    println!("CPU {cpu:.3} dB, GPU {gpu:.3} dB, {parameters} parameters");
-    assert!((cpu - gpu).abs() < 0.1, "CPU {cpu} dB, GPU {gpu} dB");
-    assert_eq!(parameters, on_gpu, "the mask keeps the same channels");
-    assert!(cpu > 15.0, "{cpu} dB is no reconstruction");
-}
-
-/// Both specs of Gaussians, the published one with its prior and its density control, end at the same PSNR.
-#[test]
-fn gaussians_end_where_the_cpu_ends() {
-    if !adapter("runs of Gaussians") {
-        return;
-    }
-    let d = Folder::after(&["simulate phantom:head:32 -o scan --views 20 --detector 32x32"]);
-    let control = "--set=density_control.every=20 --set=density_control.from=0";
-    for (spec, more) in [("gaussians", ""), ("gaussians-published", control)] {
-        let psnr = ["cpu", "wgpu"].map(|backend| {
-            let small = format!("--set=start.count=800 --set=most=1200 --steps=50 {more}");
-            number(&reconstruct(&d, &format!("{spec}-{backend}"), spec, backend, &small)["scores"]["psnr"])
-        });
-        println!("{spec}: {psnr:?} dB");
-        assert!((psnr[0] - psnr[1]).abs() < 0.01, "{spec}: {psnr:?} dB");
-        assert!(psnr[0] > 15.0, "{psnr:?} dB is no reconstruction");
+        d.refused_with(code, &format!("explain ni-naf --backend {backend}"), &[words]);
     }
 }
 

@@ -145,8 +145,7 @@ fn a_run_has_its_folder_alone() {
     let mut child = checkpointed(&d);
     for _ in 0..6 {
         for more in ["--force", "--resume"] {
-            let said = d.refused(1, &format!("{FAST} {more}"));
-            assert!(said.contains("another conefield is writing"), "{said}");
+            d.refused_with(1, &format!("{FAST} {more}"), &["another conefield is writing"]);
         }
     }
     assert!(child.try_wait().unwrap().is_none(), "the run goes on");
@@ -168,8 +167,7 @@ fn a_killed_replacement_gives_back_what_it_replaced() {
     child.wait().unwrap();
     assert!(!d.has("run/record.json"), "the new run had begun");
     // The next command, though refused, restores the earlier run.
-    let said = d.refused(1, FAST);
-    assert!(said.contains("an earlier run"), "{said}");
+    d.refused_with(1, FAST, &["an earlier run"]);
     assert!(d.content("run") == before);
     assert_eq!(d.names(""), ["run", "scan"]);
 }
@@ -232,16 +230,6 @@ fn a_name_without_utf_8_is_reported_as_such() {
     let output = d.command(&format!("{FAST} --init")).arg(init).output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.code() == Some(1) && said.contains("a name in UTF-8"), "{said}");
-}
-
-#[test]
-fn a_full_disk_is_reported_with_the_requested_name() {
-    let d = Folder::after(&[SCAN]);
-    for line in ["simulate phantom:head:16 -o new", "convert scan new --to r2", "convert scan new --to rtk"] {
-        let output = d.shell("trap '' XFSZ; ulimit -f 2; exec \"$0\" --quiet \"$@\"", line);
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.code() == Some(1) && said.contains("new/") && !said.contains(".conefield-"), "{said}");
-    }
 }
 
 #[test]

@@ -18,16 +18,18 @@ fn failed(output: &Output, words: &[&str]) {
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.starts_with("error: ") && said.trim_end().lines().count() == 1, "{said}");
     assert!(words.iter().all(|w| said.contains(w)), "{words:?} are not all in: {said}");
+    assert!(!said.contains(".conefield-"), "a temporary name: {said}");
 }
 
 /// Every output format: the command before the output's name, and that name.
-const WRITERS: [(&str, &str); 9] = [
+const WRITERS: [(&str, &str); 10] = [
     ("convert v.npy --force", "out.nii"),
     ("convert v.npy --force", "out.nii.gz"),
     ("convert v.npy --force", "out.mha"),
     ("convert v.npy --force", "out.npy"),
     ("convert scan --to naf --force", "out.pickle"),
     ("convert scan --to r2 --force", "out.r2"),
+    ("convert scan --to rtk --force", "out.rtk"),
     ("convert scan --to conefield --force", "out.scan"),
     ("pretrain phantom:head:16 --spec naf --steps 1 --set encoder.log2_table_size=12 --force -o", "out.safetensors"),
     ("evaluate v.npy v.npy --png", "out.png"),
@@ -48,11 +50,11 @@ fn a_disk_without_room_leaves_the_earlier_file_whole() {
         // The limit on a file's length (512 or 1024 bytes per block) lets a write fail half-way, like a full disk. Its
         // signal is ignored, so that the write itself fails.
         let no_room = "trap '' XFSZ; ulimit -f 2";
-        failed(&after(&d, no_room, &line), &["File too large"]);
+        failed(&after(&d, no_room, &line), &[name, "File too large"]);
         assert_eq!(d.names(&folder), [""; 0], "{name}: a first attempt leaves nothing");
         d.done(&line);
         let before = d.content(&folder);
-        failed(&after(&d, no_room, &line), &["File too large"]);
+        failed(&after(&d, no_room, &line), &[name, "File too large"]);
         assert_eq!(d.names(&folder), [name]);
         assert!(d.content(&folder) == before, "{name}");
     }

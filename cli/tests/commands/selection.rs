@@ -35,12 +35,6 @@ fn import_and_convert_take_the_same_part() {
         assert_eq!(found.projections, all.projections.slice(s![0..12;3, 1..9, 2..16]), "{name}");
         let (a, b) = (&found.geometry, &all.geometry);
         assert_eq!((a.detector, a.views.len(), a.volume), ([8, 14], 4, b.volume));
-        // The remaining pixels keep their positions.
-        for (row, column) in [(0.0, 0.0), (7.0, 13.0)] {
-            let here = a.views[2].pixel(a.detector, row, column);
-            let there = b.views[6].pixel(b.detector, row + 1.0, column + 2.0);
-            assert!((0..3).all(|k| (here[k] - there[k]).abs() < 1e-9), "{name}: {here:?} {there:?}");
-        }
         // Still a circle about the axis: the crop is an offset of the detector.
         assert!(d.text(format!("{name}/scan.toml")).contains("[orbit]"), "{name}");
     }
@@ -62,20 +56,18 @@ fn import_and_convert_take_the_same_part() {
     assert_eq!(half.projections, flips.projections);
     assert_eq!(half.projections, all.projections.slice(s![.., ..;-1, ..;-1]));
 
-    for (options, words) in [
-        ("--views 0-12", "numbers below 12"),
-        ("--views 1,1", "repeats view 1"),
-        ("--rows 4:20", "the 10"),
-        ("--columns 5:5", "at least one"),
-        ("--bin 99", "the detector's longer side"),
-    ] {
-        for command in COMMANDS {
-            d.refuses("none", &[(&format!("{command} none {options}"), words)]);
-        }
-    }
+    d.refuses(
+        "none",
+        &[
+            ("import s.toml -o none --views 0-12", "numbers below 12"),
+            ("convert whole none --views 1,1", "repeats view 1"),
+            ("convert whole none --rows 4:20", "the 10"),
+            ("convert whole none --columns 5:5", "at least one"),
+            ("convert whole none --bin 99", "the detector's longer side"),
+        ],
+    );
     d.done("simulate phantom:head:16 -o head --views 4 --detector 8x8");
-    let said = d.refused(1, "convert head/truth.nii.gz v.npy --bin 2");
-    assert!(said.contains("--bin") && said.contains("a volume"), "{said}");
+    d.refused_with(1, "convert head/truth.nii.gz v.npy --bin 2", &["--bin", "a volume"]);
 }
 
 #[test]
@@ -126,17 +118,7 @@ fn angles_and_vectors_come_from_files() {
         assert!((0..3).all(|k| (a.u[k] - b.u[k]).abs() < 1e-9 && (a.v[k] - b.v[k]).abs() < 1e-9), "{a:?} {b:?}");
     }
 
-    d.put("short.txt", "0\n30\n");
-    d.put("word.csv", "0\n30\nsixty\n");
-    for (toml, words) in [
-        (angles("short.txt"), "circle.angles_deg: found 2 of them, expected 12, one for each view"),
-        (angles("word.csv"), "word.csv: line 3"),
-        (angles("none.txt"), "none.txt"),
-        (angles("../angles.txt"), "without \"..\""),
-        (vectors("angles.npy"), "[views, 12]"),
-        (tilted("{ u = nan }"), "circle.tilt_deg.u"),
-        (tilted("{ w = 1 }"), "u, v, normal"),
-    ] {
+    for (toml, words) in [(vectors("angles.npy"), "[views, 12]"), (tilted("{ w = 1 }"), "u, v, normal")] {
         d.put("f.toml", &toml);
         d.refuses("none", &[("import f.toml -o none", words)]);
     }

@@ -103,6 +103,12 @@ impl Folder {
         text
     }
 
+    /// The same, with these words in the message.
+    pub fn refused_with(&self, code: i32, line: &str, words: &[&str]) {
+        let said = self.refused(code, line);
+        assert!(words.iter().all(|w| said.contains(w)), "{line}: {words:?} are not all in: {said}");
+    }
+
     /// Checks that each line ends with status 1 and a message with these words, and that it makes nothing called `output`.
     pub fn refuses(&self, output: &str, lines: &[(&str, &str)]) {
         for (line, words) in lines {
