@@ -39,6 +39,13 @@ impl Inputs {
         self.and([path]).and(named.into_iter().map(|n| folder.join(n)))
     }
 
+    /// Refuses to replace an existing output unless `force`, and one that this command reads in any case.
+    pub fn spare(&self, output: &Path, force: bool) -> Result<()> {
+        refuse_existing(output, force)?;
+        self.spare_file(output)?;
+        self.spare_folder(output)
+    }
+
     /// Refuses to write a file that is an input or lies in an input folder.
     pub fn spare_file(&self, output: &Path) -> Result<()> {
         if output.symlink_metadata().is_err() {

@@ -15,7 +15,7 @@ mod signals;
 
 use clap::Parser;
 use conefield::{memory, plugins, ranks};
-use conefield_core::{Error, simd};
+use conefield_core::{Error, Result, simd};
 use std::ffi::OsString;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -80,17 +80,26 @@ fn obey(cli: Cli) -> u8 {
         progress::show_bars();
     }
     log::start(general.verbose, quiet);
-    if let Err(e) = signals::watch() {
-        log::error(&e.to_string());
-        return FAILURE;
+    let done = prepare(&cli.command, &general).and_then(|()| commands::run(cli.command, &general));
+    let Err(e) = done else { return SUCCESS };
+    complain(&e);
+    match (&e, signals::caught()) {
+        (
+            Error::Interrupted { .. } | Error::Stopped { .. } | Error::Cancelled { .. } | Error::Aborted { .. },
+            Some(signal),
+        ) => 128 + signal,
+        _ => FAILURE,
     }
+}
+
+/// Prepares this process for a command.
+fn prepare(command: &commands::Command, general: &commands::General) -> Result<()> {
+    signals::watch()?;
     memory::set_budget(general.memory);
     general.scratch.iter().for_each(|folder| memory::allow_scratch(folder));
-    if let Some(n) = general.threads
-        && let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global()
-    {
-        log::error(&format!("{n} threads: {e}"));
-        return FAILURE;
+    if let Some(n) = general.threads {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global();
+        pool.map_err(|e| Error::unsupported(format!("{n} threads"), e.to_string()))?;
     }
     if let Some(found) = simd::other_level() {
         let used = simd::level_name();
@@ -99,30 +108,13 @@ fn obey(cli: Cli) -> u8 {
         );
     }
     // A plugin under check is loaded only in a separate process.
-    if !matches!(&cli.command, commands::Command::Plugins(p) if p.is_check()) {
+    if !matches!(command, commands::Command::Plugins(p) if p.is_check()) {
         plugins::search(&general.plugins, general.allow_plugins_from_spec);
     }
-    // `plugins` shows refused plugins itself.
-    let listed = matches!(cli.command, commands::Command::Plugins(_));
-    let settled = if listed { Ok(()) } else { plugins::settle() };
-    let alone = match cli.command {
-        commands::Command::Reconstruct(_) => Ok(()),
-        _ if ranks::count() == 1 => Ok(()),
-        _ => {
-            Err(Error::unsupported("mpirun", "several processes: they share the work of `conefield reconstruct` only"))
-        }
-    };
-    match alone.and(settled).and_then(|()| commands::run(cli.command, &general)) {
-        Ok(()) => SUCCESS,
-        Err(e) => {
-            complain(&e);
-            match (&e, signals::caught()) {
-                (
-                    Error::Interrupted { .. } | Error::Stopped { .. } | Error::Cancelled { .. } | Error::Aborted { .. },
-                    Some(signal),
-                ) => 128 + signal,
-                _ => FAILURE,
-            }
-        }
+    if ranks::count() > 1 && !matches!(command, commands::Command::Reconstruct(_)) {
+        let why = "several processes: they share the work of `conefield reconstruct` only";
+        return Err(Error::unsupported("mpirun", why));
     }
+    // `plugins` shows refused plugins itself.
+    if matches!(command, commands::Command::Plugins(_)) { Ok(()) } else { plugins::settle() }
 }

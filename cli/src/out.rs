@@ -56,7 +56,12 @@ pub fn json(value: &impl Serialize) -> Result<()> {
 }
 
 fn print(text: &str) -> Result<()> {
-    match writeln!(std::io::stdout(), "{text}") {
+    raw(format!("{text}\n").as_bytes())
+}
+
+/// Prints bytes as they are.
+pub fn raw(bytes: &[u8]) -> Result<()> {
+    match std::io::stdout().write_all(bytes) {
         Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output", e)),
         _ => Ok(()),
     }

@@ -46,9 +46,12 @@ pub struct Progress {
     latest: Record,
     records: Vec<Record>,
     log: Option<(PathBuf, File)>,
-    keeper: Option<Keeper>,
-    live: Option<Live>,
-    board: Option<Board>,
+    /// Checkpoints.
+    pub keeper: Option<Keeper>,
+    /// Live pictures.
+    pub live: Option<Live>,
+    /// The file for TensorBoard.
+    pub board: Option<Board>,
 }
 
 /// Path, interval and identity of checkpoints.
@@ -83,29 +86,6 @@ impl Progress {
             live: None,
             board: None,
         }
-    }
-
-    /// Adds checkpoints.
-    pub fn keeping(mut self, keeper: Option<Keeper>) -> Self {
-        self.keeper = keeper;
-        self
-    }
-
-    /// Adds live pictures.
-    pub fn showing(mut self, live: Option<Live>) -> Self {
-        self.live = live;
-        self
-    }
-
-    /// Adds a file for TensorBoard.
-    pub fn reporting(mut self, board: Option<Board>) -> Self {
-        self.board = board;
-        self
-    }
-
-    /// Returns the file for TensorBoard.
-    pub fn take_board(&mut self) -> Option<Board> {
-        self.board.take()
     }
 
     /// Calls `f` with the file for TensorBoard. After a failure the run continues without it.

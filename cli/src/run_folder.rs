@@ -1,7 +1,6 @@
 //! The folder of a run: `metrics.jsonl`, `spec.toml`, `live.png` and `events.out.tfevents.conefield` if requested, and
 //! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `volume-hu.nii.gz` if requested,
-//! `weights.safetensors`, `slices.png` and, last
-//! and only for a finished run, `record.json`.
+//! `weights.safetensors`, `slices.png` and, last and only for a finished run, `record.json`.
 
 use crate::boundary;
 use conefield::plugins::Used;
@@ -67,24 +66,12 @@ impl RunFolder {
 
     /// Refuses a folder with other content than a run, and a run with progress unless `force`.
     pub fn may_begin(&self, force: bool) -> Result<()> {
-        let path = self.0.path();
-        let place = path.display().to_string();
-        let entries = match fs::read_dir(path) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
-            entries => entries.map_err(|e| Error::io(path, e))?,
-        };
-        let mut strange = vec![];
-        for entry in entries {
-            let path = entry.map_err(|e| Error::io(path, e))?.path();
-            // A spec without a record beside it is the user's.
-            let own = path.ends_with("spec.toml") && !self.0.path().join("metrics.jsonl").exists();
-            let is_strange = !known(&path) || own;
-            strange.extend(is_strange.then(|| path.file_name().unwrap_or_default().to_string_lossy().into_owned()));
-        }
-        if let Some(other) = strange.iter().min() {
-            let found = format!("a folder with {other} in it");
-            return Err(Error::invalid(place, "output", found, "a new or empty folder"));
-        }
+        let place = self.0.path().display().to_string();
+        CONTENTS.entries(self.0.path())?;
+        // A spec without a record beside it is the user's.
+        let has = |name: &str| self.file(name).exists();
+        let own = has("spec.toml") && !has("metrics.jsonl");
+        ensure(!own, &place, "output", "a folder with spec.toml in it", "a new or empty folder")?;
         let expected = "a new or empty folder, or --force to replace the run";
         ensure(force || self.0.progressed() == Progressed::Nothing, &place, "output", "an earlier run", expected)
     }
@@ -121,31 +108,22 @@ impl RunFolder {
         Ok((path, file))
     }
 
-    /// Opens `metrics.jsonl` of an interrupted run without the records after `step`, which will be repeated.
-    pub fn metrics_until(&self, step: u64) -> Result<(PathBuf, File)> {
+    /// Opens `metrics.jsonl` of an interrupted run without the records after `step`, which will be repeated. Also returns
+    /// loss and held-out error of the last record that stays.
+    pub fn metrics_until(&self, step: u64) -> Result<((PathBuf, File), Option<Record>)> {
         let path = self.file("metrics.jsonl");
         let io = |e| Error::io(&path, e);
-        let before = |line: &&str| {
-            let record: Option<serde_json::Value> = serde_json::from_str(line).ok();
-            record.and_then(|r| r["step"].as_u64()).is_some_and(|s| s <= step)
-        };
-        // The last line may be incomplete.
         let text = fs::read(&path).map_err(io)?;
-        let kept: String = String::from_utf8_lossy(&text).lines().filter(before).flat_map(|l| [l, "\n"]).collect();
+        let text = String::from_utf8_lossy(&text);
+        // The last line may be incomplete.
+        let records = text.lines().filter_map(|line| Some((line, serde_json::from_str::<Value>(line).ok()?)));
+        let before: Vec<_> = records.filter(|(_, r)| r["step"].as_u64().is_some_and(|s| s <= step)).collect();
+        let kept: String = before.iter().flat_map(|(line, _)| [line, "\n"]).collect();
+        let [loss, held_out] = ["loss", "held_out"].map(|key| before.last().and_then(|(_, r)| r[key].as_f64()));
+        let last = before.last().map(|_| Record { loss, held_out, ..Record::default() });
         conefield_io::write_text_atomic(&path, &kept)?;
         let file = File::options().append(true).open(&path).map_err(io)?;
-        Ok((path, file))
-    }
-
-    /// Loss and held-out error of the last record of metrics.jsonl.
-    pub fn last_record(&self) -> Result<Option<Record>> {
-        let path = self.file("metrics.jsonl");
-        let text = fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
-        let last = text.lines().rev().find_map(|line| serde_json::from_str::<Value>(line).ok());
-        let number = |value: &Value| value.as_f64();
-        let known =
-            |r: Value| Record { loss: number(&r["loss"]), held_out: number(&r["held_out"]), ..Record::default() };
-        Ok(last.map(known))
+        Ok(((path, file), last))
     }
 
     /// Finishes the run: removes its checkpoint and the run it replaced.
@@ -160,10 +138,14 @@ impl RunFolder {
 
 /// A run read from its folder.
 pub struct RunOnDisk {
-    folder: PathBuf,
-    spec: String,
-    curves: Vec<Value>,
-    record: Option<Value>,
+    /// Its folder.
+    pub folder: PathBuf,
+    /// The spec with all settings; empty if it is missing.
+    pub spec: String,
+    /// The lines of `metrics.jsonl`.
+    pub curves: Vec<Value>,
+    /// `record.json` of a finished run.
+    pub record: Option<Value>,
     known: Option<Known>,
 }
 
@@ -198,26 +180,6 @@ impl RunOnDisk {
         // The last line of a killed run may be incomplete.
         let curves = text("metrics.jsonl")?.lines().filter_map(|l| serde_json::from_str(l).ok()).collect();
         Ok(Self { folder: folder.to_path_buf(), spec: text("spec.toml")?, curves, record, known })
-    }
-
-    /// The run's folder.
-    pub fn folder(&self) -> &Path {
-        &self.folder
-    }
-
-    /// The spec with all settings; empty if it is missing.
-    pub fn spec(&self) -> &str {
-        &self.spec
-    }
-
-    /// The lines of `metrics.jsonl`.
-    pub fn curves(&self) -> &[Value] {
-        &self.curves
-    }
-
-    /// `record.json` of a finished run.
-    pub fn record(&self) -> Option<&Value> {
-        self.record.as_ref()
     }
 
     /// Whether the run is finished.

@@ -1,6 +1,6 @@
 //! An external program that segments a volume, such as an installed TotalSegmentator.
 
-use crate::signals;
+use crate::{program, signals};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::scan::Volume;
 use ndarray::Array3;
@@ -9,12 +9,9 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 use std::process::{Command, ExitStatus, Stdio};
 use std::str::FromStr;
-use std::time::Duration;
 
 /// Placeholders of the files in the command.
 const FILES: [&str; 2] = ["{in}", "{out}"];
-/// Interval between two checks of the process.
-const LOOK: Duration = Duration::from_millis(20);
 /// Maximum bytes of a failed command's output in an error.
 const TAIL: u64 = 600;
 
@@ -82,7 +79,6 @@ impl Segmenter {
             .truncate(true)
             .open(&log)
             .map_err(|e| Error::io(&log, e))?;
-        let io = |e: std::io::Error| Error::unsupported(format!("segmenter {}", self.program), e.to_string());
         let arguments = self
             .arguments
             .iter()
@@ -90,18 +86,12 @@ impl Segmenter {
         let mut command = Command::new(&self.program);
         command.args(arguments).stdin(Stdio::null()).stdout(Stdio::null());
         command.stderr(errors.try_clone().map_err(|e| Error::io(&log, e))?);
-        let mut child = command.spawn().map_err(io)?;
-        let status = loop {
-            if let Some(status) = child.try_wait().map_err(io)? {
-                break status;
-            }
-            if signals::caught().is_some() {
-                let _ = child.kill();
-                let _ = child.wait();
-                return Err(Error::Aborted { part: format!("the segmentation of {name}") });
-            }
-            std::thread::sleep(LOOK);
-        };
+        let what = format!("segmenter {}", self.program);
+        let mut child = command.spawn().map_err(|e| Error::unsupported(&what, e.to_string()))?;
+        let status = program::wait(&mut child, &what, &mut || match signals::caught() {
+            Some(_) => Err(Error::Aborted { part: format!("the segmentation of {name}") }),
+            None => Ok(()),
+        })?;
         Ok((status, tail(&mut errors).map_err(|e| Error::io(&log, e))?))
     }
 }

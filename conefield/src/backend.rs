@@ -12,7 +12,10 @@ use std::str::FromStr;
 use std::sync::OnceLock;
 
 /// Help text of `--backend`.
-pub const HELP: &str = "Backend: auto (the CPU, whose results repeat to the bit), cpu, wgpu, wgpu:N for adapter N, or wgpu:N,M,... for a volume that several adapters share";
+pub const HELP: &str = "Backend: auto (the CPU, whose results repeat to the bit), cpu, wgpu, or wgpu:N for adapter N";
+
+/// The same for [`BackendChoice::open_for_run`].
+pub const HELP_OF_A_RUN: &str = "Backend: auto (the CPU, whose results repeat to the bit), cpu, wgpu, wgpu:N for adapter N, or wgpu:N,M,... for a volume that several adapters share";
 
 /// Value of `--backend`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -66,6 +69,14 @@ impl Serialize for BackendChoice {
 }
 
 impl BackendChoice {
+    /// The name with which the description of the opened backend begins.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Auto | Self::Cpu => "cpu",
+            Self::Wgpu { .. } => "wgpu",
+        }
+    }
+
     /// Opens the backend.
     pub fn open(&self) -> Result<Box<dyn Backend>> {
         // Each process takes one of the adapters in turn.

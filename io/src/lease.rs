@@ -41,6 +41,25 @@ pub struct Contents {
     pub progressed: fn(&Path) -> Progressed,
 }
 
+impl Contents {
+    /// The paths in `folder`, sorted; none if there is no folder. Refuses a folder with anything that its commands do not
+    /// write.
+    pub fn entries(&self, folder: &Path) -> Result<Vec<PathBuf>> {
+        let at = |e| Error::io(folder, e);
+        let entries = match fs::read_dir(folder) {
+            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
+            entries => entries.map_err(at)?,
+        };
+        let mut all = entries.map(|entry| Ok(entry.map_err(at)?.path())).collect::<Result<Vec<PathBuf>>>()?;
+        all.sort();
+        if let Some(other) = all.iter().find(|path| !(self.known)(path)) {
+            let found = format!("a folder with {} in it", other.file_name().unwrap_or_default().to_string_lossy());
+            return Err(Error::invalid(folder.display().to_string(), "output", found, "a new or empty folder"));
+        }
+        Ok(all)
+    }
+}
+
 /// A folder that only this process writes.
 pub struct Lease {
     path: PathBuf,

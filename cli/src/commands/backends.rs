@@ -1,6 +1,6 @@
 //! `conefield backends`
 
-use crate::out;
+use crate::out::{self, bytes};
 use clap::Args;
 use conefield::machine::simd_level;
 use conefield::tradeoff::speed::pass_s;
@@ -42,7 +42,6 @@ impl BackendsArgs {
 
 /// One line about an adapter and its limits.
 fn line(a: &Adapter) -> String {
-    let bytes = |n: u64| out::bytes(n);
     let subgroups = a.subgroups.map_or(String::new(), |[least, most]| match least == most {
         true => format!(", subgroups of {least}"),
         false => format!(", subgroups of {least} to {most}"),

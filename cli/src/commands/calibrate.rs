@@ -1,6 +1,6 @@
 //! `conefield calibrate`
 
-use crate::boundary::{self, Inputs, refuse_existing};
+use crate::boundary::{self, Inputs};
 use crate::progress::Progress;
 use crate::{out, signals};
 use clap::Args;
@@ -64,9 +64,7 @@ impl CalibrateArgs {
         let inputs = Inputs::of([&self.scan]);
         boundary::picture(self.png.as_deref(), &inputs)?;
         if let Some(output) = &self.output {
-            refuse_existing(output, self.force)?;
-            inputs.spare_file(output)?;
-            inputs.spare_folder(output)?;
+            inputs.spare(output, self.force)?;
         }
         let backend = self.backend.open()?;
         let size = conefield_io::scan_size(&self.scan)?;

@@ -1,12 +1,12 @@
 //! A run as part of a comparison or a study: how it starts, and its process.
 
 use super::protocol::RunProtocol;
-use super::reconstruct::{budget, identity};
+use super::reconstruct::{conditions, identity};
 use super::trial::Trial;
 use super::{EndOptions, General};
-use crate::out;
 use conefield::files;
 use conefield::plugins::{self, Used};
+use conefield::record::ScanRecord;
 use conefield::study::method::Method;
 use conefield::tradeoff::json::{LONGEST, read_json};
 use conefield::tradeoff::trial::TrialInput;
@@ -14,7 +14,7 @@ use conefield_core::Result;
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// How a run starts, given the content of its folder.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,10 +32,10 @@ pub enum Start {
 /// A method on a scan.
 pub struct Cell<'a> {
     pub method: &'a Method,
-    pub scan: &'a Path,
+    pub scan: PathBuf,
     /// The run's folder.
-    pub run: &'a Path,
-    pub protocol: &'a RunProtocol,
+    pub run: PathBuf,
+    pub protocol: RunProtocol,
 }
 
 /// Whether `folder` holds a finished run.
@@ -55,9 +55,9 @@ impl Cell<'_> {
         }
         let mut now = identity(&method.loaded, protocol, &input.held, &input.scan)?;
         if is_done(run) {
-            let reference = protocol.reference.as_ref().map(|r| r.display().to_string());
-            now.insert("reference".into(), Value::from(reference).to_string());
+            now.insert("reference".into(), Value::from(protocol.named_reference()).to_string());
             now.insert("peak".into(), input.peak.to_string());
+            now.insert("backend".into(), protocol.backend.kind().into());
             files::same_run(&run.join("record.json").display().to_string(), &recorded(run)?, &now)?;
             return Ok(Start::Done);
         }
@@ -79,7 +79,6 @@ impl Cell<'_> {
             Start::Anew => vec![],
         };
         more.extend(self.method.init.as_ref().map(|i| format!("--init={i}")));
-        let more: Vec<&str> = more.iter().map(String::as_str).collect();
         let Self { method, scan, run, protocol } = self;
         Trial { scan, spec: &method.spec, output: run, protocol, more: &more }.run(part, general)
     }
@@ -91,34 +90,31 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
     struct Known {
         version: String,
         seed: u64,
-        scan: KnownScan,
+        scan: ScanRecord,
         held_out_views: Vec<usize>,
         limits: EndOptions,
         #[serde(default)]
         budget_s: Option<f64>,
         reference: Value,
         peak: f64,
+        backend: KnownBackend,
         #[serde(default)]
         plugins: Vec<Used>,
     }
     #[derive(Deserialize)]
-    struct KnownScan {
-        projections_fnv1a64: String,
-        geometry_fnv1a64: String,
+    struct KnownBackend {
+        backend: String,
     }
     let known: Known = read_json(&folder.join("record.json"))?;
     let mut all = BTreeMap::from([
         ("conefield".into(), known.version),
         ("seed".into(), known.seed.to_string()),
         ("spec".into(), conefield_core::files::read_text(&folder.join("spec.toml"), LONGEST)?),
-        ("projections".into(), known.scan.projections_fnv1a64),
-        ("geometry".into(), known.scan.geometry_fnv1a64),
-        ("budget".into(), budget(known.budget_s)),
-        ("held_out_views".into(), format!("{:?}", known.held_out_views)),
-        ("limits".into(), out::to_json(&known.limits)?),
         ("reference".into(), known.reference.to_string()),
         ("peak".into(), known.peak.to_string()),
+        ("backend".into(), known.backend.backend.split(',').next().unwrap_or_default().into()),
     ]);
+    all.extend(conditions(&known.scan, &known.held_out_views, &known.limits, known.budget_s)?);
     all.extend(plugins::identity(&known.plugins));
     Ok(all)
 }

@@ -21,7 +21,6 @@ use conefield_evaluation::report::Table;
 use conefield_io::{Contents, Lease, Progressed};
 use serde::Serialize;
 use std::fs;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use tracing::info;
 
@@ -104,10 +103,13 @@ impl CompareArgs {
         let mut lease = Lease::take(&self.output, CONTENTS)?;
         self.look_into_folder()?;
         self.spare_inputs(&methods)?;
-        let runs: Vec<PathBuf> = methods.iter().map(|m| self.output.join(&m.name)).collect();
-        let (scan, protocol) = (&self.scan, &self.protocol);
-        let cells = methods.iter().zip(&runs).map(|(method, run)| Cell { method, scan, run, protocol });
-        let cells: Vec<Cell> = cells.collect();
+        let cell = |method| Cell {
+            method,
+            scan: self.scan.clone(),
+            run: self.output.join(&method.name),
+            protocol: self.protocol.clone(),
+        };
+        let cells: Vec<Cell> = methods.iter().map(cell).collect();
         let start = |c: &Cell| if self.resume { c.start(&input) } else { Ok(Start::Anew) };
         let starts: Vec<Start> = cells.iter().map(start).collect::<Result<_>>()?;
         signals::listen()?;
@@ -175,23 +177,10 @@ impl CompareArgs {
 
     /// Refuses a folder with files that no comparison writes, and an earlier comparison without --force or --resume.
     fn look_into_folder(&self) -> Result<()> {
-        let place = self.output.display().to_string();
-        let entries = match fs::read_dir(&self.output) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
-            entries => entries.map_err(|e| Error::io(&self.output, e))?,
-        };
-        for entry in entries {
-            let entry = entry.map_err(|e| Error::io(&self.output, e))?;
-            let found = format!("a folder with {} in it", entry.file_name().to_string_lossy());
-            ensure(known(&entry.path()), &place, "output", found, "a new or empty folder")?;
-        }
+        CONTENTS.entries(&self.output)?;
         let expected = "a new or empty folder, --resume to continue or --force to replace it";
         let free = self.force || self.resume || progressed(&self.output) == Progressed::Nothing;
-        ensure(free, &place, "output", "an earlier comparison", expected)
-    }
-
-    fn reference(&self) -> Option<String> {
-        self.protocol.reference.as_ref().map(|r| r.display().to_string())
+        ensure(free, &self.output.display().to_string(), "output", "an earlier comparison", expected)
     }
 
     fn shared(&self, scan: ScanRecord, held_out_views: Vec<usize>, peak: f64, general: &General) -> Shared<'_> {
@@ -199,7 +188,7 @@ impl CompareArgs {
             version: env!("CARGO_PKG_VERSION"),
             scan,
             held_out_views,
-            reference: self.reference(),
+            reference: self.protocol.named_reference(),
             peak,
             seed: self.protocol.seed,
             limits: &self.protocol.ends,
@@ -218,9 +207,9 @@ fn entry(cell: &Cell, start: Start, part: String, general: &General) -> Result<E
     info!("{part}{}", if start == Start::Done { " is already finished" } else { "" });
     let outcome = match cell.carry_out(start, part, general)? {
         Some(error) => Outcome::failed(error),
-        None => Outcome::of_run(cell.run)?,
+        None => Outcome::of_run(&cell.run)?,
     };
-    Ok(Entry { name: cell.method.name.clone(), spec: cell.method.spec.clone(), run: cell.run.to_path_buf(), outcome })
+    Ok(Entry { name: cell.method.name.clone(), spec: cell.method.spec.clone(), run: cell.run.clone(), outcome })
 }
 
 /// The results, for a picture.
@@ -235,9 +224,9 @@ const CONTENTS: Contents = Contents { known, progressed };
 /// Whether a comparison may have written this path: one of its files, or a run's folder.
 fn known(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default();
-    let own = FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(name) || conefield_io::is_aside(name);
     let run = || fs::read_dir(path).is_ok_and(|all| all.flatten().all(|e| run_folder::known(&e.path())));
-    if path.is_dir() { conefield_io::is_aside(name) || conefield_io::is_unfinished(name) || run() } else { own }
+    let own = if path.is_dir() { run() } else { FILES.iter().any(|f| name == *f) };
+    own || conefield_io::is_unfinished(name) || conefield_io::is_aside(name)
 }
 
 /// The progress of the comparison in `folder`.

@@ -1,10 +1,10 @@
 //! `conefield completions`
 
 use crate::boundary::refuse_existing;
+use crate::out;
 use clap::{Args, CommandFactory};
 use clap_complete::{Shell, generate};
 use conefield_core::{Error, Result};
-use std::io::{ErrorKind, Write};
 use std::path::PathBuf;
 
 /// Print completions for a shell, or write manual pages.
@@ -38,9 +38,6 @@ impl CompletionsArgs {
             generate(shell, &mut command, "conefield", &mut script);
         }
         // Written byte for byte, as the reader is a shell.
-        match std::io::stdout().write_all(&script) {
-            Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output", e)),
-            _ => Ok(()),
-        }
+        out::raw(&script)
     }
 }

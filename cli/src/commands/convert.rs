@@ -3,7 +3,7 @@
 use super::corrections::{CorrectionOptions, corrected_size, log_applied};
 use super::selection::SelectionOptions;
 use super::units::{HounsfieldOption, unit_of};
-use crate::boundary::{Inputs, refuse_existing};
+use crate::boundary::Inputs;
 use crate::out;
 use clap::{Args, ValueEnum};
 use conefield::files;
@@ -66,10 +66,8 @@ enum ScanFormat {
 impl ConvertArgs {
     pub fn run(self) -> Result<()> {
         std::fs::metadata(&self.input).map_err(|e| Error::io(&self.input, e))?;
-        refuse_existing(&self.output, self.force)?;
         let inputs = Inputs::of([&self.input]).and(self.units.path()).and(&self.dicom_template);
-        inputs.spare_file(&self.output)?;
-        inputs.spare_folder(&self.output)?;
+        inputs.spare(&self.output, self.force)?;
         let (selection, corrections) = (self.selection.selection(), self.corrections.corrections()?);
         if conefield_io::is_volume(&self.input) {
             let named = self.selection.named().or((!corrections.is_none()).then_some("--correct"));

@@ -58,7 +58,7 @@ pub struct EvaluateArgs {
 }
 
 /// All requested scores.
-#[derive(Serialize)]
+#[derive(Default, Serialize)]
 struct Evaluation {
     #[serde(flatten)]
     scores: Option<Scores>,
@@ -99,7 +99,7 @@ impl EvaluateArgs {
         let reference = conefield_io::read_volume(&self.reference)?.data;
         same_shape(&self.volume.display().to_string(), volume.shape(), reference.shape())?;
         let material = Some(agreement(volume.view(), reference.view(), threshold)?);
-        Ok(Evaluation { scores: None, peak: None, dice: None, material })
+        Ok(Evaluation { material, ..Evaluation::default() })
     }
 
     /// The Dice scores of two label maps.
@@ -108,7 +108,7 @@ impl EvaluateArgs {
             |path: &PathBuf| label_map(&path.display().to_string(), conefield_io::read_volume(path)?.data.view());
         let (volume, reference) = (read(&self.volume)?, read(&self.reference)?);
         same_shape(&self.volume.display().to_string(), volume.shape(), reference.shape())?;
-        Ok(Evaluation { scores: None, peak: None, dice: Some(dice(volume.view(), reference.view())?), material: None })
+        Ok(Evaluation { dice: Some(dice(volume.view(), reference.view())?), ..Evaluation::default() })
     }
 
     /// The scores of a volume, with the Dice of the segmentations of volume and reference.

@@ -8,6 +8,7 @@ use clap::Args;
 use conefield::files;
 use conefield::memory::Memory;
 use conefield_backend_cpu::Cpu;
+use conefield_core::error::ensure;
 use conefield_core::finite::range;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Volume};
@@ -46,15 +47,17 @@ impl InfoArgs {
         boundary::picture(png, &Inputs::of([path]))?;
         let ends = |end: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(end));
         let mut head = String::new();
-        let found = if ends("safetensors") {
-            no_picture(path, png)?;
-            weights(path)?
+        let other: Option<fn(&Path) -> Result<Value>> = if ends("safetensors") {
+            Some(weights)
         } else if ends("xml") && conefield_io::scan_size(path).is_err() {
-            no_picture(path, png)?;
-            geometry(path)?
-        } else if RunOnDisk::is(path) {
-            no_picture(path, png)?;
-            run(path)?
+            Some(geometry)
+        } else {
+            RunOnDisk::is(path).then_some(run)
+        };
+        let found = if let Some(describe) = other {
+            let expected = "a scan or a volume";
+            ensure(png.is_none(), &path.display().to_string(), "--png", "a file of another kind", expected)?;
+            describe(path)?
         } else if conefield_io::is_volume(path) {
             volume(path, png)?
         } else {
@@ -74,17 +77,17 @@ fn run(path: &Path) -> Result<Value> {
     let files: Vec<&str> = run_folder::FILES.into_iter().filter(|f| path.join(f).exists()).collect();
     let run = RunOnDisk::read(path)?;
     let mut found = json!({ "kind": "run", "status": run.status(), "files": files });
-    if let Some(record) = run.record() {
+    if let Some(record) = &run.record {
         let mut record = record.clone();
         // Programs read the record from its own file.
         if let Some(map) = record.as_object_mut() {
             ["memory", "backend", "plan"].iter().for_each(|key| drop(map.remove(*key)));
         }
         found["record"] = record;
-    } else if let Some(last) = run.curves().last() {
+    } else if let Some(last) = run.curves.last() {
         found["last_record"] = last.clone();
     }
-    found["spec"] = json!(run.spec());
+    found["spec"] = json!(run.spec);
     Ok(found)
 }
 
@@ -95,16 +98,6 @@ pub fn warnings(value: &Value) -> String {
         Some(format!("\n\nwarning: {}{advice}", w["found"].as_str()?))
     };
     value["warnings"].as_array().into_iter().flatten().filter_map(one).collect()
-}
-
-fn no_picture(path: &Path, png: Option<&Path>) -> Result<()> {
-    match png {
-        None => Ok(()),
-        Some(_) => {
-            let expected = "a scan or a volume";
-            Err(Error::invalid(path.display().to_string(), "--png", "a file of another kind", expected))
-        }
-    }
 }
 
 fn statistics(values: ArrayView3<'_, f32>) -> Value {

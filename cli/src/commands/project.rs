@@ -1,6 +1,6 @@
 //! `conefield project`
 
-use crate::boundary::{Inputs, refuse_existing};
+use crate::boundary::Inputs;
 use crate::{out, signals};
 use clap::Args;
 use conefield::memory::{self, Memory};
@@ -52,9 +52,7 @@ impl ProjectArgs {
     pub fn run(self) -> Result<()> {
         let inputs = Inputs::of([&self.volume, &self.like]);
         for folder in std::iter::once(&self.output).chain(&self.residual) {
-            refuse_existing(folder, self.force)?;
-            inputs.spare_file(folder)?;
-            inputs.spare_folder(folder)?;
+            inputs.spare(folder, self.force)?;
         }
         let twice = self.residual.as_ref() == Some(&self.output);
         ensure(!twice, "command line", "--residual", "the folder of the predicted views", "another folder")?;

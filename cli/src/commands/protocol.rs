@@ -24,7 +24,7 @@ pub struct RunProtocol {
     /// Time of the whole command, from start to last file, such as 60s or 10m.
     #[arg(long, value_name = "TIME", value_parser = parse::seconds, conflicts_with_all = ["steps", "seconds", "at_most"])]
     pub budget: Option<f64>,
-    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP)]
+    #[arg(long, value_name = "BACKEND", default_value_t, help = backend::HELP_OF_A_RUN)]
     pub backend: BackendChoice,
     /// The reference volume to score against: a file, or "truth" for the one in the scan.
     #[arg(long, value_name = "VOLUME")]
@@ -44,6 +44,11 @@ impl RunProtocol {
     /// The data range of the scores.
     pub fn peak(&self, reference: Option<&Volume>) -> f64 {
         reference.map_or(self.peak.unwrap_or(1.0), |r| score::peak(self.peak, r))
+    }
+
+    /// The reference as it is named.
+    pub fn named_reference(&self) -> Option<String> {
+        self.reference.as_ref().map(|r| r.display().to_string())
     }
 
     /// Indices of the held-out views, of `n`. Refuses a choice without any.
@@ -92,14 +97,12 @@ mod tests {
 
     #[test]
     fn a_child_gets_the_same_options() {
-        let full = "x --checkpoint-every 0.1m --set a=b --set c=[1,2] ENDS --backend wgpu:2 \
-                    --reference -v.nii --peak 2.5 --hold-out";
-        for (held, ends) in [("3,17", "--seconds 1h --steps 7 --at-most 1e-9s"), ("every:10", "--budget 2m")] {
-            // `--reference -v.nii` needs its equals sign.
-            let line: Vec<String> =
-                full.replace("ENDS", ends).replace("--reference ", "--reference=").split(' ').map(Into::into).collect();
-            let line: Vec<String> = line.into_iter().filter(|w| !w.is_empty()).chain([held.into()]).collect();
-            let first = Line::try_parse_from(line).unwrap().protocol;
+        for ends in ["3,17 --seconds 1h --steps 7 --at-most 1e-9s", "every:10 --budget 2m"] {
+            let line = format!(
+                "x --checkpoint-every 0.1m --set a=b --set c=[1,2] --backend wgpu:2 --reference=-v.nii --peak 2.5 \
+                 --hold-out {ends}"
+            );
+            let first = Line::try_parse_from(line.split(' ')).unwrap().protocol;
             let again = [OsString::from("x")].into_iter().chain(first.arguments());
             let second = Line::try_parse_from(again).unwrap().protocol;
             assert_eq!(format!("{first:?}"), format!("{second:?}"));

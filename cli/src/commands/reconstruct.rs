@@ -2,7 +2,7 @@
 
 use super::summary::summary;
 use super::units::HounsfieldOption;
-use super::{calibrate, protocol::RunProtocol, watch};
+use super::{EndOptions, calibrate, protocol::RunProtocol, watch};
 use crate::board::Board;
 use crate::boundary::{self, Inputs};
 use crate::live::Live;
@@ -23,7 +23,7 @@ use conefield::{files, ranks, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
-use conefield_core::method::{Observer, Record};
+use conefield_core::method::Record;
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::{Loaded, to_toml};
 use conefield_core::{Error, Result};
@@ -102,21 +102,6 @@ const WATCHED: f64 = 5.0;
 /// A held-out error above this may be due to a wrong geometry.
 const DOUBTFUL: f64 = 0.05;
 
-/// The observer of a process that does not lead.
-struct Follower;
-
-impl Observer for Follower {
-    fn progress(&mut self, _: u64, _: f64, _: f64) {}
-
-    fn record(&mut self, _: &Record) {}
-
-    fn note(&mut self, _: &str) {}
-
-    fn cancelled(&self) -> bool {
-        signals::caught().is_some()
-    }
-}
-
 impl ReconstructArgs {
     pub fn run(self) -> Result<()> {
         if self.spec.is_none() && self.protocol.budget.is_none() {
@@ -154,7 +139,8 @@ impl ReconstructArgs {
         let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
         let mut run = session.plan(input, spent, &|| false)?;
         signals::listen()?;
-        match run.solve(None, resume.as_ref(), &mut Follower) {
+        // Such a process is quiet.
+        match run.solve(None, resume.as_ref(), &mut Progress::new("reconstruct", None)) {
             // The leading process writes the checkpoint and says so.
             Err(Error::Interrupted { .. }) => Ok(()),
             done => done.map(drop),
@@ -220,7 +206,7 @@ impl ReconstructArgs {
         }
         // A run resumed after its last pass adds no record.
         let last = progress.records().last().cloned().or(earlier);
-        let board = progress.take_board();
+        let board = progress.board.take();
         drop(progress);
 
         let (record, failed) =
@@ -259,11 +245,10 @@ impl ReconstructArgs {
             Ok(levels) => (levels.flatten(), None),
             Err(e) => (None, Some(e)),
         };
-        let path = |p: &PathBuf| p.display().to_string();
         let record = RunRecord {
             scan: Some(scan.clone()),
-            init: self.init.as_ref().map(path),
-            reference: self.protocol.reference.as_ref().map(path),
+            init: self.init.as_ref().map(|init| init.display().to_string()),
+            reference: self.protocol.named_reference(),
             hounsfield,
             ..run.record(solved, last, written)
         };
@@ -285,11 +270,11 @@ impl ReconstructArgs {
     /// The requested spec, or the front within a budget.
     fn session<'a>(&self, backend: &'a dyn Backend, begin: Instant) -> Result<Session<'a>> {
         let asked = self.asked();
-        let read = asked.as_ref().map(|(spec, _)| |sets: &[String]| specs::read(spec, sets));
+        let read = asked.as_ref().map(|spec| |sets: &[String]| specs::read(spec, sets));
         let request = Request {
             spec: read.as_ref().map(|read| read as Read<'_>),
             front: self.front.as_deref().map(Front::read).transpose()?,
-            sets: asked.as_ref().map_or_else(|| self.protocol.sets.clone(), |(_, sets)| sets.clone()),
+            sets: self.protocol.sets.clone(),
             // A run resumed without a spec reads the start from its own spec.
             init: self.init.clone().filter(|_| self.spec.is_some() || !self.resume),
             limits: self.protocol.ends.limits(),
@@ -329,26 +314,23 @@ impl ReconstructArgs {
         run: BTreeMap<String, String>,
     ) -> Result<Progress> {
         let board = self.tensorboard.then(|| Board::new(&folder.file("events.out.tfevents.conefield"), &metrics.0));
-        let keeper = Keeper {
+        let mut progress = Progress::new("reconstruct", Some(metrics));
+        progress.keeper = Some(Keeper {
             path: folder.file(CHECKPOINT),
             every: Duration::from_secs_f64(self.protocol.checkpoint_every),
             run,
             last: Instant::now(),
-        };
-        Ok(Progress::new("reconstruct", Some(metrics))
-            .keeping(Some(keeper))
-            .showing(
-                self.live.or(self.watch.map(|_| WATCHED)).map(|seconds| Live::new(folder.file("live.png"), seconds)),
-            )
-            .reporting(board.transpose()?))
+        });
+        let interval = self.live.or(self.watch.map(|_| WATCHED));
+        progress.live = interval.map(|seconds| Live::new(folder.file("live.png"), seconds));
+        progress.board = board.transpose()?;
+        Ok(progress)
     }
 
-    /// The requested spec and its changed settings. A resumed run reads its choice from its folder.
-    fn asked(&self) -> Option<(String, Vec<String>)> {
-        match &self.spec {
-            Some(spec) => Some((spec.clone(), self.protocol.sets.clone())),
-            None => self.resume.then(|| (self.output.join("spec.toml").display().to_string(), vec![])),
-        }
+    /// The requested spec. A resumed run reads its choice from its folder.
+    fn asked(&self) -> Option<String> {
+        let chosen = || self.output.join("spec.toml").display().to_string();
+        self.spec.clone().or_else(|| self.resume.then(chosen))
     }
 }
 
@@ -360,8 +342,7 @@ fn begin_or_go_on(
 ) -> Result<((PathBuf, File), Option<Record>)> {
     if let Some(resume) = resume {
         folder.go_on();
-        let metrics = folder.metrics_until(resume.standing.recorded)?;
-        return Ok((metrics, folder.last_record()?));
+        return folder.metrics_until(resume.standing.recorded);
     }
     folder.begin()?;
     conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
@@ -405,15 +386,22 @@ pub fn identity(
     scan: &ScanRecord,
 ) -> Result<BTreeMap<String, String>> {
     let mut all = specs::notes(loaded, protocol.seed)?;
-    all.insert("projections".into(), scan.projections_fnv1a64.clone());
-    all.insert("geometry".into(), scan.geometry_fnv1a64.clone());
-    all.insert("held_out_views".into(), format!("{held:?}"));
-    all.insert("limits".into(), out::to_json(&protocol.ends)?);
-    all.insert("budget".into(), budget(protocol.budget));
+    all.extend(conditions(scan, held, &protocol.ends, protocol.budget)?);
     Ok(all)
 }
 
-/// A budget as part of [`identity`].
-pub fn budget(seconds: Option<f64>) -> String {
-    seconds.map_or("none".into(), |s| s.to_string())
+/// The part of [`identity`] that is not in the spec.
+pub fn conditions(
+    scan: &ScanRecord,
+    held: &[usize],
+    ends: &EndOptions,
+    budget: Option<f64>,
+) -> Result<[(String, String); 5]> {
+    Ok([
+        ("projections".into(), scan.projections_fnv1a64.clone()),
+        ("geometry".into(), scan.geometry_fnv1a64.clone()),
+        ("held_out_views".into(), format!("{held:?}")),
+        ("limits".into(), out::to_json(ends)?),
+        ("budget".into(), budget.map_or("none".into(), |s| s.to_string())),
+    ])
 }

@@ -60,7 +60,7 @@ impl ReportArgs {
         refuse_existing(&self.output, self.force)?;
         let found = runs::find(&self.runs)?;
         Inputs::of(&self.runs)
-            .and(found.iter().map(RunOnDisk::folder))
+            .and(found.iter().map(|r| &r.folder))
             .and(found.iter().filter_map(|r| r.scan_path()))
             .and(found.iter().filter_map(|r| r.reference()))
             .and(&self.scan)

@@ -99,7 +99,7 @@ impl StudyArgs {
 
     /// Takes the folder. Refuses one with other files, or an earlier study without --force or --resume.
     fn take(&self, work: &Work<'_>, cells: &[Cell], inputs: &Inputs) -> Result<Hold> {
-        let mut lease = self.shard.is_none().then(|| Lease::take(&self.output, CONTENTS)).transpose()?;
+        let lease = self.shard.is_none().then(|| Lease::take(&self.output, CONTENTS)).transpose()?;
         let any = work.layout.look()?;
         inputs.spare_folder(&self.output)?;
         let goes_on = self.resume || self.shard.is_some();
@@ -115,12 +115,13 @@ impl StudyArgs {
             work.check_runs(cells)?;
         }
         signals::listen()?;
-        match &mut lease {
-            Some(lease) if goes_on && any => lease.go_on(),
-            Some(lease) => lease.replace()?,
-            None => return SharedLease::take(&self.output).map(Hold::Shared),
+        let Some(mut lease) = lease else { return SharedLease::take(&self.output).map(Hold::Shared) };
+        if goes_on && any {
+            lease.go_on();
+        } else {
+            lease.replace()?;
         }
-        lease.map(Hold::Alone).ok_or_else(|| Error::unsupported("study", "the folder is not held"))
+        Ok(Hold::Alone(lease))
     }
 
     /// Writes tables and pictures when all runs have ended, and reports the result.
@@ -215,7 +216,7 @@ impl Work<'_> {
             // A missing scan is simulated again bit-identically, and is checked then.
             if self.scan(&cells[0]).exists() && cells.iter().any(|c| self.run(c).exists()) {
                 let input = self.input(&cells[0])?;
-                cells.iter().try_for_each(|c| self.start(c, &input).map(drop))?;
+                cells.iter().try_for_each(|c| self.process(c).start(&input).map(drop))?;
             }
         }
         Ok(())
@@ -232,7 +233,7 @@ impl Work<'_> {
                 number += 1;
                 let part = format!("{} ({number} of {})", self.name(cell), cells.len());
                 self.await_run(cell, &part)?;
-                let start = self.start(cell, &input)?;
+                let start = self.process(cell).start(&input)?;
                 if start == Start::Done {
                     info!("{part} is already finished");
                     continue;
@@ -249,15 +250,11 @@ impl Work<'_> {
 
     /// Does a run. A failure is recorded in its folder.
     fn make_run(&self, cell: &Cell, start: Start, part: String) -> Result<()> {
-        let (scan, run, protocol, failure) =
-            (self.scan(cell), self.run(cell), self.protocol(cell), self.failure_file(cell));
+        let failure = self.failure_file(cell);
         if failure.exists() {
             fs::remove_file(&failure).map_err(|e| Error::io(&failure, e))?;
         }
-        let method = &self.study.methods[cell.method];
-        let made =
-            cell::Cell { method, scan: &scan, run: &run, protocol: &protocol }.carry_out(start, part, self.general)?;
-        let Some(error) = made else { return Ok(()) };
+        let Some(error) = self.process(cell).carry_out(start, part, self.general)? else { return Ok(()) };
         let folder = failure.parent().unwrap_or(Path::new(""));
         fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         conefield_io::write_text_atomic(&failure, &error)
@@ -296,10 +293,10 @@ impl Work<'_> {
         })
     }
 
-    fn start(&self, cell: &Cell, input: &TrialInput) -> Result<Start> {
-        let (scan, run, protocol) = (self.scan(cell), self.run(cell), self.protocol(cell));
+    /// A run with its method, scan and options.
+    fn process(&self, cell: &Cell) -> cell::Cell<'_> {
         let method = &self.study.methods[cell.method];
-        cell::Cell { method, scan: &scan, run: &run, protocol: &protocol }.start(input)
+        cell::Cell { method, scan: self.scan(cell), run: self.run(cell), protocol: self.protocol(cell) }
     }
 
     /// The options of a run.

@@ -7,6 +7,7 @@ use crate::boundary::Inputs;
 use crate::{out, signals};
 use clap::Args;
 use conefield::backend::{self, BackendChoice};
+use conefield::input::is_truth;
 use conefield::machine::simd_level;
 use conefield::parse::{self, HoldOut};
 use conefield::specs;
@@ -16,7 +17,7 @@ use conefield::tradeoff::search::{CONTENTS, Due, Earlier, Search};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use conefield_io::Lease;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Search for the best methods under time budgets.
 ///
@@ -98,7 +99,7 @@ impl TradeoffArgs {
             (_, true) => Earlier::Resume,
             _ => Earlier::Refuse,
         };
-        let named = self.reference.iter().filter(|r| *r != Path::new("truth"));
+        let named = self.reference.iter().filter(|r| !is_truth(r));
         let inputs = Inputs::of(&self.scans).and(named).and(&self.levers);
         // Also the specs that a list of levers names.
         let bases: Vec<_> = search.candidates.iter().map(|c| specs::read(&c.spec, &c.sets)).collect::<Result<_>>()?;
@@ -123,7 +124,7 @@ impl TradeoffArgs {
         let rising = self.budgets.windows(2).all(|w| w[0] < w[1]);
         ensure(rising, "tradeoff", "--budgets", format!("{:?} seconds", self.budgets), "ascending times")?;
         let all = self.reference.len();
-        let truth = all == 1 && self.reference[0] == Path::new("truth");
+        let truth = all == 1 && is_truth(&self.reference[0]);
         let fits = all == 0 || truth || all == self.scans.len();
         ensure(
             fits,
@@ -186,7 +187,7 @@ impl TradeoffArgs {
             output,
             protocol: &protocol,
             // Replaces the remains of an interrupted trial.
-            more: &["--force"],
+            more: &["--force".into()],
         };
         trial.run(part.clone(), general)
     }

@@ -9,13 +9,8 @@ use conefield::memory::Run;
 use conefield::tradeoff::trial::TrialInput;
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
-use std::io::Read;
 use std::path::Path;
 use std::process::{ExitStatus, Stdio};
-use std::time::Duration;
-
-/// Time between two checks of a run's process.
-const LOOK: Duration = Duration::from_millis(20);
 
 /// One run.
 pub struct Trial<'a> {
@@ -26,7 +21,7 @@ pub struct Trial<'a> {
     pub output: &'a Path,
     pub protocol: &'a RunProtocol,
     /// Further options.
-    pub more: &'a [&'a str],
+    pub more: &'a [String],
 }
 
 impl Trial<'_> {
@@ -36,29 +31,20 @@ impl Trial<'_> {
             return Err(Error::Stopped { part });
         }
         let mut command = program::command()?;
-        let io = |e| Error::io("conefield", e);
         command.args(general.arguments()).args(["reconstruct", "--as-part"]).args(self.more);
         command.arg(word("--spec", self.spec)).arg(word("--output", self.output));
         command.args(self.protocol.arguments()).arg("--").arg(self.scan);
-        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().map_err(io)?;
+        let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
+        let mut child = child.map_err(|e| Error::io("conefield", e))?;
         let mut input = child.stdin.take();
-        let output = child.stdout.take();
-        let said = std::thread::spawn(move || {
-            let mut said = vec![];
-            let _ = output.map(|mut o| o.read_to_end(&mut said));
-            String::from_utf8_lossy(&said).into_owned()
-        });
-        let status = loop {
-            if let Some(status) = child.try_wait().map_err(io)? {
-                break status;
-            }
-            // Ctrl-C reaches the child directly; a signal to this process alone reaches it through the end of its
-            // input.
+        let said = program::read(child.stdout.take());
+        // Ctrl-C reaches the child directly; a signal to this process alone reaches it through the end of its input.
+        let status = program::wait(&mut child, "conefield", &mut || {
             if signals::caught().is_some() {
                 input = None;
             }
-            std::thread::sleep(LOOK);
-        };
+            Ok(())
+        })?;
         drop(input);
         let said = said.join().unwrap_or_default();
         if let Some(signal) = ended_by(status).filter(|_| !status.success()).filter(|s| [2, 15].contains(s)) {

@@ -1,6 +1,7 @@
 //! NAF's pickle, which could run anything in Python.
 
 use crate::case::{Case, End, changed, cut_end, put, table};
+use conefield_core::geometry::{Millimetres, Radians, View};
 use conefield_tests::hostile::seeds::{SHAPE, naf, scan, volume};
 use std::path::Path;
 
@@ -28,24 +29,18 @@ fn float(from: f64, to: f64) -> impl Fn(&Path) + Sync + Send {
 
 /// Replaces the first projection value.
 fn projection(to: f32) -> impl Fn(&Path) + Sync + Send {
-    move |d| {
-        naf(d);
-        let path = d.join("scan.pickle");
-        let mut bytes = std::fs::read(&path).unwrap();
+    changed(naf, "scan.pickle", move |b| {
         let raw: Vec<u8> = scan().projections.iter().flat_map(|x| x.to_le_bytes()).collect();
-        let start = bytes.windows(raw.len()).position(|w| w == raw).expect("the projections as they are");
-        bytes[start..start + 4].copy_from_slice(&to.to_le_bytes());
-        put(path, bytes);
-    }
+        let start = b.windows(raw.len()).position(|w| w == raw).expect("the projections as they are");
+        b[start..start + 4].copy_from_slice(&to.to_le_bytes());
+    })
 }
 
 /// Angles in degrees, labelled as radians.
 fn degrees(d: &Path) {
-    let mut scan = scan();
+    let (mut scan, mm) = (scan(), Millimetres);
     for (i, view) in scan.geometry.views.iter_mut().enumerate() {
-        let turn = conefield_core::geometry::Radians(0.3 + i as f64);
-        let mm = conefield_core::geometry::Millimetres;
-        *view = conefield_core::geometry::View::circular(turn, mm(500.0), mm(800.0), [mm(2.0), mm(1.5)], [mm(0.0); 2]);
+        *view = View::circular(Radians(0.3 + i as f64), mm(500.0), mm(800.0), [mm(2.0), mm(1.5)], [mm(0.0); 2]);
     }
     conefield_io::write_naf(d.join("scan.pickle"), &scan, None, Some(&volume())).unwrap();
     let mut bytes = std::fs::read(d.join("scan.pickle")).unwrap();

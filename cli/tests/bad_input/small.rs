@@ -9,34 +9,29 @@ use std::path::Path;
 /// A shipped spec of a field.
 const NAF: &str = include_str!("../../../conefield/specs/naf.toml");
 
-/// Weights of one tensor whose notes name a network of 137 GB.
-fn huge_network(masks: &'static str) -> impl Fn(&Path) + Sync + Send {
-    move |d| {
-        let spec = NAF.replace("features = 2", "features = 8").replace("log2_table_size = 19", "log2_table_size = 28");
-        assert_ne!(spec, NAF);
-        let placement = format!(
-            "{{\"grid\":{{\"shape\":[8,8,8],\"spacing\":[1,1,1],\"center\":[0,0,0]}},\"attenuation\":0.02,\"unit_mm\":1.0,\
-             \"masks\":{masks}}}"
-        );
-        field(d, &spec, &placement);
-    }
-}
-
-fn field(d: &Path, spec: &str, placement: &str) {
-    let notes = [("spec", spec), ("placement", placement)].map(|(k, v)| (k.to_owned(), v.to_owned()));
+/// Weights of one tensor with these notes.
+fn field(d: &Path, spec: &str, attenuation: &str, unit_mm: &str, masks: &str) {
+    let placement = format!(
+        "{{\"grid\":{{\"shape\":[8,8,8],\"spacing\":[1,1,1],\"center\":[0,0,0]}},\"attenuation\":{attenuation},\
+         \"unit_mm\":{unit_mm},\"masks\":{masks}}}"
+    );
+    let notes = [("spec", spec), ("placement", &placement)].map(|(k, v)| (k.to_owned(), v.to_owned()));
     let tensors = [("encoder.table", vec![4], &[0.0f32; 4][..])];
     conefield_io::write_weights(d.join("w.safetensors"), &tensors, &BTreeMap::from(notes)).unwrap();
 }
 
+/// Weights whose notes name a network of 137 GB.
+fn huge_network(masks: &'static str) -> impl Fn(&Path) + Sync + Send {
+    move |d| {
+        let spec = NAF.replace("features = 2", "features = 8").replace("log2_table_size = 19", "log2_table_size = 28");
+        assert_ne!(spec, NAF);
+        field(d, &spec, "0.02", "1.0", masks);
+    }
+}
+
 /// Weights whose placement holds these two numbers.
 fn placed(attenuation: &'static str, unit_mm: &'static str) -> impl Fn(&Path) + Sync + Send {
-    move |d| {
-        let placement = format!(
-            "{{\"grid\":{{\"shape\":[8,8,8],\"spacing\":[1,1,1],\"center\":[0,0,0]}},\"attenuation\":{attenuation},\
-             \"unit_mm\":{unit_mm},\"masks\":[]}}"
-        );
-        field(d, NAF, &placement);
-    }
+    move |d| field(d, NAF, attenuation, unit_mm, "[]")
 }
 
 /// `z.npy` of zeros in gzip.

@@ -1,6 +1,6 @@
 //! TIFF stacks, through a scanner's description.
 
-use crate::case::{Case, End, changed, cut, cut_end, put, refused, replaced, table};
+use crate::case::{Case, End, changed, cut, cut_end, put, refused, replaced, table, then};
 use conefield_tests::hostile::seeds::{
     CIRCLE, scanner_tiff, scanner_tiff_deflate, scanner_tiff_lzw, scanner_tiff_zstd, scanner_toml,
 };
@@ -33,6 +33,25 @@ where
         put(d.join(FILE), file.into_inner());
         put(d.join("scanner.toml"), scanner_toml(FILE, CIRCLE));
     }
+}
+
+/// Pages of grey images.
+fn pages(write: fn(&mut TiffEncoder<&mut Cursor<Vec<u8>>>)) -> impl Fn(&Path) + Sync + Send {
+    then(scanner_tiff, move |d| {
+        let mut file = Cursor::new(Vec::new());
+        write(&mut TiffEncoder::new(&mut file).unwrap());
+        put(d.join(FILE), file.into_inner());
+    })
+}
+
+/// A folder with one image under these names.
+fn folder(names: &'static [&'static str]) -> impl Fn(&Path) + Sync + Send {
+    then(scanner_tiff, move |d| {
+        std::fs::create_dir(d.join("views")).unwrap();
+        let image = std::fs::read(d.join(FILE)).unwrap();
+        names.iter().for_each(|name| put(d.join(format!("views/{name}.tif")), &image));
+        put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
+    })
 }
 
 /// One directory with ImageJ's text, `counted` images in it and `stored` after each other: 2 x 3 pixels of 16 bits.
@@ -91,59 +110,33 @@ pub fn cases() -> Vec<Case> {
             IMPORT, ["page 0", "RGB", "grey"];
         "a pixel that is NaN", image::<colortype::Gray32Float>(2, 1, vec![1.0, f32::NAN], Compression::Uncompressed),
             IMPORT, ["row 0, column 1", "NaN"];
-        "a page of another size", |d| {
-            scanner_tiff(d);
-            let mut file = Cursor::new(Vec::new());
-            let mut w = TiffEncoder::new(&mut file).unwrap();
+        "a page of another size", pages(|w| {
             w.write_image::<colortype::Gray8>(3, 2, &[1; 6]).unwrap();
             w.write_image::<colortype::Gray8>(2, 3, &[1; 6]).unwrap();
-            put(d.join(FILE), file.into_inner());
-        }, IMPORT, ["page 1", "size of the first page"];
+        }), IMPORT, ["page 1", "size of the first page"];
         "fewer pages than angles",
             replaced(scanner_tiff, "scanner.toml", "range_deg = 360.0", "angles_deg = [0, 90, 180, 270]"),
             IMPORT, ["circle.angles_deg", "4 of them", "expected 3"];
         "deflate bomb: 90 million zeros in 90 kB",
             image::<colortype::Gray8>(9000, 10000, vec![0; 90_000_000], Compression::Deflate(Default::default())),
             IMPORT, ["page 0", "100 times"];
-        "a folder without images", |d| {
-            std::fs::create_dir(d.join("views")).unwrap();
-            put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
-        }, IMPORT, ["files.projections", ".tif"];
+        "a folder without images", folder(&[]), IMPORT, ["files.projections", ".tif"];
         "one directory for eight images, of which three are there", one_directory(Some(8), 3),
             IMPORT, ["images", "found 8 in the ImageDescription", "36 bytes"];
         "one directory, and images that nothing counts", one_directory(None, 3),
             IMPORT, ["file size", "24 bytes after the one page"];
-        "pages of other numbers", |d| {
-            scanner_tiff(d);
-            let mut file = Cursor::new(Vec::new());
-            let mut w = TiffEncoder::new(&mut file).unwrap();
+        "pages of other numbers", pages(|w| {
             w.write_image::<colortype::Gray16>(3, 2, &[1; 6]).unwrap();
             w.write_image::<colortype::Gray8>(3, 2, &[1; 6]).unwrap();
-            put(d.join(FILE), file.into_inner());
-        }, IMPORT, ["page 1", "8-bit unsigned", "16-bit unsigned"];
-        "a folder whose numbers have a gap", |d| {
-            scanner_tiff(d);
-            std::fs::create_dir(d.join("views")).unwrap();
-            let image = std::fs::read(d.join(FILE)).unwrap();
-            for i in [1, 2, 3, 4, 7, 8, 9] {
-                put(d.join(format!("views/view_{i:04}.tif")), &image);
-            }
-            put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
-        }, IMPORT, ["files.projections", "view_0004.tif and view_0007.tif"].ends(End::Warned);
-        "a folder with two series", |d| {
-            scanner_tiff(d);
-            std::fs::create_dir(d.join("views")).unwrap();
-            let image = std::fs::read(d.join(FILE)).unwrap();
-            for name in ["flat", "view_1", "view_2"] {
-                put(d.join(format!("views/{name}.tif")), &image);
-            }
-            put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
-        }, IMPORT, ["files.projections", "flat.tif and view_1.tif", "two series"].ends(End::Warned);
+        }), IMPORT, ["page 1", "8-bit unsigned", "16-bit unsigned"];
+        "a folder whose numbers have a gap",
+            folder(&["view_0001", "view_0002", "view_0003", "view_0004", "view_0007", "view_0008", "view_0009"]),
+            IMPORT, ["files.projections", "view_0004.tif and view_0007.tif"].ends(End::Warned);
+        "a folder with two series", folder(&["flat", "view_1", "view_2"]),
+            IMPORT, ["files.projections", "flat.tif and view_1.tif", "two series"].ends(End::Warned);
         "HND of Varian, cut off", |d| {
-            scanner_tiff(d);
-            std::fs::create_dir(d.join("views")).unwrap();
+            folder(&[])(d);
             put(d.join("views/Proj_00001.hnd"), b"VARIAN_VA_INTERNAL_HND_1.0");
-            put(d.join("scanner.toml"), scanner_toml("views", CIRCLE));
         }, IMPORT, ["Proj_00001.hnd", "header", "512 bytes"];
     };
     all.extend([

@@ -1,6 +1,6 @@
 //! Weights and checkpoints.
 
-use crate::case::{Case, changed, cut, cut_end, put, table};
+use crate::case::{Case, changed, cut, cut_end, put, table, then};
 use conefield_tests::hostile::seeds::{checkpoint, scan_toml, weights};
 use std::path::Path;
 
@@ -14,16 +14,9 @@ fn header(text: &'static str, data: usize) -> impl Fn(&Path) + Sync + Send {
     }
 }
 
-fn with_scan(make: impl Fn(&Path) + Sync + Send) -> impl Fn(&Path) + Sync + Send {
-    move |d| {
-        scan_toml(d);
-        make(d);
-    }
-}
-
 /// An interrupted run with this checkpoint.
-fn run(make: impl Fn(&Path) + Sync + Send) -> impl Fn(&Path) + Sync + Send {
-    with_scan(move |d| {
+fn run(make: impl Fn(&Path) + Sync + Send + 'static) -> impl Fn(&Path) + Sync + Send {
+    then(scan_toml, move |d| {
         make(d);
         std::fs::create_dir(d.join("run")).unwrap();
         std::fs::rename(d.join("c.safetensors"), d.join("run/checkpoint.safetensors")).unwrap();
@@ -56,10 +49,10 @@ pub fn cases() -> Vec<Case> {
             let text = "[".repeat(1000);
             put(d.join("w.safetensors"), [&1000u64.to_le_bytes(), text.as_bytes()].concat());
         }, INFO, ["header"];
-        "to start from: cut", with_scan(changed(weights, "w.safetensors", cut_end(1))),
+        "to start from: cut", then(scan_toml, changed(weights, "w.safetensors", cut_end(1))),
             INIT, ["w.safetensors", "header"];
-        "to start from: not there", with_scan(|_| ()), INIT, ["w.safetensors"];
-        "to start from: tensors of another network", with_scan(weights),
+        "to start from: not there", then(scan_toml, |_| ()), INIT, ["w.safetensors"];
+        "to start from: tensors of another network", then(scan_toml, weights),
             INIT, ["w.safetensors", "expected a tensor of shape"];
         "checkpoint: empty", run(|d| put(d.join("c.safetensors"), "")),
             RESUME, ["checkpoint.safetensors", "header length"];
@@ -72,6 +65,6 @@ pub fn cases() -> Vec<Case> {
             std::fs::rename(d.join("w.safetensors"), d.join("c.safetensors")).unwrap();
         }), RESUME, ["checkpoint.safetensors", "format"];
         "checkpoint: of another run", run(checkpoint), RESUME, ["checkpoint.safetensors", "--resume"];
-        "checkpoint: none", with_scan(|_| ()), RESUME, ["no checkpoint"];
+        "checkpoint: none", then(scan_toml, |_| ()), RESUME, ["no checkpoint"];
     }
 }

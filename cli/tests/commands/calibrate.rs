@@ -1,28 +1,23 @@
 //! `conefield calibrate`: a wrong geometry is corrected, and a right one is unchanged.
 
-use crate::common::{conefield, done, json, refused, text};
+use crate::common::{Folder, number};
 use conefield_core::geometry::{norm, sub};
 use conefield_core::orbit::CircularOrbit;
 use conefield_evaluation::report::Pixels;
 use conefield_projectors::simulate::{Ellipsoid, scan_ellipsoids};
 use serde_json::Value;
 use std::fs;
-use std::path::Path;
-use tempfile::tempdir;
 
-/// A noisy scan of a phantom in `folder`.
-fn scanned(folder: &Path) {
-    let size = ["--views", "30", "--detector", "48x48", "--noise", "poisson:1e5"];
-    done(&[&["simulate", "phantom:head:32", "-o", &text(folder)], &size[..]].concat());
-}
+/// A noisy scan of a phantom.
+const RIGHT: &str = "simulate phantom:head:32 -o right --views 30 --detector 48x48 --noise poisson:1e5";
 
-/// The same scan in `folder`, described with its detector shifted along u.
-fn shifted(scan: &Path, folder: &Path, pixels: f64) {
-    let mut scan = conefield_scans::read_scan(scan).unwrap();
+/// Writes that scan as `wrong`, with a changed orbit.
+fn described_wrongly(d: &Folder, change: impl Fn(&mut CircularOrbit)) {
+    let mut scan = conefield_scans::read_scan(d.at("right")).unwrap();
     let mut orbit = CircularOrbit::fit(&scan.geometry.views).unwrap();
-    orbit.offset[1] += pixels * orbit.pixel[1];
+    change(&mut orbit);
     scan.geometry.views = orbit.views();
-    conefield_io::write_scan(folder, &scan, None).unwrap();
+    conefield_io::write_scan(d.at("wrong"), &scan, None).unwrap();
 }
 
 /// The result for a parameter.
@@ -31,22 +26,13 @@ fn of<'a>(found: &'a Value, parameter: &str) -> &'a Value {
     all.iter().find(|f| f["parameter"] == parameter).unwrap()
 }
 
-fn number(value: &Value) -> f64 {
-    value.as_f64().unwrap()
-}
-
 #[test]
 fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
-    let dir = tempdir().unwrap();
-    let at = |n: &str| dir.path().join(n);
-    scanned(&at("right"));
-    shifted(&at("right"), &at("wrong"), -3.0);
-    let before = fs::read(at("wrong/scan.toml")).unwrap();
+    let d = Folder::after(&[RIGHT]);
+    described_wrongly(&d, |orbit| orbit.offset[1] -= 3.0 * orbit.pixel[1]);
+    let before = d.bytes("wrong/scan.toml");
 
-    let (wrong, out, png) = (text(&at("wrong")), text(&at("out")), text(&at("curves.png")));
-    let found = json(&[
-        "calibrate", &wrong, "-o", &out, "--png", &png, "--pixels", "24", "--parameters", "offset-u,rotation", "--json",
-    ]);
+    let found = d.json("calibrate wrong -o out --png curves.png --pixels 24 --parameters offset-u,rotation --json");
     let u = of(&found, "offset-u");
     assert_eq!((&u["verdict"], &u["unit"]), (&"corrected".into(), &"mm".into()), "{found}");
     let change = number(&u["change"]);
@@ -54,16 +40,15 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
     assert!((pixels - 3.0).abs() < 0.1 && deviation < 0.1, "{pixels} ± {deviation}");
     let held_out = &found["held_out"];
     assert!(number(&held_out["after"]) < 0.5 * number(&held_out["before"]), "{held_out}");
-    assert!(Pixels::open(at("curves.png")).unwrap().width > 1000);
+    assert!(Pixels::open(d.at("curves.png")).unwrap().width > 1000);
     // The curve has its minimum at the estimate.
     let curve = u["curve"].as_array().unwrap();
     let lowest = curve.iter().min_by(|a, b| number(&a[1]).total_cmp(&number(&b[1]))).unwrap();
     assert!((number(&lowest[0]) - change).abs() < 1e-9, "{lowest} {change}");
 
     // The input scan is unchanged, and the new one has the estimated geometry.
-    assert_eq!(fs::read(at("wrong/scan.toml")).unwrap(), before);
-    let corrected = conefield_scans::read_scan(at("out")).unwrap();
-    let right = conefield_scans::read_scan(at("right")).unwrap();
+    assert_eq!(d.bytes("wrong/scan.toml"), before);
+    let [corrected, right] = ["out", "right"].map(|name| conefield_scans::read_scan(d.at(name)).unwrap());
     assert_eq!(corrected.projections, right.projections);
     // The first source is on the axis x, so u is along y.
     let moved = corrected.geometry.views[0].detector[1] - right.geometry.views[0].detector[1];
@@ -72,67 +57,33 @@ fn a_shifted_detector_is_found_and_a_right_one_is_left_alone() {
     assert!((number(&note["change"]) - change).abs() < 1e-9, "{note}");
 
     // Calibrated again, nothing is left to correct along u, nor in the scan whose geometry was right from the start.
-    for scan in [&out, &text(&at("right"))] {
-        let again = json(&["calibrate", scan, "--pixels", "24", "--parameters", "offset-u", "--json"]);
-        assert_eq!(of(&again, "offset-u")["verdict"], "kept", "{again}");
-        assert_eq!(again["output"], Value::Null);
+    let again = d.json("calibrate out --pixels 24 --parameters offset-u --json");
+    assert_eq!(of(&again, "offset-u")["verdict"], "kept", "{again}");
+    assert_eq!(again["output"], Value::Null);
+    let said = d.done("calibrate right -o same --pixels 24 --parameters offset-u --jitter");
+    for words in ["right: unchanged", "held-out error", "shifts of single views", "not clear: unchanged"] {
+        assert!(said.contains(words), "{said}");
     }
-    let said = done(&["calibrate", &text(&at("right")), "--pixels", "24", "--parameters", "offset-u"]);
-    assert!(said.contains("right: unchanged") && said.contains("held-out error"), "{said}");
-
-    // `info` warns about the wrong geometry and not about the right one.
-    let warned = done(&["info", &wrong]);
-    assert!(warned.contains("conefield calibrate"), "{warned}");
-    assert!(!done(&["info", &text(&at("right"))]).contains("conefield calibrate"));
-}
-
-/// Views that are shifted alternately along u and v.
-#[test]
-fn shifts_of_single_views_are_corrected_and_steady_views_are_unchanged() {
-    let dir = tempdir().unwrap();
-    let at = |n: &str| dir.path().join(n);
-    scanned(&at("right"));
-    let mut scan = conefield_scans::read_scan(at("right")).unwrap();
-    for (i, view) in scan.geometry.views.iter_mut().enumerate() {
-        let [along_v, along_u] = [[1.0, -0.5], [-1.0, 0.0], [0.0, 1.5], [0.0, -1.0]][i % 4];
-        view.detector = std::array::from_fn(|k| view.detector[k] + along_v * view.v[k] + along_u * view.u[k]);
-    }
-    conefield_io::write_scan(at("wrong"), &scan, None).unwrap();
-    let calibrate = |name: &str, out: &str| {
-        let [scan, out] = [name, out].map(|n| text(&at(n)));
-        json(&["calibrate", &scan, "-o", &out, "--pixels", "48", "--parameters", "offset-u", "--jitter", "--json"])
-    };
-    let found = calibrate("wrong", "corrected");
-    assert_eq!(found["jitter"]["verdict"], "corrected", "{found}");
-    let [before, after] = [0, 1].map(|i| number(&found["jitter"]["held_out"][i]));
-    assert!(after < 0.8 * before, "{found}");
-    let provenance = conefield_scans::read_scan(at("corrected")).unwrap().provenance;
-    assert!(number(&provenance["jitter"]["rms_pixels"]["u"]) > 0.5, "{provenance}");
-
-    assert_eq!(calibrate("right", "same")["jitter"]["verdict"], "kept");
-    let [same, right] = ["same", "right"].map(|n| conefield_scans::read_scan(at(n)).unwrap().geometry);
-    for (a, b) in same.views.iter().zip(&right.views) {
+    let same = conefield_scans::read_scan(d.at("same")).unwrap();
+    for (a, b) in same.geometry.views.iter().zip(&right.geometry.views) {
         assert!(norm(sub(a.detector, b.detector)) < 1e-9 * norm(b.detector), "{a:?} {b:?}");
     }
-    assert!(done(&["calibrate", &text(&at("wrong")), "--pixels", "32", "--jitter"]).contains("shifts of single views"));
+
+    // `info` warns about the wrong geometry and not about the right one.
+    let warned = d.done("info wrong");
+    assert!(warned.contains("conefield calibrate"), "{warned}");
+    assert!(!d.done("info right").contains("conefield calibrate"));
 }
 
 #[test]
 fn a_wrong_direction_of_rotation_is_reported() {
-    let dir = tempdir().unwrap();
-    let at = |n: &str| dir.path().join(n);
-    scanned(&at("right"));
-    let mut scan = conefield_scans::read_scan(at("right")).unwrap();
-    let mut orbit = CircularOrbit::fit(&scan.geometry.views).unwrap();
-    orbit.angles.iter_mut().for_each(|a| *a = -*a);
-    scan.geometry.views = orbit.views();
-    conefield_io::write_scan(at("wrong"), &scan, None).unwrap();
-    let calibrate = ["--pixels", "24", "--parameters", "offset-u"];
-    let printed = |name: &str| done(&[&["calibrate", &text(&at(name))], &calibrate[..]].concat());
+    let d = Folder::after(&[RIGHT]);
+    described_wrongly(&d, |orbit| orbit.angles.iter_mut().for_each(|a| *a = -*a));
+    let printed = |name: &str| d.done(&format!("calibrate {name} --pixels 24 --parameters offset-u"));
     let said = printed("wrong");
     assert!(said.contains("the other `direction`") && said.contains("--flip-columns"), "{said}");
     assert!(!printed("right").contains("direction"));
-    let found = json(&[&["calibrate", &text(&at("wrong"))], &calibrate[..], &["--json"]].concat());
+    let found = d.json("calibrate wrong --pixels 24 --parameters offset-u --json");
     let [given, reversed] = ["given", "reversed"].map(|k| number(&found["direction"][k]));
     assert!(reversed < 0.7 * given, "{found}");
 }
@@ -140,39 +91,28 @@ fn a_wrong_direction_of_rotation_is_reported() {
 /// A ball on the axis: with a detector rotated in its plane or a wider step, every view is the same.
 #[test]
 fn undetermined_parameters_are_unchanged() {
-    let dir = tempdir().unwrap();
-    let at = |n: &str| dir.path().join(n);
-    scanned(&at("right"));
-    let geometry = conefield_scans::read_scan(at("right")).unwrap().geometry;
-    let ball = Ellipsoid {
-        center: [0.0; 3],
-        axes: [0.2 * geometry.volume.size()[0]; 3],
-        value: 0.5 / geometry.volume.size()[0],
-    };
-    conefield_io::write_scan(at("ball"), &scan_ellipsoids(&[ball], geometry), None).unwrap();
-    let found =
-        json(&["calibrate", &text(&at("ball")), "--pixels", "24", "--parameters", "offset-u,rotation,step", "--json"]);
-    assert_eq!(of(&found, "rotation")["verdict"], "not-determined", "{found}");
-    assert_eq!(of(&found, "step")["verdict"], "not-determined", "{found}");
-    assert_eq!(of(&found, "offset-u")["verdict"], "kept", "{found}");
+    let d = Folder::after(&[RIGHT]);
+    let geometry = conefield_scans::read_scan(d.at("right")).unwrap().geometry;
+    let side = geometry.volume.size()[0];
+    let ball = Ellipsoid { center: [0.0; 3], axes: [0.2 * side; 3], value: 0.5 / side };
+    conefield_io::write_scan(d.at("ball"), &scan_ellipsoids(&[ball], geometry), None).unwrap();
+    let found = d.json("calibrate ball --pixels 24 --parameters offset-u,rotation,step --json");
+    for (parameter, verdict) in [("rotation", "not-determined"), ("step", "not-determined"), ("offset-u", "kept")] {
+        assert_eq!(of(&found, parameter)["verdict"], verdict, "{found}");
+    }
 }
 
 #[test]
 fn what_cannot_be_calibrated_is_refused() {
-    let dir = tempdir().unwrap();
-    let at = |n: &str| dir.path().join(n);
-    scanned(&at("scan"));
-    let scan = text(&at("scan"));
-    let said = refused(1, &["calibrate", &scan, "-o", &scan, "--force"]);
-    assert!(said.contains("that this command reads"), "{said}");
-    fs::create_dir(at("there")).unwrap();
-    fs::write(at("there/notes.txt"), "mine").unwrap();
-    assert!(refused(1, &["calibrate", &scan, "-o", &text(&at("there"))]).contains("--force"));
-    let few = text(&at("few"));
-    done(&["convert", &scan, &few, "--views", "0-6"]);
-    let said = refused(1, &["calibrate", &few, "-o", &text(&at("out"))]);
-    assert!(said.contains("views") && said.contains("found 7") && !at("out").exists(), "{said}");
-    let output = conefield(&["calibrate", &scan, "--parameters", "dso"]).assert().code(2).get_output().clone();
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert!(said.contains("object's size") && said.contains("offset-u"), "{said}");
+    let d = Folder::after(&[RIGHT, "convert right few --views 0-6"]);
+    fs::create_dir(d.at("there")).unwrap();
+    d.put("there/notes.txt", "mine");
+    d.refuses(
+        "out",
+        &[
+            ("calibrate right -o right --force", "that this command reads"),
+            ("calibrate right -o there", "--force"),
+            ("calibrate few -o out", "found 7"),
+        ],
+    );
 }

@@ -3,7 +3,7 @@
 //! The `sh` blocks of a page run in order, in a folder of their own, except those below `<!-- not run: REASON -->`. A
 //! `toml` block below a line that begins with a file name in backticks is written to that file first.
 
-use crate::common::{done, text};
+use crate::common::{Folder, number};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -57,20 +57,20 @@ fn pages() -> Vec<(String, String)> {
     pages
 }
 
-/// Writes the files and runs the commands of a page in `dir`; returns the number of blocks run.
-fn run(name: &str, page: &str, dir: &Path) -> usize {
+/// Writes the files and runs the commands of a page; returns the number of blocks run.
+fn run(d: &Folder, name: &str, page: &str) -> usize {
     let program = Path::new(env!("CARGO_BIN_EXE_conefield"));
     let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
     let mut ran = 0;
     for block in blocks(page) {
         let file = block.above.strip_prefix('`').and_then(|rest| rest.split_once('`')).map(|(file, _)| file);
         match (block.language, file) {
-            ("toml", Some(file)) => fs::write(dir.join(file), block.text).unwrap(),
+            ("toml", Some(file)) => d.put(file, block.text),
             ("sh", _) if !block.above.starts_with("<!-- not run: ") => {
                 let script = block.text.replace("--budget 60s", "--budget 12s");
                 let output = Command::new("bash")
                     .args(["-euo", "pipefail", "-c", &script])
-                    .current_dir(dir)
+                    .current_dir(d.at(""))
                     .env("PATH", &path)
                     .env_remove("CONEFIELD_PLUGIN_PATH")
                     .env("XDG_DATA_HOME", env!("CARGO_TARGET_TMPDIR"))
@@ -90,27 +90,25 @@ fn run(name: &str, page: &str, dir: &Path) -> usize {
 #[test]
 fn every_command_of_the_guide_works() {
     for (name, page) in pages().iter().filter(|(name, _)| name != "scan-in") {
-        let dir = tempfile::tempdir().unwrap();
-        let ran = run(name, page, dir.path());
+        let ran = run(&Folder::new(), name, page);
         let wanted =
             !["choosing", "gpu", "machines", "python", "troubleshooting", "writing-stages"].contains(&name.as_str());
         assert!(!wanted || ran > 0, "docs/guide/{name}.md: no block ran");
     }
 }
 
-/// Files of a scanner: counts of the projections of a phantom, in the geometry of the page.
-fn scanner_files(dir: &Path) {
-    let simulated = text(&dir.join("simulated"));
-    let [n, size] = ["24", "32x32"];
-    done(&["simulate", "phantom:head:32", "-o", &simulated, "--protocol", "r2", "--views", n, "--detector", size]);
-    fs::create_dir(dir.join("views")).unwrap();
-    let simulated = conefield_scans::read_scan(simulated).unwrap();
+/// A folder with the files of a scanner: counts of the projections of a phantom, in the geometry of the page.
+fn scanner_files() -> Folder {
+    let d = Folder::after(&["simulate phantom:head:32 -o simulated --protocol r2 --views 24 --detector 32x32"]);
+    fs::create_dir(d.at("views")).unwrap();
+    let simulated = conefield_scans::read_scan(d.at("simulated")).unwrap();
     for (i, view) in simulated.projections.outer_iter().enumerate() {
         let counts: Vec<u16> = view.iter().map(|a| DARK + (OPEN * (-a).exp()) as u16).collect();
-        tiff(&dir.join("views").join(format!("view{i}.tif")), 32, &counts);
+        tiff(&d.at(format!("views/view{i}.tif")), 32, &counts);
     }
-    tiff(&dir.join("flat.tif"), 32, &[DARK + OPEN as u16; 32 * 32]);
-    tiff(&dir.join("dark.tif"), 32, &[DARK; 32 * 32]);
+    tiff(&d.at("flat.tif"), 32, &[DARK + OPEN as u16; 32 * 32]);
+    tiff(&d.at("dark.tif"), 32, &[DARK; 32 * 32]);
+    d
 }
 
 fn tiff(path: &Path, side: u32, counts: &[u16]) {
@@ -121,28 +119,20 @@ fn tiff(path: &Path, side: u32, counts: &[u16]) {
 #[test]
 fn a_scan_comes_in_as_the_guide_says() {
     let (_, page) = pages().into_iter().find(|(name, _)| name == "scan-in").unwrap();
-    let dir = tempfile::tempdir().unwrap();
-    let at = |name: &str| dir.path().join(name);
-    scanner_files(dir.path());
-    let said = done(&["info", &text(&at("views"))]);
+    let d = scanner_files();
+    let said = d.done("info views");
     assert!(said.contains("scanner.toml") && said.contains("views of a scan"), "{said}");
-    assert_eq!(run("scan-in", &page, dir.path()), 5);
-    assert!(at("volume.mha").exists());
+    assert_eq!(run(&d, "scan-in", &page), 5);
+    assert!(d.has("volume.mha"));
 
     // The quick test predicts held-out views; with a wrong direction it predicts them worse.
-    let held_out = |run: &Path| -> f64 {
-        let record = fs::read_to_string(run.join("record.json")).unwrap();
-        serde_json::from_str::<serde_json::Value>(&record).unwrap()["held_out"].as_f64().unwrap()
-    };
-    let right = held_out(&at("first"));
+    let held_out = |run: &str| number(&d.read(format!("{run}/record.json"))["held_out"]);
+    let right = held_out("first");
     assert!(right < 0.05, "{right}");
-    let description = fs::read_to_string(at("scanner.toml")).unwrap();
-    fs::write(at("wrong.toml"), description.replace("\"counterclockwise\"", "\"clockwise\"")).unwrap();
-    let [mirrored, wrong] = ["mirrored", "wrong"].map(|name| text(&at(name)));
-    done(&["import", &text(&at("wrong.toml")), "-o", &mirrored]);
-    let options = ["--spec", "fast", "-o", &wrong, "--steps", "400", "--hold-out", "every:6"];
-    done(&[&["reconstruct", &mirrored][..], &options].concat());
-    let wrong = held_out(&at("wrong"));
+    d.put("wrong.toml", d.text("scanner.toml").replace("\"counterclockwise\"", "\"clockwise\""));
+    d.done("import wrong.toml -o mirrored");
+    d.done("reconstruct mirrored --spec fast -o wrong --steps 400 --hold-out every:6");
+    let wrong = held_out("wrong");
     assert!(wrong > 1.3 * right, "{wrong} with the wrong direction, {right} with the right one");
 }
 

@@ -21,7 +21,6 @@ mod help;
 mod hounsfield;
 mod import;
 mod memory;
-mod naf;
 mod peak;
 mod project;
 mod quality;

@@ -1,19 +1,19 @@
 //! The schema files for editors are current.
 
-use crate::common::done;
+use crate::common::Folder;
 use serde_json::Value;
 
 #[test]
 fn the_files_in_specs_are_current() {
-    for (file, line) in [("spec.schema.json", &["schema"][..]), ("study.schema.json", &["schema", "--study"])] {
+    for (file, line) in [("spec.schema.json", "schema"), ("study.schema.json", "schema --study")] {
         let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../conefield/specs/schema").join(file);
-        let command = line.join(" ");
+        let wanted = Folder::new().done(line);
         if std::env::var_os("CONEFIELD_BLESS").is_some() {
-            std::fs::write(&path, done(line)).unwrap();
+            std::fs::write(&path, &wanted).unwrap();
         }
         assert!(
-            std::fs::read_to_string(&path).unwrap_or_default() == done(line),
-            "write it anew: cargo run --release --bin conefield -- {command} > conefield/specs/schema/{file}"
+            std::fs::read_to_string(&path).unwrap_or_default() == wanted,
+            "write it anew: cargo run --release --bin conefield -- {line} > conefield/specs/schema/{file}"
         );
     }
 }
@@ -34,7 +34,7 @@ fn every_reference_leads_somewhere() {
             _ => {}
         }
     }
-    let schema: Value = serde_json::from_str(&done(&["schema"])).unwrap();
+    let schema: Value = Folder::new().json("schema");
     let mut count = 0;
     walk(&schema, &schema, &mut count);
     assert!(count > 10);

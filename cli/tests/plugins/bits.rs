@@ -2,7 +2,7 @@
 //! a kill.
 
 use crate::build::example;
-use crate::common::{conefield, done, json, refused, started, text};
+use crate::common::{Folder, SCAN, text};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::{Backend, BlockWork, Work};
 use conefield_core::method::{Context, Job, Limits, Silent};
@@ -11,7 +11,6 @@ use conefield_core::random::{mix, unit};
 use conefield_core::registry::read;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::stage::UnitRay;
-use std::path::{Path, PathBuf};
 
 // Stage types register themselves when their crate is linked.
 use conefield_encoders as _;
@@ -60,56 +59,38 @@ sampling = "stratified"
 rays = 48
 "#;
 
-struct Place {
-    dir: tempfile::TempDir,
-    scan: PathBuf,
-    spec: PathBuf,
-    plugins: [String; 2],
+/// A folder with a scan and the spec.
+fn place() -> Folder {
+    let d = Folder::after(&[SCAN]);
+    d.put("plugins.toml", SPEC);
+    d
 }
 
-fn place() -> Place {
-    let dir = tempfile::tempdir().unwrap();
-    let (scan, spec) = (dir.path().join("scan"), dir.path().join("plugins.toml"));
-    done(&["simulate", "phantom:head:16", "-o", &text(&scan), "--views", "8", "--detector", "16x16"]);
-    std::fs::write(&spec, SPEC).unwrap();
-    Place { dir, scan, spec, plugins: ["siren", "triplane"].map(|p| text(&example(p))) }
+/// The options that load the plugins of the spec.
+fn plugins() -> String {
+    ["siren", "triplane"].map(|name| format!("--plugin {} ", text(&example(name)))).concat()
 }
 
-impl Place {
-    fn reconstruct<'a>(&'a self, run: &'a str, steps: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-        let [siren, triplane] = &self.plugins;
-        let mut all = vec!["--plugin", siren, "--plugin", triplane, "reconstruct"];
-        all.extend([self.scan.to_str().unwrap(), "--spec", self.spec.to_str().unwrap(), "-o", run, "--seed", "7"]);
-        all.extend(["--steps", steps]);
-        all.extend(more);
-        all
-    }
+fn reconstruct(run: &str, more: &str) -> String {
+    format!("{}reconstruct scan --spec plugins.toml -o {run} --seed 7 {more}", plugins())
 }
 
-/// Runs the command with `args`, and kills it after its first checkpoint.
-fn kill_after(checkpoint: &Path, args: &[&str]) {
-    let mut child = started(args);
-    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
-        std::thread::sleep(std::time::Duration::from_millis(1));
-    }
-    child.kill().unwrap();
-    child.wait().unwrap();
-    assert!(checkpoint.exists(), "it was over before it could be killed");
+fn weights(d: &Folder, run: &str) -> conefield_core::arena::Weights {
+    conefield_io::read_weights(d.at(run).join("weights.safetensors")).unwrap()
 }
 
 #[test]
 fn as_built_in() {
-    let place = place();
-    let run = text(&place.dir.path().join("run"));
-    done(&place.reconstruct(&run, "60", &[]));
+    let d = place();
+    d.done(&reconstruct("run", "--steps 60"));
 
-    let scan = conefield_scans::read_scan(&place.scan).unwrap();
+    let scan = conefield_scans::read_scan(d.at("scan")).unwrap();
     let spec = conefield_core::spec::load::parse(SPEC, "plugins.toml", &[], &[]).unwrap().spec;
     let (backend, limits) = (Cpu::new(), Limits { steps: Some(60), ..Limits::default() });
     let job = Job { seed: 7, limits, ..Job::new(&scan, &backend) };
     let solution = spec.method.plan(&Context::new(&backend)).unwrap().run(&job, &mut Silent).unwrap();
     let field = solution.result.field().unwrap();
-    let weights = conefield_io::read_weights(Path::new(&run).join("weights.safetensors")).unwrap();
+    let weights = weights(&d, "run");
     let blocks = &field.model.pipeline.layout().blocks;
     assert_eq!(weights.tensors.len(), blocks.len());
     for b in blocks {
@@ -118,7 +99,7 @@ fn as_built_in() {
         let bits = |v: &[f32]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
         assert!(bits(values) == bits(&field.model.arena.params[b.range.clone()]), "{} differs", b.name);
     }
-    let volume = conefield_io::read_volume(Path::new(&run).join("volume.nii.gz")).unwrap();
+    let volume = conefield_io::read_volume(d.at("run/volume.nii.gz")).unwrap();
     let built_in = solution.result.volume(&Cpu::new()).unwrap();
     assert!(volume.data == built_in.data, "the volumes differ");
 }
@@ -128,161 +109,123 @@ fn as_built_in() {
 #[test]
 fn a_regularizer_as_built_in() {
     const SPEC: &str = "type = 'fista'\nprior = 'huber'\nsubsets = 2\nstop = { passes = 400 }\n";
-    let dir = tempfile::tempdir().unwrap();
-    let (scan, spec) = (dir.path().join("scan"), dir.path().join("huber.toml"));
-    done(&["simulate", "phantom:head:16", "-o", &text(&scan), "--views", "8", "--detector", "16x16"]);
-    std::fs::write(&spec, SPEC).unwrap();
+    let d = Folder::after(&[SCAN]);
+    d.put("huber.toml", SPEC);
     let library = text(&example("huber"));
-    let (scan_at, spec_at) = (text(&scan), text(&spec));
-    let [short, whole, broken] = ["short", "whole", "broken"].map(|run| text(&dir.path().join(run)));
-    let args = |run| ["--plugin", &library, "reconstruct", &scan_at, "--spec", &spec_at, "-o", run];
-    done(&[&args(&short)[..], &["--steps", "10"]].concat());
-    done(&args(&whole));
-    let read = |run: &str| conefield_io::read_volume(Path::new(run).join("volume.nii.gz")).unwrap().data;
+    let line = |run: &str| format!("--plugin {library} reconstruct scan --spec huber.toml -o {run}");
+    d.done(&format!("{} --steps 10", line("short")));
+    d.done(&line("whole"));
+    let read = |run: &str| conefield_io::read_volume(d.at(run).join("volume.nii.gz")).unwrap().data;
 
-    let scan = conefield_scans::read_scan(&scan).unwrap();
+    let scan = conefield_scans::read_scan(d.at("scan")).unwrap();
     let spec = conefield_core::spec::load::parse(SPEC, "huber.toml", &[], &[]).unwrap().spec;
     let (backend, limits) = (Cpu::new(), Limits { steps: Some(10), ..Limits::default() });
     let job = Job { limits, ..Job::new(&scan, &backend) };
     let solution = spec.method.plan(&Context::new(&backend)).unwrap().run(&job, &mut Silent).unwrap();
-    assert!(read(&short) == solution.result.volume(&backend).unwrap().data, "the volumes differ");
+    assert!(read("short") == solution.result.volume(&backend).unwrap().data, "the volumes differ");
 
-    let checkpoint = Path::new(&broken).join("checkpoint.safetensors");
-    kill_after(&checkpoint, &[&args(&broken)[..], &["--checkpoint-every", "0.01s"]].concat());
-    let kept = conefield_io::read_checkpoint(&checkpoint).unwrap();
+    d.killed_at_a_checkpoint("broken", &format!("{} --checkpoint-every 0.01s", line("broken")));
+    let kept = conefield_io::read_checkpoint(d.at("broken/checkpoint.safetensors")).unwrap();
     assert!(["prior.dual.x", "prior.dual.y", "prior.dual.z"].iter().all(|name| kept.tensors.contains_key(*name)));
-    done(&[&args(&broken)[..], &["--resume"]].concat());
-    assert!(read(&whole) == read(&broken), "the volumes differ after a kill");
+    d.done(&format!("{} --resume", line("broken")));
+    assert!(read("whole") == read("broken"), "the volumes differ after a kill");
 }
 
 #[test]
 fn killed_and_resumed() {
-    let place = place();
-    let [whole, killed] = ["whole", "killed"].map(|f| text(&place.dir.path().join(f)));
-    done(&place.reconstruct(&whole, "1500", &[]));
-    let checkpoint = Path::new(&killed).join("checkpoint.safetensors");
-    let arguments = place.reconstruct(&killed, "1500", &["--checkpoint-every", "0.02s"]);
-    kill_after(&checkpoint, &arguments);
+    let d = place();
+    d.done(&reconstruct("whole", "--steps 1500"));
+    let killed = reconstruct("killed", "--steps 1500 --checkpoint-every 0.02s");
+    d.killed_at_a_checkpoint("killed", &killed);
 
     // Without the plugins the spec is refused.
-    let mut bare = arguments[4..].to_vec();
-    bare.push("--resume");
-    let e = refused(1, &bare);
-    assert!(e.contains("no encoder type \"triplane\"") && e.contains("load it with --plugin PATH"), "{e}");
+    d.refused_with(
+        1,
+        &format!("{} --resume", killed.replace(&plugins(), "")),
+        &["no encoder type \"triplane\"", "load it with --plugin PATH"],
+    );
 
-    let mut again = arguments.clone();
-    again.push("--resume");
-    done(&again);
+    d.done(&format!("{killed} --resume"));
     for file in ["volume.nii.gz", "weights.safetensors"] {
-        let [a, b] = [&whole, &killed].map(|r| std::fs::read(Path::new(r).join(file)).unwrap());
-        assert!(a == b, "{file} differs");
+        assert!(d.bytes(format!("whole/{file}")) == d.bytes(format!("killed/{file}")), "{file} differs");
     }
 }
 
 #[test]
 fn explained_and_in_the_schema() {
-    let place = place();
-    let [siren, triplane] = &place.plugins;
-    let spec = text(&place.spec);
-    let report =
-        json(&["--plugin", siren, "--plugin", triplane, "explain", &spec, "--scan", &text(&place.scan), "--json"]);
+    let (d, plugins) = (place(), plugins());
+    let report = d.json(&format!("{plugins}explain plugins.toml --scan scan --json"));
     assert_eq!(report["stages"][0]["type"], "triplane");
     assert_eq!(report["stages"][3]["what"], "9 -> 2 layers of 12 -> 1, sines of frequency 3");
     assert_eq!(report["plugins"].as_array().unwrap().len(), 2);
     assert_eq!(report["stages"][0]["parameters"], 3 * (12 * 12 + 12) * 3);
-    let schema = json(&["--plugin", siren, "schema"]);
+    let schema = d.json(&format!("{plugins}schema"));
     assert!(schema["$defs"]["field.siren"]["properties"]["omega"].is_object());
     // A mistake in a plugin's settings is reported like one in built-in settings.
-    let set = |s| refused(1, &["--plugin", siren, "--plugin", triplane, "explain", &spec, "--set", s]);
-    let e = set("field.omgea=2.0");
-    assert!(e.contains("field.omgea: found an unknown key, expected \"omega\""), "{e}");
-    let e = set("field.omega=-2.0");
-    assert!(e.contains("--set field.omega=-2.0: field.omega: found -2, expected above 0"), "{e}");
+    for (set, want) in [
+        ("field.omgea=2.0", "field.omgea: found an unknown key, expected \"omega\""),
+        ("field.omega=-2.0", "--set field.omega=-2.0: field.omega: found -2, expected above 0"),
+    ] {
+        d.refused_with(1, &format!("{plugins}explain plugins.toml --set {set}"), &[want]);
+    }
 }
 
 /// Weights pre-trained with a plugin's field start another run of it.
 #[test]
 fn mapping_consistency() {
-    let place = place();
-    let [siren, triplane] = &place.plugins;
-    let weights = text(&place.dir.path().join("weights.safetensors"));
-    let spec = text(&place.spec);
-    let small = ["--steps", "20", "--set", "pretraining.points=200"];
-    let pretrain =
-        ["--plugin", siren, "--plugin", triplane, "pretrain", "phantom:head:16", "--spec", &spec, "-o", &weights];
-    done(&[&pretrain[..], &small].concat());
-    let run = text(&place.dir.path().join("mci"));
-    done(&place.reconstruct(&run, "5", &["--init", &weights]));
+    let d = place();
+    let small = "--steps 20 --set pretraining.points=200";
+    d.done(&format!("{}pretrain phantom:head:16 --spec plugins.toml -o w.safetensors {small}", plugins()));
+    d.done(&reconstruct("mci", "--steps 5 --init w.safetensors"));
     // A field of another width is refused by name.
-    let other = text(&place.dir.path().join("other"));
-    let output =
-        conefield(&place.reconstruct(&other, "5", &["--init", &weights, "--set", "field.width=13"])).output().unwrap();
-    let e = String::from_utf8(output.stderr).unwrap();
-    assert!(!output.status.success() && e.contains("field.0.weight"), "{e}");
+    d.refused_with(
+        1,
+        &reconstruct("other", "--steps 5 --init w.safetensors --set field.width=13"),
+        &["field.0.weight"],
+    );
 }
 
 /// Plugin initializers support everything that built-in ones do: weights read by the host, a check before the run, a
 /// known volume.
 #[test]
 fn initializers_of_plugins() {
-    let place = place();
+    let d = place();
+    let small = "--set encoder.log2_table_size=10 --set pretraining.points=200 --steps 20";
+    d.done(&format!("pretrain phantom:head:16 --spec fast -o w.safetensors {small}"));
     let plugin = text(&example("rehashed"));
-    let [scan, weights] = [&place.scan, &place.dir.path().join("weights.safetensors")].map(|p| text(p));
-    let small = ["--set", "encoder.log2_table_size=10", "--set", "pretraining.points=200", "--steps", "20"];
-    done(&[&["pretrain", "phantom:head:16", "--spec", "fast", "-o", &weights][..], &small].concat());
-    let truth = text(&place.scan.join("truth.nii.gz"));
-    let sets = ["--set", "encoder.log2_table_size=10", "--set", "training.rays=48", "--set", "projector.samples=16"];
-    let args = |command: &'static str, initializer: &str| {
-        let start = ["--plugin", &plugin, command].map(String::from);
-        let end = ["--spec", "fast", "--steps", "5", "--set"].map(String::from);
-        [
-            &start[..],
-            std::slice::from_ref(&scan),
-            &end,
-            &[format!("initializer={initializer}")],
-            &sets.map(String::from),
-        ]
-        .concat()
+    let line = |run: &str, initializer: &str| {
+        let small = "--set encoder.log2_table_size=10 --set training.rays=48 --set projector.samples=16 --steps 5";
+        format!("--plugin {plugin} reconstruct scan --spec fast -o {run} {small} --set 'initializer={{{initializer}}}'")
     };
-    for settings in [format!("weights={weights:?}"), format!("path={truth:?}, steps=4")] {
-        let kind = if settings.starts_with('w') { "mci" } else { "volume" };
-        let of = ["", "again-"].map(|prefix| {
-            let run = place.dir.path().join(format!("{prefix}{kind}"));
-            let mut args = args("reconstruct", &format!("{{type=\"{prefix}{kind}\", {settings}}}"));
-            args.extend(["-o".into(), text(&run)]);
-            done(&args.iter().map(String::as_str).collect::<Vec<_>>());
-            conefield_io::read_weights(run.join("weights.safetensors")).unwrap().tensors
+    for (kind, settings) in [("mci", "weights=\"w.safetensors\""), ("volume", "path=\"scan/truth.nii.gz\", steps=4")] {
+        let of = [kind.to_owned(), format!("again-{kind}")].map(|kind| {
+            d.done(&line(&kind, &format!("type=\"{kind}\", {settings}")));
+            weights(&d, &kind).tensors
         });
         assert!(of[0] == of[1], "{kind}: the weights differ");
     }
     // A misfit is refused before a run begins.
-    let run = text(&place.dir.path().join("other"));
-    let mut other = args("reconstruct", &format!("{{type=\"again-mci\", weights={weights:?}}}"));
-    other.extend(["-o", &run, "--set", "field.width=13"].map(String::from));
-    let said = refused(1, &other.iter().map(String::as_str).collect::<Vec<_>>());
-    assert!(said.contains("field.0.weight") && said.contains("initializer"), "{said}");
-    assert!(!Path::new(&run).exists(), "a run was begun");
+    let misfit = line("other", "type=\"again-mci\", weights=\"w.safetensors\"");
+    d.refused_with(1, &format!("{misfit} --set field.width=13"), &["field.0.weight", "initializer"]);
+    assert!(!d.has("other"), "a run was begun");
 }
 
 /// A mask removes channels of a plugin's encoder, as of a built-in one.
 #[test]
 fn masks_of_plugins() {
-    let place = place();
+    let d = place();
     let plugin = text(&example("rehashed"));
     let runs = ["hash-grid", "rehashed"].map(|encoder| {
-        let spec = text(&place.dir.path().join(format!("{encoder}.toml")));
         let lines = format!(
             "extends = 'ni-naf'\ncallbacks = [{{ type = 'fft-mask', keep = [0, 1, 3] }}]\n\
              [encoder]\ntype = '{encoder}'\nconvention = 'naf'\nfeatures = 2\ngrowth = 2.0\nlevels = 3\nlog2_table_size = 10\nbase_resolution = 16\n\
              [projector]\nsamples = 16\n[training]\nrays = 48\n"
         );
-        std::fs::write(&spec, lines).unwrap();
-        let run = place.dir.path().join(encoder);
-        let scan = text(&place.scan);
-        done(&["--plugin", &plugin, "reconstruct", &scan, "--spec", &spec, "-o", &text(&run), "--steps", "80"]);
-        let metrics = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
+        d.put("masked.toml", lines);
+        d.done(&format!("--plugin {plugin} reconstruct scan --spec masked.toml -o {encoder} --steps 80"));
+        let metrics = d.text(format!("{encoder}/metrics.jsonl"));
         assert!(metrics.contains("events"), "nothing was masked: {metrics}");
-        conefield_io::read_weights(run.join("weights.safetensors")).unwrap().tensors
+        weights(&d, encoder).tensors
     });
     let shape = &runs[0]["normalizers.0.weight"].0;
     assert_eq!(*shape, [3], "three channels are left");

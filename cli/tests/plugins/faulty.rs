@@ -3,7 +3,7 @@
 //! `CONEFIELD_BLESS=1` writes it.
 
 use crate::build::{cc, example, sources};
-use crate::common::{conefield, done, text};
+use crate::common::{Folder, text};
 use rayon::prelude::*;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -65,18 +65,19 @@ struct Kind {
     /// What gives the sound plugin a function that the template lacks.
     more: Edit,
     /// The run, and the setting that puts the plugin into it.
-    run: &'static [&'static str],
+    run: &'static str,
     set: &'static str,
     faults: &'static [Fault],
 }
+
+const SCAN: &str = "simulate phantom:head:16 -o scan --views 6 --detector 16x16";
 
 /// C that fails, at once or after some calls.
 const FAILS: &str = "return say(error, \"no more numbers\"), CONEFIELD_FAILED; ";
 const FAILS_LATER: &str = "if (calls++ > 20) return say(error, \"no more numbers\"), CONEFIELD_FAILED; ";
 
-const FAST: &[&str] =
-    &["--spec", "fast", "--steps", "100", "--set", "training.rays=16", "--set", "projector.samples=16", "--set"];
-const FISTA: &[&str] = &["--spec", "fista", "--steps", "40", "--set"];
+const FAST: &str = "--spec fast --steps 100 --set training.rays=16 --set projector.samples=16 --set";
+const FISTA: &str = "--spec fista --steps 40 --set";
 
 const KINDS: [Kind; 7] = [
     Kind { kind: "encoder", more: NOTHING, run: FAST, set: "encoder.type=faulty", faults: ENCODER_FAULTS },
@@ -365,14 +366,14 @@ const PANICS: &[(&str, &str, [&str; 2])] = &[
     ("panics after many rows", "later", ["finite differences: inputs", "forward panicked: as ordered, in call"]),
 ];
 
-/// Makes the sound plugin of this kind in `dir`.
-fn sound(dir: &Path, kind: &str) {
-    done(&["plugins", "new", "faulty", "--kind", kind, "--lang", "c", "--into", &text(&dir.join(kind))]);
+/// Makes the sound plugin of this kind.
+fn sound(d: &Folder, kind: &str) {
+    d.done(&format!("plugins new faulty --kind {kind} --lang c --into {kind}"));
 }
 
 /// The sound plugin of a kind with an edit, compiled in the new folder `own`.
-fn edited(dir: &Path, kind: &Kind, fault: Edit, own: &Path) -> PathBuf {
-    let code = std::fs::read_to_string(dir.join(kind.kind).join("faulty/faulty.c")).unwrap();
+fn edited(d: &Folder, kind: &Kind, fault: Edit, own: &Path) -> PathBuf {
+    let code = d.text(format!("{}/faulty/faulty.c", kind.kind));
     // For some faults: functions of the system, and the calls of this process.
     let code = format!("#include <unistd.h>\n\nstatic _Atomic int calls;\n{}", edit(&edit(&code, kind.more), fault));
     std::fs::create_dir(own).unwrap();
@@ -393,8 +394,8 @@ fn without(mut message: String, folders: &[&Path]) -> String {
 }
 
 /// The last line of a command's output; empty for success. Omits folders of this test.
-fn said(args: &[&str], hide: &[&Path]) -> String {
-    let output = conefield(args).output().unwrap();
+fn said(d: &Folder, line: &str, hide: &[&Path]) -> String {
+    let output = d.command(line).output().unwrap();
     if output.status.success() {
         return String::new();
     }
@@ -406,9 +407,8 @@ fn said(args: &[&str], hide: &[&Path]) -> String {
     last.to_owned()
 }
 
-fn refusal(library: &str, hide: &[&Path]) -> String {
-    let listed: serde_json::Value =
-        serde_json::from_str(&done(&["--plugin", library, "plugins", "list", "--json"])).unwrap();
+fn refusal(d: &Folder, library: &str, hide: &[&Path]) -> String {
+    let listed = d.json(&format!("--plugin {library} plugins list --json"));
     without(listed["plugins"][0]["refused"].as_str().unwrap_or_default().to_owned(), hide)
 }
 
@@ -434,31 +434,26 @@ fn fits(what: &str, command: &str, found: &str, want: &str) {
 
 #[test]
 fn every_fault_is_found_and_none_takes_the_process_down() {
-    let dir = tempfile::tempdir().unwrap();
-    let scan = text(&dir.path().join("scan"));
-    done(&["simulate", "phantom:head:16", "-o", &scan, "--views", "6", "--detector", "16x16"]);
-    let reconstruct = |library: &str, number: usize, spec: &[&str], hide: &[&Path]| {
-        let run = text(&dir.path().join(format!("run-{number}")));
-        let mut args = vec!["--plugin", library, "reconstruct", &scan, "-o", &run];
-        args.extend(spec);
-        let found = said(&args, hide);
+    let d = Folder::after(&[SCAN]);
+    let dir = d.at("");
+    let reconstruct = |library: &str, number: usize, spec: &str, hide: &[&Path]| {
+        let found = said(&d, &format!("--plugin {library} reconstruct scan -o run-{number} {spec}"), hide);
         // A failed run leaves no volume.
-        let volume = dir.path().join(format!("run-{number}/volume.nii.gz"));
-        assert!(found.is_empty() || !volume.exists(), "{library}");
+        assert!(found.is_empty() || !d.has(format!("run-{number}/volume.nii.gz")), "{library}");
         found
     };
     for Kind { kind, .. } in &KINDS {
-        sound(dir.path(), kind);
+        sound(&d, kind);
     }
     let all: Vec<_> = KINDS.iter().flat_map(|kind| kind.faults.iter().map(move |f| (kind, f))).enumerate().collect();
     // Some of them sleep, and most of their work has one thread.
     let rows = all.into_par_iter().map(|(i, (kind, fault))| {
-        let own = dir.path().join(format!("plugin-{i}"));
-        let library = edited(dir.path(), kind, fault.edit, &own);
-        let (library, here) = (text(&library), [own.as_path(), dir.path()]);
-        let list = refusal(&library, &here);
-        let check = said(&["plugins", "check", &library, "--settings", "{}"], &here);
-        let run = reconstruct(&library, i, &[kind.run, &[kind.set]].concat(), &here);
+        let own = d.at(format!("plugin-{i}"));
+        let library = edited(&d, kind, fault.edit, &own);
+        let (library, here) = (text(&library), [own.as_path(), &dir]);
+        let list = refusal(&d, &library, &here);
+        let check = said(&d, &format!("plugins check {library} --settings {{}}"), &here);
+        let run = reconstruct(&library, i, &format!("{} {}", kind.run, kind.set), &here);
         fits(fault.what, "list", &list, fault.list);
         fits(fault.what, "check", &check, fault.check);
         fits(fault.what, "reconstruct", &run, fault.reconstruct);
@@ -467,14 +462,11 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
     let mut rows: Vec<Row> = pool.install(|| rows.collect());
     let panics = example("rehashed");
-    let folder = panics.parent().unwrap();
+    let (library, folder) = (text(&panics), panics.parent().unwrap());
     for (i, (what, when, [check, run])) in PANICS.iter().enumerate() {
-        let library = text(&panics);
-        let settings = format!("{{\"when\": \"{when}\"}}");
-        let args = ["plugins", "check", &library, "--type", "panics", "--settings", &settings];
-        let checked = said(&args, &[folder]);
-        let when = format!("encoder.when={when}");
-        let set = [FAST, &["encoder.type=panics", "--set", &when]].concat();
+        let line = format!("plugins check {library} --type panics --settings '{{\"when\": \"{when}\"}}'");
+        let checked = said(&d, &line, &[folder]);
+        let set = format!("{FAST} encoder.type=panics --set encoder.when={when}");
         let ran = reconstruct(&library, 200 + i, &set, &[folder]);
         fits(what, "check", &checked, check);
         fits(what, "reconstruct", &ran, run);
@@ -486,17 +478,14 @@ fn every_fault_is_found_and_none_takes_the_process_down() {
 /// Random points miss such a place, and a smaller learning rate does not help.
 #[test]
 fn numbers_that_are_not_finite_at_an_edge_are_found_and_the_run_names_the_stage() {
-    let dir = tempfile::tempdir().unwrap();
-    let at = |name: &str| text(&dir.path().join(name));
-    done(&["simulate", "phantom:head:16", "-o", &at("scan"), "--views", "6", "--detector", "16x16"]);
-    sound(dir.path(), "encoder");
+    let d = Folder::after(&[SCAN]);
+    sound(&d, "encoder");
     let edge = "to[i] = (x.data[i] > 0.96f && x.data[x.stride + i] > 0.96f ? NAN : 1) * params[c]";
-    let library = text(&edited(dir.path(), &KINDS[0], instead("to[i] = params[c]", edge), &dir.path().join("plugin")));
-    let checked = said(&["plugins", "check", &library], &[dir.path()]);
+    let library = text(&edited(&d, &KINDS[0], instead("to[i] = params[c]", edge), &d.at("plugin")));
+    let checked = said(&d, &format!("plugins check {library}"), &[]);
     assert!(checked.contains("faulty: finite"), "{checked}");
-    let sets = ["--spec", "fast", "--steps", "100", "--set", "encoder.type=faulty", "--set", "projector.samples=64"];
-    let run = at("run");
-    let ran = said(&[&["--plugin", &library, "reconstruct", &at("scan"), "-o", &run][..], &sets].concat(), &[]);
+    let sets = "--spec fast --steps 100 --set encoder.type=faulty --set projector.samples=64";
+    let ran = said(&d, &format!("--plugin {library} reconstruct scan -o run {sets}"), &[]);
     let named = "the first stage whose output is not finite: encoder (";
     assert!(ran.contains("training diverged") && ran.contains(named), "{ran}");
 }

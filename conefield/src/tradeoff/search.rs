@@ -129,7 +129,7 @@ impl Search {
     /// the finished trials of a resumed search.
     pub fn look(&self, folder: &Path, earlier: Earlier) -> Result<Vec<Over>> {
         let place = folder.display().to_string();
-        let old = entries(folder)?;
+        let old = CONTENTS.entries(folder)?;
         let expected = "a new or empty folder, --resume to continue or --force to replace it";
         let state = folder.join(FILES[0]);
         ensure(old.is_empty() || earlier != Earlier::Refuse, &place, "output", "an earlier search", expected)?;
@@ -252,22 +252,6 @@ fn progressed(folder: &Path) -> Progressed {
         Some(_) => Progressed::Begun,
         None => Progressed::Nothing,
     }
-}
-
-/// The content of the folder. Refuses a folder with anything that no search writes.
-fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
-    let entries = match fs::read_dir(folder) {
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
-        entries => entries.map_err(|e| Error::io(folder, e))?,
-    };
-    let mut old = vec![];
-    for entry in entries {
-        let entry = entry.map_err(|e| Error::io(folder, e))?;
-        let found = format!("a folder with {} in it", entry.file_name().to_string_lossy());
-        ensure(known(&entry.path()), &folder.display().to_string(), "output", found, "a new or empty folder")?;
-        old.push(entry.path());
-    }
-    Ok(old)
 }
 
 /// Runs a trial, reads its results and removes its large files.

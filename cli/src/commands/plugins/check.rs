@@ -12,12 +12,10 @@ use conefield_plugins::spec::with_defaults;
 use conefield_plugins::{Library, Place};
 use serde::Serialize;
 use serde_json::Value;
-use std::io::Read;
 use std::path::PathBuf;
 use std::process::{ExitStatus, Stdio};
 use std::sync::OnceLock;
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Run the conformance kit on every stage of a plugin: finite differences, shapes, extremes, independence of tiles and
 /// threads, guard zones, save and load. The plugin runs in a separate process, so that crashes are reported.
@@ -110,28 +108,15 @@ impl Check {
     /// seconds.
     fn apart(&self, part: &str, limit: f64, late: String) -> Result<()> {
         let mut command = program::command()?;
-        let io = |e| Error::io("conefield", e);
         command.args(program::arguments()).arg(part);
-        let mut child = command.stdin(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(io)?;
-        let errors = child.stderr.take();
-        let said = thread::spawn(move || {
-            let mut said = vec![];
-            let _ = errors.map(|mut e| e.read_to_end(&mut said));
-            String::from_utf8_lossy(&said).into_owned()
-        });
-        let place = self.library.display().to_string();
-        let begin = Instant::now();
-        let status = loop {
-            if let Some(status) = child.try_wait().map_err(io)? {
-                break status;
-            }
-            if begin.elapsed().as_secs_f64() > limit {
-                let _ = child.kill();
-                let _ = child.wait();
-                return Err(Error::unsupported(place, late));
-            }
-            thread::sleep(Duration::from_millis(20));
-        };
+        let child = command.stdin(Stdio::null()).stderr(Stdio::piped()).spawn();
+        let mut child = child.map_err(|e| Error::io("conefield", e))?;
+        let said = program::read(child.stderr.take());
+        let (place, begin) = (self.library.display().to_string(), Instant::now());
+        let status = program::wait(&mut child, "conefield", &mut || match begin.elapsed().as_secs_f64() > limit {
+            true => Err(Error::unsupported(&place, &late)),
+            false => Ok(()),
+        })?;
         let said = said.join().unwrap_or_default();
         if status.success() {
             return Ok(());

@@ -20,7 +20,7 @@ pub fn find(folders: &[PathBuf]) -> Result<Vec<RunOnDisk>> {
     let mut found: Vec<RunOnDisk> = vec![];
     for folder in folders {
         for run in of_folder(folder)? {
-            let twice = found.iter().any(|r| same_file::is_same_file(r.folder(), &run).unwrap_or(false));
+            let twice = found.iter().any(|r| same_file::is_same_file(&r.folder, &run).unwrap_or(false));
             ensure(!twice, &run.display().to_string(), "run", "a run that is shown already", "each run once")?;
             found.push(RunOnDisk::read(&run)?);
         }
@@ -101,17 +101,17 @@ pub fn page_runs(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun
         .map(|(run, name)| {
             let notice = |found: String| Notice { found: format!("{name}: {found}"), advice: String::new() };
             warnings.extend((!run.is_complete()).then(|| notice(format!("the run is {}", run.status()))));
-            if let Some(n) = run.record().and_then(|r| r["rollbacks"].as_u64()).filter(|n| *n > 0) {
+            if let Some(n) = run.record.as_ref().and_then(|r| r["rollbacks"].as_u64()).filter(|n| *n > 0) {
                 warnings.push(notice(format!(
                     "training diverged and was rolled back {n} times; each rollback halved the learning rate"
                 )));
             }
             PageRun {
-                folder: run.folder().display().to_string(),
+                folder: run.folder.display().to_string(),
                 status: run.status().into(),
-                spec: run.spec().to_owned(),
+                spec: run.spec.clone(),
                 plan: plan(run).ok(),
-                record: run.record().cloned(),
+                record: run.record.clone(),
                 curves: curves(run),
                 name,
                 ..PageRun::default()
@@ -122,8 +122,8 @@ pub fn page_runs(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun
 
 /// The lines of the run's metrics; that of the result has the score of the record.
 fn curves(run: &RunOnDisk) -> Vec<Value> {
-    let mut lines = run.curves().to_vec();
-    if let Some(record) = run.record() {
+    let mut lines = run.curves.clone();
+    if let Some(record) = &run.record {
         score_last(&mut lines, record);
     }
     lines
@@ -131,7 +131,7 @@ fn curves(run: &RunOnDisk) -> Vec<Value> {
 
 /// Describes what the spec builds. Fails if its plugins are not loaded.
 fn plan(run: &RunOnDisk) -> Result<String> {
-    let loaded = specs::reread(run.spec(), &run.folder().join("spec.toml").display().to_string())?;
+    let loaded = specs::reread(&run.spec, &run.folder.join("spec.toml").display().to_string())?;
     let plan = method::plan_without_files(&loaded, &Cpu::new())?;
     Ok(Explanation::new(&loaded, plan.as_ref(), None)?.text())
 }
@@ -146,16 +146,16 @@ fn names(found: &[RunOnDisk]) -> Vec<String> {
     // An unfinished run has no record yet.
     let own = |run: &RunOnDisk| {
         let named = run.spec_name().map(str::to_owned);
-        let named = named.or_else(|| written::read("spec.toml", run.spec()).ok().map(|n: Named| n.name));
-        named.unwrap_or_else(|| stem(&run.folder().display().to_string()))
+        let named = named.or_else(|| written::read("spec.toml", &run.spec).ok().map(|n: Named| n.name));
+        named.unwrap_or_else(|| stem(&run.folder.display().to_string()))
     };
-    let whole = |run: &RunOnDisk| run.folder().canonicalize().unwrap_or_default();
+    let whole = |run: &RunOnDisk| run.folder.canonicalize().unwrap_or_default();
     let folder = |run: &RunOnDisk| stem(&whole(run).display().to_string());
     let nested = |run: &RunOnDisk| {
         let parent = whole(run).parent().map(|p| stem(&p.display().to_string()));
         format!("{}/{}", parent.unwrap_or_default(), folder(run))
     };
-    let path = |run: &RunOnDisk| run.folder().display().to_string();
+    let path = |run: &RunOnDisk| run.folder.display().to_string();
     let ways: [&dyn Fn(&RunOnDisk) -> String; 4] = [&own, &folder, &nested, &path];
     let distinct = |names: &Vec<String>| names.iter().collect::<BTreeSet<_>>().len() == names.len();
     let all = ways.into_iter().map(|way| found.iter().map(way).collect::<Vec<_>>());

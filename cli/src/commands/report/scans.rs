@@ -59,7 +59,7 @@ impl Group {
                     page.warnings.push(Notice {
                         found: format!(
                             "{}: the scan is {where_}; its geometry and projections are not shown",
-                            run.folder().display()
+                            run.folder.display()
                         ),
                         advice: "name it with conefield report --scan SCAN".into(),
                     });
@@ -76,7 +76,7 @@ impl Group {
             group.runs.push((i, result));
             let reference = options.reference.map(Path::to_path_buf).or(run.reference().map(Path::to_path_buf));
             let Some(path) = reference.filter(|p| group.references.iter().all(|(r, _)| r != p)) else { continue };
-            let truth = path == Path::new("truth") && !path.exists();
+            let truth = input::is_truth(&path);
             let voxels = match &group.scan {
                 Some(scan) if truth => Some(conefield_io::scan_size(scan)?.voxels),
                 None if truth => None,
@@ -86,7 +86,7 @@ impl Group {
             match voxels {
                 Some(voxels) => group.references.push((path, voxels)),
                 None => page.warnings.push(Notice {
-                    found: format!("{}: the reference {} is not there", run.folder().display(), path.display()),
+                    found: format!("{}: the reference {} is not there", run.folder.display(), path.display()),
                     advice: "name it with conefield report --reference VOLUME".into(),
                 }),
             }
@@ -148,7 +148,7 @@ impl Group {
         for (path, _) in &self.references {
             let volume = match (&scan, &self.scan) {
                 (Some(scan), Some(place)) => input::reference(path, place, scan)?,
-                _ if path.exists() => conefield_io::read_volume(path)?,
+                _ if !input::is_truth(path) && path.exists() => conefield_io::read_volume(path)?,
                 // The truth in this scan is not the one of the run.
                 _ => continue,
             };
@@ -195,7 +195,7 @@ fn read(path: &Path, run: &RunOnDisk, options: &Options, page: &mut Page) -> Res
     if run.is_of(&ScanRecord::of(path, &scan)?) {
         return Ok(Some(scan));
     }
-    let found = format!("another scan than the one of {}", run.folder().display());
+    let found = format!("another scan than the one of {}", run.folder.display());
     if options.scan.is_some() {
         return Err(Error::invalid(place, "--scan", found, "the scan that the run worked on"));
     }
