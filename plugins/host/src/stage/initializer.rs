@@ -10,7 +10,6 @@ use conefield_core::prelude::*;
 use conefield_core::settings::KnownVolume;
 use conefield_plugin_abi::*;
 use serde_json::Value;
-use std::ptr;
 use std::sync::Arc;
 
 /// An initializer from a library.
@@ -55,7 +54,7 @@ fn named(
     call: &str,
     ask: impl FnOnce(&mut ConefieldStr) -> Option<ConefieldStatus>,
 ) -> Result<Option<String>> {
-    let mut path = ConefieldStr { data: ptr::null(), length: 0 };
+    let mut path = ConefieldStr::of("");
     match ask(&mut path) {
         None | Some(CONEFIELD_UNSUPPORTED) => Ok(None),
         // SAFETY: the plugin guarantees that this many bytes are valid while the stage lives.

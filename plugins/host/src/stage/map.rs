@@ -55,7 +55,8 @@ impl MapStage {
         Ok(Self { own, info, said, passes, resolutions, parameters, partition })
     }
 
-    fn reduce(&self, side: u32, keep: &[usize]) -> Result<(Self, Vec<Range<usize>>, Vec<usize>)> {
+    /// The stage without channels on one side; `boxed` makes it one of its kind.
+    fn reduce<S: ?Sized>(&self, side: u32, keep: &[usize], boxed: fn(Self) -> Box<S>) -> Result<Reduced<S>> {
         let info = &self.info;
         let Some(reduce) = self.own.functions.reduce else {
             return Err(Error::unsupported(self.own.ty().words(), "it cannot leave out channels"));
@@ -94,7 +95,8 @@ impl MapStage {
             let expected = format!("what is kept to fit it, {} and {} channels", keep.len(), channels.len());
             return Err(Error::invalid(self.own.ty().words(), "reduce", found, expected));
         }
-        Ok((smaller, params, channels.to_vec()))
+        let channels = channels.to_vec();
+        Ok(Reduced { stage: boxed(smaller), params, channels })
     }
 }
 
@@ -165,11 +167,7 @@ fn parameters(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Para
     let mut names = BTreeSet::new();
     let mut start = 0usize;
     for index in 0..i.blocks {
-        let mut p = ConefieldParameter {
-            name: ConefieldStr { data: ptr::null(), length: 0 },
-            shape: ptr::null(),
-            dimensions: 0,
-        };
+        let mut p = ConefieldParameter { name: ConefieldStr::of(""), shape: ptr::null(), dimensions: 0 };
         // SAFETY: the stage is alive, `p` is writable.
         let status =
             own.functions.parameter.map_or(CONEFIELD_FAILED, |f| unsafe { f(own.handle.stage, index, &mut p) });
@@ -365,8 +363,7 @@ impl Stage for MapStage {
 
 impl Encoder for MapStage {
     fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
-        let (stage, params, channels) = self.reduce(CONEFIELD_OUTPUTS, keep)?;
-        Ok(Reduced { stage: Box::new(stage), params, channels })
+        self.reduce(CONEFIELD_OUTPUTS, keep, |stage| Box::new(stage))
     }
 
     fn coarse_to_fine(&self) -> bool {
@@ -380,14 +377,12 @@ impl Encoder for MapStage {
 
 impl Field for MapStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
-        let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
-        Ok(Reduced { stage: Box::new(stage), params, channels })
+        self.reduce(CONEFIELD_INPUTS, keep, |stage| Box::new(stage))
     }
 }
 
 impl Normalizer for MapStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
-        Ok(Reduced { stage: Box::new(stage), params, channels })
+        self.reduce(CONEFIELD_INPUTS, keep, |stage| Box::new(stage))
     }
 }
