@@ -134,10 +134,12 @@ impl<F: FunctionsOf> Foreign<F> {
         f: impl FnOnce(*mut c_void, *mut *mut c_void, *mut ConefieldText) -> ConefieldStatus,
     ) -> Result<Option<Handle>> {
         let (mut made, mut error) = (ptr::null_mut(), Text::new());
-        match f(self.handle.stage, &mut made, error.room()) {
-            CONEFIELD_OK => self.handle.made(made, call),
-            status => Err(self.ty().refusal(call, status, &error.text())),
+        let status = f(self.handle.stage, &mut made, error.room());
+        if status != CONEFIELD_OK {
+            return Err(self.ty().refusal(call, status, &error.text()));
         }
+        ensure(made != self.handle.stage, &self.ty().words(), call, "the old stage", "a new one")?;
+        Ok((!made.is_null()).then(|| Handle { ty: self.ty().clone(), stage: made }))
     }
 
     /// The stage that `call` must have derived.

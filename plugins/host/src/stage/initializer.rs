@@ -4,7 +4,7 @@
 
 use super::{Foreign, call, make, said};
 use crate::library::{self, Handle, Type};
-use crate::trial::{UNTOUCHED, timed};
+use crate::trial::{Marked, timed};
 use conefield_core::arena::Block;
 use conefield_core::prelude::*;
 use conefield_core::settings::KnownVolume;
@@ -105,10 +105,10 @@ impl Initializer for InitializerStage {
         // A copy, so that errors do no harm.
         let n = arena.params.len();
         let mut params = arena.params.to_vec();
-        params.resize(n + GUARD, f32::from_bits(UNTOUCHED));
+        params.resize(n + GUARD, f32::MARK);
         let mut filled = vec![0u8; blocks.len()];
         call!(self.own, apply(blocks.as_ptr(), blocks.len(), params.as_mut_ptr(), n, filled.as_mut_ptr()))?;
-        if params[n..].iter().any(|v| v.to_bits() != UNTOUCHED) {
+        if params[n..].iter().any(|v| !v.is_mark()) {
             return Err(self.own.wrong("apply", "it writes past the parameters"));
         }
         let mut report = InitReport::default();

@@ -4,7 +4,7 @@
 
 use super::{Foreign, ask, call, said};
 use crate::library::Handle;
-use crate::trial::{self, GUARD, UNTOUCHED_64};
+use crate::trial::{self, GUARD, Marked};
 use conefield_core::prelude::*;
 use conefield_core::registry::Kind;
 use conefield_plugin_abi::*;
@@ -223,19 +223,18 @@ fn partition(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Range
 /// Resolution of each of `count` channels in cells, if the encoder reports it.
 fn resolutions(own: &Foreign<ConefieldMap>, count: usize) -> Result<Option<Vec<f64>>> {
     let Some(f) = own.functions.resolutions.filter(|_| own.ty().kind == Kind::Encoder) else { return Ok(None) };
-    let mut cells = vec![f64::from_bits(UNTOUCHED_64); count + GUARD];
+    let mut cells = vec![f64::MARK; count + GUARD];
     // SAFETY: the stage is alive, `cells` has room for more than `count`.
     if !own.asked("resolutions", |stage, error| unsafe { f(stage, cells.as_mut_ptr(), count, error) })? {
         return Ok(None);
     }
     let wrong = |what: String| Err(own.wrong("resolutions", &what));
-    let untouched = |v: &f64| v.to_bits() == UNTOUCHED_64;
-    if !cells[count..].iter().all(untouched) {
+    if !cells[count..].iter().all(|v| v.is_mark()) {
         return wrong(format!("it writes past the {count} channels that there are"));
     }
     cells.truncate(count);
     match cells.iter().position(|v| !(v.is_finite() && *v > 0.0)) {
-        Some(c) if untouched(&cells[c]) => wrong(format!("channel {c} of {count} is left unwritten")),
+        Some(c) if cells[c].is_mark() => wrong(format!("channel {c} of {count} is left unwritten")),
         Some(c) => wrong(format!("channel {c} of {count} resolves {} cells", cells[c])),
         None => Ok(Some(cells)),
     }
