@@ -111,8 +111,8 @@ fn projectors_agree_with_double_precision_and_are_adjoint() {
 }
 
 /// A projector whose WGSL is another's, changed.
-struct Changed(Box<dyn VoxelProjector>, fn(&str) -> Option<String>);
-impl VoxelProjector for Changed {
+struct ChangedWalk(Box<dyn VoxelProjector>, fn(&str) -> Option<String>);
+impl VoxelProjector for ChangedWalk {
     fn operator(&self) -> &dyn VoxelOperator<f32> {
         self.0.operator()
     }
@@ -131,7 +131,7 @@ impl VoxelProjector for Changed {
 fn a_perturbed_walk_is_found_and_what_cannot_run_is_refused() {
     let Some((_, backend)) = crate::device::backends("negative controls").into_iter().next() else { return };
     let place = backend.place();
-    let changed = |change| Changed(projector(json!({"type": "joseph"})), change);
+    let changed = |change| ChangedWalk(projector(json!({"type": "joseph"})), change);
     let wrong = changed(|s| Some(s.replace("fa * fb * step", "fa * fb * 1.01 * step")));
     let [forward, adjoint, mismatch] = errors(place.as_ref(), &wrong, &geometry()).unwrap();
     assert!(forward > LIMIT && adjoint > LIMIT && mismatch < 1e-5, "{forward} {adjoint} {mismatch}");
@@ -356,7 +356,7 @@ fn updates_in_a_place_are_those_of_the_host() {
                     agrees(|p| p);
                     // On the host in between, as a penalty without WGSL; the arrays of others are on the device.
                     if place.device().is_none() || prior["type"] == "none" {
-                        agrees(|p| Box::new(OnHost(p)));
+                        agrees(|p| Box::new(Changed(p, |_| None)));
                     }
                 }
             }
@@ -364,9 +364,9 @@ fn updates_in_a_place_are_those_of_the_host() {
     }
 }
 
-/// A penalty without kernels.
-struct OnHost(Box<dyn Penalty>);
-impl Penalty for OnHost {
+/// A penalty whose WGSL is changed, or left out.
+struct Changed(Box<dyn Penalty>, fn(&str) -> Option<String>);
+impl Penalty for Changed {
     fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
         self.0.value(x)
     }
@@ -382,28 +382,14 @@ impl Penalty for OnHost {
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         self.0.state()
     }
-}
-
-/// A penalty whose WGSL is changed.
-struct Rewritten(Box<dyn Penalty>, fn(&str) -> String);
-impl Penalty for Rewritten {
-    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
-        self.0.value(x)
-    }
-    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
-        self.0.prox(v, tau, u);
-    }
-    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
-        self.0.state()
-    }
     fn kernels(&mut self) -> Option<Kernels<'_>> {
-        let change = self.1;
-        self.0.kernels().map(|kernels| match kernels {
+        match self.0.kernels()? {
             Kernels::Dual(dual) => {
-                Kernels::Dual(Dual { fragment: Fragment { source: change(&dual.fragment.source) }, ..dual })
+                let source = self.1(&dual.fragment.source)?;
+                Some(Kernels::Dual(Dual { fragment: Fragment { source }, ..dual }))
             }
-            Kernels::Clip(bounds) => Kernels::Clip(bounds),
-        })
+            Kernels::Clip(bounds) => self.1("").map(|_| Kernels::Clip(bounds)),
+        }
     }
 }
 
@@ -412,11 +398,11 @@ fn a_perturbed_prior_is_found_and_one_without_wgsl_travels() {
     let Some((_, backend)) = crate::device::backends("negative controls").into_iter().next() else { return };
     let (place, prior) = (backend.place(), json!({"type": "total-variation"}));
     let differ = |change| updates_differ(&place, &prior, [false; 3], 0.2, change);
-    let wrong = differ(|p| Box::new(Rewritten(p, |s| s.replace("p + d", "p + 1.01 * d"))));
+    let wrong = differ(|p| Box::new(Changed(p, |s| Some(s.replace("p + d", "p + 1.01 * d")))));
     assert!(wrong.unwrap() > LIMIT);
-    let wrong = differ(|p| Box::new(Rewritten(p, |s| s.replace("return length(d)", "return 1.01 * length(d)"))));
+    let wrong = differ(|p| Box::new(Changed(p, |s| Some(s.replace("return length(d)", "return 1.01 * length(d)")))));
     assert!(wrong.unwrap() > LIMIT);
-    let e = differ(|p| Box::new(Rewritten(p, |s| s.replace("let q", "let r")))).unwrap_err().to_string();
+    let e = differ(|p| Box::new(Changed(p, |s| Some(s.replace("let q", "let r"))))).unwrap_err().to_string();
     assert!(e.contains("penalty") && e.contains("line"), "{e}");
 }
 
