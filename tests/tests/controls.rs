@@ -1015,6 +1015,8 @@ faults! {
     DataFault {
         /// The derivative is twice what it is.
         Steep: "finite differences";
+        /// One derivative is NaN.
+        Hole: "finite differences", "finite";
         /// The bound of the curvature is a tenth too low.
         LowBound: only "curvature";
         /// It falls where residuals grow.
@@ -1067,6 +1069,9 @@ impl Misfit for DataOn {
             _ => 1.0,
         };
         residuals.iter_mut().for_each(|r| *r *= factor);
+        if self.fault == DataFault::Hole {
+            residuals[0] = f32::NAN;
+        }
         if self.fault == DataFault::Upside { -0.5 * square } else { 0.5 * square }
     }
     fn curve(&self, _: usize, _: &[f32], values: &mut [f32]) {

@@ -136,7 +136,8 @@ fn differences(of: &On) -> Outcome {
         all += 1;
         if (near - far).abs() <= KINK * top {
             smooth += 1;
-            worst = worst.max((f64::from(derivative[pixel]) - near).abs() / top);
+            let e = (f64::from(derivative[pixel]) - near).abs() / top;
+            worst = if e.is_nan() { f64::INFINITY } else { worst.max(e) };
         }
     }
     let few = (2 * smooth < all).then(|| format!("smooth at {smooth} of {all} pixels"));
