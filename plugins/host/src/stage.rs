@@ -112,6 +112,14 @@ impl<F: FunctionsOf> Foreign<F> {
         })
     }
 
+    /// The end of a call that fills `out`: records its error and leaves NaN.
+    fn filled<R: Real>(&self, result: Result<()>, out: &mut [R]) {
+        if let Err(e) = result {
+            self.fault.set(e);
+            out.fill(R::of(f64::NAN));
+        }
+    }
+
     /// The WGSL of the stage, if any.
     fn fragment(&self, wgsl: Option<WgslFn>) -> Option<Fragment> {
         let wgsl = wgsl?;

@@ -272,10 +272,7 @@ macro_rules! kernel {
             fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
                 let (rows, params) = (x.rows, params.as_ptr());
                 let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                if let Err(e) = call!(self.own, $forward(params, x, out, tape)) {
-                    self.own.fault.set(e);
-                    y.data.fill(<$real>::NAN);
-                }
+                self.own.filled(call!(self.own, $forward(params, x, out, tape)), y.data);
             }
 
             fn backward(
@@ -285,18 +282,18 @@ macro_rules! kernel {
                 tape: TileMut<'_, $real>,
                 dy: Tile<'_, $real>,
                 grads: Grads<'_, $real>,
-                mut dx: Option<TileMut<'_, $real>>,
+                dx: Option<TileMut<'_, $real>>,
             ) {
                 let (rows, params) = (x.rows, params.as_ptr());
-                let nowhere = $tile_mut { data: ptr::null_mut(), channels: 0, rows, stride: rows };
                 let (x, tape, dy) = (x.data.across(rows), tape.data.across(rows), dy.data.across(rows));
-                let to = dx.as_mut().map_or(nowhere, |dx| dx.data.across(rows));
+                let dx = dx.map(|dx| dx.data).unwrap_or_default();
+                let mut to: $tile_mut = dx.across(rows);
+                if dx.is_empty() {
+                    to.data = ptr::null_mut();
+                }
                 let (start, length) = (grads.range.start, grads.values.len());
                 let grads = $grads { data: grads.values.as_mut_ptr(), start, length };
-                if let Err(e) = call!(self.own, $backward(params, x, tape, dy, grads, to)) {
-                    self.own.fault.set(e);
-                    dx.iter_mut().for_each(|dx| dx.data.fill(<$real>::NAN));
-                }
+                self.own.filled(call!(self.own, $backward(params, x, tape, dy, grads, to)), dx);
             }
 
             $(
@@ -317,10 +314,7 @@ macro_rules! kernel {
                     }
                     let (rows, params) = (x.rows, params.as_ptr());
                     let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                    if let Err(e) = call!(self.own, $forward_pass(pass, params, x, out, tape)) {
-                        self.own.fault.set(e);
-                        y.data.fill(<$real>::NAN);
-                    }
+                    self.own.filled(call!(self.own, $forward_pass(pass, params, x, out, tape)), y.data);
                 }
             )?
         }

@@ -143,10 +143,8 @@ impl Penalty for PenaltyOn {
     }
 
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
-        if let Err(e) = self.try_prox(v, tau, u) {
-            self.own.fault.set(e);
-            u.fill(f32::NAN);
-        }
+        let done = self.try_prox(v, tau, u);
+        self.own.filled(done, u);
     }
 
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
