@@ -182,27 +182,31 @@ pub fn goes_on<T: PartialEq>(
     (whole, heard.records)
 }
 
-/// A whole run of `value` on `scan`, with the weights file that it may name.
-pub fn solve(value: &Value, scan: &Scan, weights: &Weights) -> Result<(Solution, Vec<Record>)> {
-    solve_on(&Cpu::new(), value, scan, weights)
+/// A whole run of `value` on `scan`, and what was recorded.
+pub fn solve(value: &Value, scan: &Scan) -> Result<(Solution, Vec<Record>)> {
+    solve_on(&Cpu::new(), value, scan)
 }
 
 /// The same on any backend.
-pub fn solve_on(
-    backend: &dyn Backend,
-    value: &Value,
-    scan: &Scan,
-    weights: &Weights,
-) -> Result<(Solution, Vec<Record>)> {
-    let job = Job { seed: 7, ..Job::new(scan, backend) };
+pub fn solve_on(backend: &dyn Backend, value: &Value, scan: &Scan) -> Result<(Solution, Vec<Record>)> {
+    run(planned(value, backend)?.as_mut(), scan, backend)
+}
+
+/// The same with the weights file that `value` names.
+pub fn solve_from(weights: &Weights, value: &Value, scan: &Scan) -> Result<(Solution, Vec<Record>)> {
+    let backend = Cpu::new();
+    run(plan(&spec(value)?, &backend, weights)?.as_mut(), scan, &backend)
+}
+
+fn run(plan: &mut dyn Plan, scan: &Scan, backend: &dyn Backend) -> Result<(Solution, Vec<Record>)> {
     let mut heard = Heard::default();
-    let solution = plan(&spec(value)?, backend, weights)?.run(&job, &mut heard)?;
+    let solution = plan.run(&Job { seed: 7, ..Job::new(scan, backend) }, &mut heard)?;
     Ok((solution, heard.records))
 }
 
 /// The voxels that a run of `value` on `scan` ends with.
 pub fn voxels(backend: &dyn Backend, value: &Value, scan: &Scan) -> Result<Array3<f32>> {
-    let (solution, _) = solve_on(backend, value, scan, &Weights::default())?;
+    let (solution, _) = solve_on(backend, value, scan)?;
     Ok(solution.result.volume(backend)?.data)
 }
 
@@ -216,7 +220,7 @@ pub fn decibels(found: &Array3<f32>, scale: f64) -> f64 {
 
 /// A run on [`scan`]: PSNR against [`truth`], and what was recorded.
 pub fn psnr(value: &Value, backend: &dyn Backend) -> (f64, Vec<Record>) {
-    let (solution, records) = solve_on(backend, value, &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve_on(backend, value, &scan()).unwrap();
     (decibels(&solution.result.volume(backend).unwrap().data, 1.0), records)
 }
 

@@ -2,7 +2,6 @@
 
 use crate::case::{Case, Seen};
 use crate::common::{protocol, scan, solve, truth, volume};
-use conefield_core::arena::Weights;
 use conefield_core::error::Result;
 use conefield_core::scan::{Scan, Volume};
 use conefield_io::{Conversion, OpenBeam};
@@ -40,7 +39,7 @@ fn method(name: &str) -> Value {
 
 /// A volume with every number finite, and times that training went back.
 fn made(method: &Value, scan: &Scan) -> Result<(Volume, u64)> {
-    let (solution, _) = solve(method, scan, &Weights::default())?;
+    let (solution, _) = solve(method, scan)?;
     let volume = solution.result.volume(&conefield_backend_cpu::Cpu::new())?;
     Ok((volume, solution.rollbacks))
 }
@@ -290,7 +289,7 @@ pub fn distances() -> Vec<Case> {
 pub fn with(set: impl FnOnce(&mut Value)) -> Result<Seen> {
     let mut value = field();
     set(&mut value);
-    let (solution, records) = solve(&value, &scan(), &Weights::default())?;
+    let (solution, records) = solve(&value, &scan())?;
     let found = volume(&solution);
     let loss = records.last().and_then(|r| r.loss).unwrap_or(f64::NAN);
     let e = error(&found, &truth(), 1.0);

@@ -4,7 +4,6 @@ use crate::case::{Case, Ends, Seen};
 use crate::common::{model, pipeline, scan, solve};
 use crate::scans::with;
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::Weights;
 use conefield_core::backend::{Adam, Backend, Work};
 use conefield_core::pipeline::Model;
 use conefield_solvers::losses::L1;
@@ -51,7 +50,7 @@ pub fn long() -> Vec<Case> {
                 "projector": {"type": "ray-march", "samples": 4},
                 "type": "neural-field", "training": {"steps": steps, "rays": 8, "report_every": steps / 10}, "optimizer": {"lr": 2e-3, "decay": "none"},
             });
-            solve(&value, &scan(), &Weights::default())
+            solve(&value, &scan())
         };
         let (_, first) = run(100_000)?;
         let (solution, records) = run(1_000_000)?;

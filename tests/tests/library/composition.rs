@@ -2,7 +2,6 @@
 //! refused in words.
 
 use crate::common::{scan, solve, volume};
-use conefield_core::arena::Weights;
 use serde_json::{Value, json};
 
 /// With their channels and whether these stand from coarse to fine.
@@ -63,7 +62,7 @@ fn pipeline(encoder: &Value, [normalizers, masks]: &[Value; 2], field: &Value, p
 
 /// Trains: the loss falls to less than half, the volume is finite. Returns how many channels the field reads.
 fn learns(name: &str, spec: &Value) -> usize {
-    let (solution, records) = solve(spec, &scan(), &Weights::default()).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let (solution, records) = solve(spec, &scan()).unwrap_or_else(|e| panic!("{name}: {e}"));
     let (first, last) = (records.first().unwrap().loss.unwrap(), records.last().unwrap().loss.unwrap());
     // A record every five steps, and others between them, so that there are at least ten.
     assert_eq!(solution.steps, 30, "{name}");
@@ -100,7 +99,7 @@ fn a_mask_that_is_never_decided_is_reported() {
     let (_, encoder, ..) = encoders().remove(0);
     let mask = json!([{"type": "fft-mask", "epoch": 1000}]);
     let spec = pipeline(&encoder, &[json!([]), mask], &mlp(), &projectors()[0]);
-    let (_, records) = solve(&spec, &scan(), &Weights::default()).unwrap();
+    let (_, records) = solve(&spec, &scan()).unwrap();
     let (last, before) = records.split_last().unwrap();
     assert!(before.iter().all(|r| r.events.is_empty()));
     assert_eq!(last.events.len(), 1);
@@ -121,7 +120,7 @@ fn voxels_behind_positions_learn() {
 
 /// The refusal of `spec` holds every one of `words`.
 fn refused(spec: &Value, words: &[&str]) {
-    let Err(e) = solve(spec, &scan(), &Weights::default()) else { panic!("{words:?}: not refused") };
+    let Err(e) = solve(spec, &scan()) else { panic!("{words:?}: not refused") };
     let e = e.to_string();
     assert!(words.iter().all(|w| e.contains(w)), "{e:?} lacks one of {words:?}");
 }
@@ -141,7 +140,7 @@ fn what_does_not_fit_is_refused_in_words() {
     for key in ["encoder", "field", "projector", "type"] {
         let mut spec = good.clone();
         spec.as_object_mut().unwrap().remove(key);
-        let known = if key == "type" { "neural-field".into() } else { format!("{key} type") };
+        let known = if key == "type" { "neural-field".to_owned() } else { format!("{key} type") };
         refused(&spec, &[key, "nothing", &known]);
     }
     let changes: [(fn(&mut Value), &[&str]); 8] = [

@@ -3,7 +3,6 @@
 use crate::common::{Heard, goes_on, model, pipeline, planned, scan, solve, state};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
-use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::host;
@@ -108,24 +107,23 @@ fn a_field_that_moves_by_a_known_amount_drifts_by_it() {
 #[test]
 fn drift_is_logged_where_it_is_asked_for_and_changes_nothing() {
     let scan = scan();
-    let none = Weights::default();
-    let (solution, records) = solve(&settings(), &scan, &none).unwrap();
+    let (solution, records) = solve(&settings(), &scan).unwrap();
     let found = drift(&records);
     let steps: Vec<[u64; 2]> = found.iter().map(|d| [d.from_step, d.step]).collect();
     assert_eq!(steps, [[0, 12], [12, 24], [24, 36]]);
     assert!(found.iter().all(|d| d.mean_l1 > 0.0 && d.mean_l1.is_finite()), "{found:?}");
     assert!((found[1].epoch - 3.0).abs() < 1e-12);
-    let (plain, without) = solve(&with("/callbacks", json!([{"type": "rollback"}])), &scan, &none).unwrap();
+    let (plain, without) = solve(&with("/callbacks", json!([{"type": "rollback"}])), &scan).unwrap();
     assert!(drift(&without).is_empty() && !serde_json::to_string(&without[0]).unwrap().contains("drift"));
     assert_eq!(model(solution).arena.params, model(plain).arena.params);
     // A rate too small to change a number leaves nothing to see.
-    let (_, still) = solve(&with("/optimizer/lr", json!(1e-30)), &scan, &none).unwrap();
+    let (_, still) = solve(&with("/optimizer/lr", json!(1e-30)), &scan).unwrap();
     assert!(drift(&still).iter().all(|d| d.mean_l1 == 0.0) && drift(&still).len() == 3);
 }
 
 #[test]
 fn an_interval_in_which_channels_are_masked_has_no_drift() {
-    let (solution, records) = solve(&masked(), &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve(&masked(), &scan()).unwrap();
     assert_eq!(model(solution).masks().len(), 1, "nothing was masked");
     let steps: Vec<u64> = drift(&records).iter().map(|d| d.step).collect();
     assert_eq!(steps, [12, 36]);

@@ -2,7 +2,6 @@
 
 use crate::common::{goes_on, model, planned, psnr, scan, solve, state};
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::Weights;
 use conefield_core::method::{Job, Record};
 use serde_json::{Value, json};
 use std::sync::LazyLock;
@@ -41,7 +40,7 @@ fn training_explains_the_views() {
 fn threads_change_no_bit() {
     let run = |threads: usize, s: &Value| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| state(&model(solve(s, &scan(), &Weights::default()).unwrap().0).arena))
+        pool.install(|| state(&model(solve(s, &scan()).unwrap().0).arena))
     };
     let mut s = settings();
     let one = run(1, &s);

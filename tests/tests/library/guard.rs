@@ -2,7 +2,7 @@
 
 use crate::common::{goes_on, model, planned, scan, solve, solve_on, state};
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::{Arena, Weights};
+use conefield_core::arena::Arena;
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
 use conefield_core::error::{Error, Result};
 use conefield_core::method::{Job, Record, Solution};
@@ -125,7 +125,7 @@ impl Executable for Remote {
 }
 
 fn run(value: &Value, fault: Fault) -> Result<(Solution, Vec<Record>)> {
-    solve_on(&Faulty { fault, device: None }, value, &scan(), &Weights::default())
+    solve_on(&Faulty { fault, device: None }, value, &scan())
 }
 
 fn outcome(solution: Solution) -> Vec<u32> {
@@ -142,7 +142,7 @@ fn events(records: &[Record]) -> Vec<(u64, String)> {
 fn what_never_diverges_keeps_its_bits() {
     let mut off = settings(130);
     off["callbacks"] = json!([]);
-    let plain = |s: &Value| solve(s, &scan(), &Weights::default()).unwrap();
+    let plain = |s: &Value| solve(s, &scan()).unwrap();
     let ((a, on), (b, without)) = (plain(&settings(130)), plain(&off));
     assert_eq!(a.rollbacks, 0);
     assert_eq!(on.iter().map(|r| r.loss).collect::<Vec<_>>(), without.iter().map(|r| r.loss).collect::<Vec<_>>());
@@ -254,7 +254,7 @@ fn a_device_goes_back_too() {
             value["training"]["rays"] = json!(8);
             value["projector"]["samples"] = json!(4);
             let backend = Faulty { fault, device: Some(device) };
-            let (solution, _) = solve_on(&backend, &value, &scan(), &Weights::default()).unwrap();
+            let (solution, _) = solve_on(&backend, &value, &scan()).unwrap();
             (solution.rollbacks, model(solution).arena)
         };
         let (rollbacks, back) = after(131, Fault::Loss(130));

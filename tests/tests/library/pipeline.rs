@@ -2,7 +2,8 @@
 //! scan, and masked channels that leave the work.
 
 use crate::common::{
-    Heard, bits, decibels, model, moved, pipeline, planned, point, protocol, rays, scan, solve, truth, volume,
+    Heard, bits, decibels, model, moved, pipeline, planned, point, protocol, rays, scan, solve, solve_from, truth,
+    volume,
 };
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
@@ -14,7 +15,7 @@ use conefield_core::loss::Loss;
 use conefield_core::method::{Limits, PretrainJob, Solution};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::trained::{Placement, TrainedField};
+use conefield_core::trained::TrainedField;
 use conefield_projectors::simulate::simulate;
 use conefield_solvers::losses::{Huber, L2};
 use conefield_solvers::priors::TotalVariation;
@@ -176,7 +177,7 @@ fn the_number_of_threads_does_not_change_a_bit() {
     let scan = scan();
     let run = |threads: usize, s: &Value| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let (solution, records) = pool.install(|| solve(s, &scan, &Weights::default())).unwrap();
+        let (solution, records) = pool.install(|| solve(s, &scan)).unwrap();
         assert_eq!(solution.steps, 10);
         let volume = volume(&solution);
         let arena = &solution.result.field().unwrap().model.arena;
@@ -202,7 +203,7 @@ fn noise_weights_come_from_the_scan() {
     let run = |loss: &str| {
         let mut s = settings();
         s["loss"] = json!(loss);
-        let (solution, records) = solve(&s, &scan, &Weights::default()).unwrap();
+        let (solution, records) = solve(&s, &scan).unwrap();
         (model(solution).arena.params.to_vec(), records.last().unwrap().loss.unwrap())
     };
     let ([weighted, again], (plain, squares)) = ([(); 2].map(|()| run("noise-weighted")), run("l2"));
@@ -214,17 +215,19 @@ fn noise_weights_come_from_the_scan() {
 
 // ---- export ----
 
-fn restored(
-    value: &Value,
-    placement: &Placement,
-    load: &mut dyn FnMut(&mut Model) -> Result<()>,
-) -> Result<TrainedField> {
-    planned(value, &Cpu::new())?.restore(placement, load)
+/// The field that `value` trained, from its weights and its placement as it would come back from a file.
+fn restored(value: &Value, field: &TrainedField) -> TrainedField {
+    let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
+    let placement = serde_json::from_str(&serde_json::to_string(&field.placement()).unwrap()).unwrap();
+    let load = &mut |model: &mut Model| {
+        weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
+    };
+    planned(value, &Cpu::new()).unwrap().restore(&placement, load).unwrap()
 }
 
 #[test]
 fn a_field_evaluated_part_by_part_is_the_same_to_the_bit() {
-    let (solution, _) = solve(&settings(), &scan(), &Weights::default()).unwrap();
+    let (solution, _) = solve(&settings(), &scan()).unwrap();
     let whole = volume(&solution);
     let mut voxels = solution.result.voxels(&Cpu::new()).unwrap();
     for part in [[0..16, 0..16, 3..4], [0..1, 5..16, 0..16], [7..12, 2..3, 1..16], [15..16, 15..16, 15..16]] {
@@ -244,15 +247,10 @@ fn a_field_comes_back_from_its_weights() {
     let width = s["encoder"]["levels"].as_u64().unwrap() * s["encoder"]["features"].as_u64().unwrap_or(2);
     let kept: Vec<u64> = (0..width - 1).collect();
     s["callbacks"] = json!([{"type": "fft-mask", "keep": kept}]);
-    let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let (solution, _) = solve(&s, &scan()).unwrap();
     let field = solution.result.field().unwrap();
     assert_eq!(field.placement().masks.len(), 1);
-    let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
-    let placement = serde_json::from_str(&serde_json::to_string(&field.placement()).unwrap()).unwrap();
-    let again = restored(&s, &placement, &mut |model| {
-        weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
-    })
-    .unwrap();
+    let again = restored(&s, field);
     let whole = volume(&solution);
     let values = |n: usize| {
         let grid = again.scene.grid.with_longest(n);
@@ -274,7 +272,7 @@ fn a_relative_attenuation_knows_no_unit() {
     let found = |attenuation: Value, scan: &Scan, scale: f64| {
         let mut s = settings();
         s["scene"] = json!({ "attenuation": attenuation });
-        decibels(&volume(&solve(&s, scan, &Weights::default()).unwrap().0).data, scale)
+        decibels(&volume(&solve(&s, scan).unwrap().0).data, scale)
     };
     let mut other = base.clone();
     other.projections.mapv_inplace(|a| 2.0 * a);
@@ -315,7 +313,7 @@ fn weights_behind_the_encoder_go_to_another_scan() {
         if steps == 0 {
             s["optimizer"]["lr"] = json!(1e-60);
         }
-        let (solution, records) = solve(&s, &scan(), &weights)?;
+        let (solution, records) = solve_from(&weights, &s, &scan())?;
         Ok((solution, records.iter().map(|r| r.loss.unwrap()).collect()))
     };
     let fresh = model(run(&s, 0).unwrap().0);
@@ -355,7 +353,7 @@ fn masked_channels_leave_the_work() {
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
     s["callbacks"] = json!([{"type": "rollback"}, mask]);
     let whole = pipeline(&s);
-    let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve(&s, &scan()).unwrap();
     let model = model(solution);
     let p = &model.pipeline;
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
@@ -394,7 +392,7 @@ fn channels_finer_than_the_data_leave_the_work() {
     // A mask that has its own say afterwards.
     s["callbacks"] = json!([{"type": "fft-mask", "keep": [0, 1, 2, 3, 4, 5, 6, 9]}]);
     s["scene"] = json!({"levels": "needed"});
-    let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve(&s, &scan()).unwrap();
     assert_eq!(records.iter().flat_map(|r| &r.events).count(), 1);
     let field = solution.result.field().unwrap();
     let masks = field.placement().masks;
@@ -404,18 +402,14 @@ fn channels_finer_than_the_data_leave_the_work() {
     assert!(names.contains(&"encoder.3.table") && !names.contains(&"encoder.4.table"), "{names:?}");
 
     // It comes back from its weights.
-    let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
-    let again = restored(&s, &field.placement(), &mut |model| {
-        weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
-    })
-    .unwrap();
+    let again = restored(&s, field);
     let values = Volume::collect(&mut again.voxels(&Cpu::new(), again.scene.grid).unwrap()).unwrap();
     assert_eq!(bits(values.data.as_slice().unwrap()), bits(volume(&solution).data.as_slice().unwrap()));
 
     // A grid that is coarser than the data keeps all.
     s["encoder"]["levels"] = json!(3);
     s["callbacks"] = json!([]);
-    let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let (solution, _) = solve(&s, &scan()).unwrap();
     assert!(solution.result.field().unwrap().placement().masks.is_empty());
 }
 
@@ -425,12 +419,12 @@ fn a_step_in_voxels_is_one_in_millimetres() {
     let run = |projector: Value| {
         let mut s = s.clone();
         s["projector"] = projector;
-        bits(&model(solve(&s, &scan(), &Weights::default()).unwrap().0).arena.params)
+        bits(&model(solve(&s, &scan()).unwrap().0).arena.params)
     };
     let voxels = run(json!({"type": "ray-march", "step_voxels": 1.5}));
     assert_eq!(voxels, run(json!({"type": "ray-march", "step_mm": 15.0})));
     assert_ne!(voxels, run(json!({"type": "ray-march", "step_mm": 10.0})));
     s["projector"] = json!({"type": "ray-march", "step_voxels": 1.5, "step_mm": 2.0});
-    let e = solve(&s, &scan(), &Weights::default()).err().unwrap().to_string();
+    let e = solve(&s, &scan()).err().unwrap().to_string();
     assert!(e.contains("projector.step_voxels"), "{e}");
 }

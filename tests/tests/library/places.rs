@@ -4,7 +4,6 @@
 use crate::common::{Heard, In, apart, decibels, planned, protocol, psnr, scan, solve_on, truth, voxels};
 use crate::ranks::rms;
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
 use conefield_core::data_term::DataTermSpec;
 use conefield_core::geometry::Geometry;
@@ -506,7 +505,7 @@ pub fn larger() -> Scan {
 /// Bytes that a run moves to the device and from it.
 fn moved(method: &Value, scan: &Scan, backend: &dyn Backend) -> [f64; 2] {
     let before = backend.moved();
-    solve_on(backend, method, scan, &Weights::default()).unwrap();
+    solve_on(backend, method, scan).unwrap();
     let after = backend.moved();
     [after.to_device - before.to_device, after.from_device - before.from_device].map(|bytes| bytes as f64)
 }

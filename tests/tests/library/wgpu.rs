@@ -8,7 +8,6 @@ use conefield_backend_cpu::step::Slots;
 use conefield_backend_wgpu::Wgpu;
 use conefield_conformance::{Options, check_projector_wgsl, check_wgsl};
 use conefield_core::Result;
-use conefield_core::arena::Weights;
 use conefield_core::backend::{Adam, Backend, BlockWork, TrainRay, Work};
 use conefield_core::loss::Loss;
 use conefield_core::method::{Job, Record};
@@ -194,12 +193,12 @@ fn masked_channels_leave_the_kernels() {
     s["encoder"]["base_resolution"] = json!(2);
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
     s["callbacks"] = json!([{"type": "rollback"}, mask]);
-    let (solution, records) = solve_on(backend, &s, &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve_on(backend, &s, &scan()).unwrap();
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), 1, "{events:?}");
     let kept = model(solution).pipeline.encoder.info().output;
     assert!((1..12).contains(&kept), "{kept}");
-    let on_cpu = model(solve(&s, &scan(), &Weights::default()).unwrap().0).pipeline.encoder.info().output;
+    let on_cpu = model(solve(&s, &scan()).unwrap().0).pipeline.encoder.info().output;
     assert_eq!(kept, on_cpu);
     assert!(records.last().unwrap().loss.unwrap() < records[1].loss.unwrap());
 }
