@@ -1,23 +1,15 @@
 //! The checks of each kind, for a stage that its settings build.
 
+use crate::losses::ready;
 use crate::{
     Options, Outcome, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
     check_loss_wgsl, check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl,
-    check_regularizer, check_voxel_projector, check_wgsl, ready,
+    check_regularizer, check_voxel_projector, check_wgsl,
 };
-use conefield_core::arena::Weights;
-use conefield_core::basis::BasisSpec;
-use conefield_core::data_term::DataTermSpec;
-use conefield_core::error::{Error, Result, ensure};
-use conefield_core::loss::Loss;
+use conefield_core::prelude::*;
 use conefield_core::registry::{Kind, Origin, Settings, read, stage_types};
-use conefield_core::regularizer::RegularizerSpec;
 use conefield_core::runner::Runner;
-use conefield_core::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
-};
 use conefield_core::spec::check;
-use conefield_core::stage::{Field, Normalizer, Stage};
 use conefield_core::voxel::VoxelProjectorSpec;
 use serde_json::Value;
 

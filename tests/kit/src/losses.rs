@@ -27,7 +27,7 @@ pub fn check_loss(loss: &dyn Loss) -> Report {
     report
 }
 
-/// Checks all properties of a loss's WGSL.
+/// Checks all properties of a loss's WGSL, which it must have.
 pub fn check_loss_wgsl(loss: &dyn Loss, device: &dyn Runner) -> Report {
     let mut report = Report::of(loss.describe());
     report.add("WGSL parity", || parity(loss, device));
@@ -145,9 +145,6 @@ fn learns(loss: &dyn Loss) -> Outcome {
 }
 
 fn parity(loss: &dyn Loss, device: &dyn Runner) -> Outcome {
-    if loss.wgsl().is_none() {
-        return Outcome::Skipped("it offers none".into());
-    }
     let pairs: Vec<[f32; 2]> = pairs().into_iter().map(|p| p.map(|v| v as f32)).collect();
     let found = match device.losses(loss, &pairs) {
         Ok(found) => found,

@@ -38,7 +38,7 @@ pub fn check_prior(prior: &dyn Prior) -> Report {
     report
 }
 
-/// Checks all properties of a prior's WGSL.
+/// Checks all properties of a prior's WGSL, which it must have.
 pub fn check_prior_wgsl(prior: &dyn Prior, device: &dyn Runner) -> Report {
     let mut report = Report::of(prior.describe());
     report.add("WGSL parity", || parity(prior, device));
@@ -130,9 +130,6 @@ fn poison(prior: &dyn Prior) -> Outcome {
 }
 
 fn parity(prior: &dyn Prior, device: &dyn Runner) -> Outcome {
-    if prior.wgsl().is_none() {
-        return Outcome::Skipped("it offers none".into());
-    }
     let values = drawn(prior);
     let (value, slopes) = run(prior, &values, 1.0);
     let single: Vec<f32> = values.iter().map(|&v| v as f32).collect();

@@ -10,7 +10,7 @@ use conefield_core::stage::{Projector, Stage};
 /// Repetitions of the rows around which a stage is smooth: several workgroups, the last one partly filled.
 const ROUNDS: usize = 9;
 
-/// Checks all properties of a stage's WGSL.
+/// Checks all properties of a stage's WGSL, which it must have.
 pub fn check_wgsl(stage: &dyn Stage, options: &Options, device: &dyn Runner) -> Report {
     let mut report = Report::of(stage.describe());
     let of = Subject::new(stage, options);
@@ -23,10 +23,6 @@ pub fn check_wgsl(stage: &dyn Stage, options: &Options, device: &dyn Runner) -> 
 /// same error, and four times as much in gradients, because their sums have no fixed order.
 fn parity(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
     let (stage, options) = (of.stage, of.options);
-    if stage.wgsl().is_none() {
-        let identity = stage.info().identity;
-        return Outcome::Skipped(if identity { "left out on a device".into() } else { "it offers none".into() });
-    }
     let rounds = |v: &[f64], change: bool| -> Vec<f64> {
         let n = options.rows;
         let of = |c: &[f64]| -> Vec<f64> {
@@ -84,9 +80,6 @@ fn single_only(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
 /// The device gives finite numbers wherever the CPU does: for zeros, denormals (which it may flush to zero) and huge
 /// numbers.
 fn extremes(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
-    if of.stage.wgsl().is_none() {
-        return Outcome::Skipped("no WGSL".into());
-    }
     let (single, options) = (of.single(), of.options);
     let rows = 70;
     for value in [0.0f32, -0.0, 1e-40, 1e-30, 1.0, -1.0, 1e30, -1e30] {
@@ -112,7 +105,7 @@ fn extremes(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
     Outcome::Passed("finite wherever the CPU is".into())
 }
 
-/// Checks all properties of a projector's WGSL.
+/// Checks all properties of a projector's WGSL, which it must have.
 pub fn check_projector_wgsl(projector: &dyn Projector, device: &dyn Runner) -> Report {
     let mut report = Report::of(projector.describe());
     report.add("WGSL parity", || same_samples(projector, device));
@@ -123,9 +116,6 @@ pub fn check_projector_wgsl(projector: &dyn Projector, device: &dyn Runner) -> R
 const PLACES: f32 = 2e-6;
 
 fn same_samples(projector: &dyn Projector, device: &dyn Runner) -> Outcome {
-    if projector.wgsl().is_none() {
-        return Outcome::Skipped("it offers none".into());
-    }
     let seeds = [None, Some(5), Some(0xfedc_ba98_7654_3210)];
     let all: Vec<_> = rays().into_iter().flat_map(|r| seeds.map(|s| (r, s))).collect();
     let found = match device.samples(projector, &all) {
