@@ -8,26 +8,12 @@ use conefield_conformance::{
     check_loss_wgsl, check_prior, check_prior_wgsl, check_projector, check_regularizer, check_settings,
     check_voxel_projector,
 };
-use conefield_core::arena::{Arena, InitReport, Layout};
-use conefield_core::basis::{Basis, BasisOperator, Expansion};
-use conefield_core::data_term::{DataTerm, Misfit};
-use conefield_core::geometry::{Geometry, VoxelGrid};
-use conefield_core::loss::{Loss, NoiseModel};
-use conefield_core::place::StatePart;
-use conefield_core::prior::{Blocks, Prior};
-use conefield_core::regularizer::{Bounds, Penalty, Regularizer};
-use conefield_core::settings::{Initializer, LossSpec};
-use conefield_core::simd::Real;
-use conefield_core::space::Space;
-use conefield_core::stage::{
-    Encoder, GradKind, Grads, Info, Kernel, Lengths, Parameter, Projector, Reduced, Samples, Stage, Tile, TileMut,
-    UnitRay,
-};
+use conefield_core::geometry::Geometry;
+use conefield_core::prelude::*;
+use conefield_core::regularizer::Bounds;
+use conefield_core::stage::Lengths;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
-use conefield_core::wgsl::Fragment;
-use conefield_core::{Error, Result};
 use conefield_projectors::voxel::{Joseph, Siddon};
-use ndarray::{ArrayView3, ArrayViewMut3};
 use std::fmt::Debug;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
@@ -53,7 +39,7 @@ macro_rules! faults {
 faults! {
     Fault {
         /// The parameter gradient is 1 % too large.
-        Gradient: only "finite differences: parameters";
+        Gradient: "finite differences: parameters";
         /// The last row is left out of the parameter gradient.
         LastRow: "finite differences: parameters", "tile sizes: gradients";
         /// One of the parameters gets no gradient.
@@ -61,15 +47,15 @@ faults! {
         /// The input gradient has the wrong sign.
         InputGradient: "finite differences: inputs";
         /// Gradients replace what is there.
-        OverwritesGradients: only "gradients add";
+        OverwritesGradients: "gradients add";
         /// The input gradient is added to what is there.
         AddsInputGradient: "input gradient overwrites";
         /// One number past the end of the output.
-        WritesOutside: only "guards";
+        WritesOutside: "guards";
         /// One number before the start of the gradients.
         WritesBefore: "guards";
         /// A NaN in one row reaches every row.
-        SpreadsNan: only "poison rows";
+        SpreadsNan: "poison rows";
         /// The result depends on the number of rows.
         TileSize: "tile sizes: outputs";
         /// An output is not written.
@@ -329,6 +315,20 @@ fn each_fails<F: Copy + Debug>(sound: F, faults: &[(F, bool, &[&str])], check: i
 #[test]
 fn every_fault_fails_its_property_and_the_sound_stage_none() {
     each_fails(Fault::None, Fault::ALL, |fault| check_encoder(&Toy::new(fault), &Options::encoder()));
+}
+
+/// But for smaller encoders, which have the fault as well.
+#[test]
+fn faults_of_one_kind_leave_the_other_properties_alone() {
+    for (fault, properties) in [
+        (Fault::Gradient, &["finite differences: parameters"][..]),
+        (Fault::OverwritesGradients, &["gradients add"]),
+        (Fault::WritesOutside, &["guards"]),
+        (Fault::SpreadsNan, &["poison rows"]),
+    ] {
+        let report = check(&Toy::new(fault), &Options::encoder());
+        assert_eq!(report.failed(), properties, "{report}");
+    }
 }
 
 #[test]

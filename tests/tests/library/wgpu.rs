@@ -364,6 +364,10 @@ fn a_perturbed_constant_fails_the_parity_check() {
 #[test]
 fn stages_of_random_shapes_agree() {
     let Some(shared) = crate::device::shared("random shapes") else { return };
+    let agrees = |what: &str, stage: &dyn Stage, options: &Options| {
+        let report = check_wgsl(stage, options, &*shared);
+        assert!(report.passed(), "{what}: {report}");
+    };
     let mut n = 0u64;
     let mut below = |k: u64| {
         n += 1;
@@ -380,8 +384,7 @@ fn stages_of_random_shapes_agree() {
         let keep: Vec<usize> = (0..whole.info().output).filter(|_| below(3) > 0).collect();
         let stage = if keep.is_empty() { whole } else { whole.keep_outputs(&keep).unwrap().stage };
         let options = Options { rows: 1 + below(20) as usize, single: 5e-5, ..Options::encoder() };
-        let report = check_wgsl(stage.as_ref(), &options, &*shared);
-        assert!(report.passed(), "{grid}: {report}");
+        agrees(&grid.to_string(), stage.as_ref(), &options);
     }
     for _ in 0..3 {
         let width = 2 + below(36) as usize;
@@ -390,8 +393,7 @@ fn stages_of_random_shapes_agree() {
         let keep: Vec<usize> = (0..width).filter(|c| *c == 0 || below(3) > 0).collect();
         let stage = norm.keep_inputs(&keep).unwrap().stage;
         let options = Options { params: Some(1.0), ..Options::features() };
-        let report = check_wgsl(stage.as_ref(), &options, &*shared);
-        assert!(report.passed(), "layer-norm of {width}, {keep:?}: {report}");
+        agrees(&format!("layer-norm of {width}, {keep:?}"), stage.as_ref(), &options);
     }
     for _ in 0..3 {
         let depth = 1 + below(3);
@@ -402,8 +404,7 @@ fn stages_of_random_shapes_agree() {
         let spec: Box<dyn FieldSpec> = serde_json::from_value(mlp.clone()).unwrap();
         let stage = spec.build(1 + below(9) as usize).unwrap();
         let options = Options { single: 5e-5, ..Options::features() };
-        let report = check_wgsl(stage.as_ref(), &options, &*shared);
-        assert!(report.passed(), "{mlp}: {report}");
+        agrees(&mlp.to_string(), stage.as_ref(), &options);
     }
 }
 
