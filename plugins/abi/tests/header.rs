@@ -78,36 +78,16 @@ fn the_header_is_current() {
 #[cfg(target_pointer_width = "64")]
 fn the_layout_is_pinned() {
     assert_eq!((CONEFIELD_ABI_MAJOR, CONEFIELD_ABI_MINOR), (4, 0));
-    let sizes = [
-        size_of::<ConefieldStr>(),
-        size_of::<ConefieldText>(),
-        size_of::<ConefieldTile>(),
-        size_of::<ConefieldTileMut>(),
-        size_of::<ConefieldGrads>(),
-        size_of::<ConefieldInfo>(),
-        size_of::<ConefieldParameter>(),
-        size_of::<ConefieldRange>(),
-        size_of::<ConefieldReduced>(),
-        size_of::<ConefieldMap>(),
-        size_of::<ConefieldRay>(),
-        size_of::<ConefieldLengths>(),
-        size_of::<ConefieldProjector>(),
-        size_of::<ConefieldBlock>(),
-        size_of::<ConefieldTensor>(),
-        size_of::<ConefieldInitializer>(),
-        size_of::<ConefieldNoise>(),
-        size_of::<ConefieldLoss>(),
-        size_of::<ConefieldBlocks>(),
-        size_of::<ConefieldPrior>(),
-        size_of::<ConefieldGrid>(),
-        size_of::<ConefieldState>(),
-        size_of::<ConefieldRegularizer>(),
-        size_of::<ConefieldDataTerm>(),
-        size_of::<ConefieldExpansion>(),
-        size_of::<ConefieldBasis>(),
-        size_of::<ConefieldStage>(),
-        size_of::<ConefieldPlugin>(),
-    ];
+    macro_rules! sizes {
+        ($($table:ident)*) => { [$(size_of::<$table>()),*] };
+    }
+    let sizes = sizes! {
+        ConefieldStr ConefieldText ConefieldTile ConefieldTileMut ConefieldGrads ConefieldInfo ConefieldParameter
+        ConefieldRange ConefieldReduced ConefieldMap ConefieldRay ConefieldLengths ConefieldProjector ConefieldBlock
+        ConefieldTensor ConefieldInitializer ConefieldNoise ConefieldLoss ConefieldBlocks ConefieldPrior ConefieldGrid
+        ConefieldState ConefieldRegularizer ConefieldDataTerm ConefieldExpansion ConefieldBasis ConefieldStage
+        ConefieldPlugin
+    };
     let first = [16, 24, 32, 32, 24, 80, 32, 16, 40, 112, 44, 16, 56, 48, 48, 48, 32, 40, 32, 32];
     assert_eq!(sizes[..20], first);
     assert_eq!(sizes[20..], [72, 32, 64, 56, 88, 56, 152, 88]);

@@ -366,12 +366,6 @@ impl Drop for Handle {
 }
 
 impl Handle {
-    /// The stage that `call` returned, if any.
-    pub fn made(&self, stage: *mut c_void, call: &str) -> Result<Option<Self>> {
-        ensure(stage != self.stage, &self.ty.words(), call, "the old stage", "a new one")?;
-        Ok((!stage.is_null()).then(|| Self { ty: self.ty.clone(), stage }))
-    }
-
     /// The stage's own description.
     pub fn describe(&self) -> String {
         let mut text = Text::new();

@@ -112,6 +112,14 @@ impl<F: FunctionsOf> Foreign<F> {
         })
     }
 
+    /// The end of a call that fills `out`: records its error and leaves NaN.
+    fn filled<R: Real>(&self, result: Result<()>, out: &mut [R]) {
+        if let Err(e) = result {
+            self.fault.set(e);
+            out.fill(R::of(f64::NAN));
+        }
+    }
+
     /// The WGSL of the stage, if any.
     fn fragment(&self, wgsl: Option<WgslFn>) -> Option<Fragment> {
         let wgsl = wgsl?;
@@ -134,10 +142,12 @@ impl<F: FunctionsOf> Foreign<F> {
         f: impl FnOnce(*mut c_void, *mut *mut c_void, *mut ConefieldText) -> ConefieldStatus,
     ) -> Result<Option<Handle>> {
         let (mut made, mut error) = (ptr::null_mut(), Text::new());
-        match f(self.handle.stage, &mut made, error.room()) {
-            CONEFIELD_OK => self.handle.made(made, call),
-            status => Err(self.ty().refusal(call, status, &error.text())),
+        let status = f(self.handle.stage, &mut made, error.room());
+        if status != CONEFIELD_OK {
+            return Err(self.ty().refusal(call, status, &error.text()));
         }
+        ensure(made != self.handle.stage, &self.ty().words(), call, "the old stage", "a new one")?;
+        Ok((!made.is_null()).then(|| Handle { ty: self.ty().clone(), stage: made }))
     }
 
     /// The stage that `call` must have derived.

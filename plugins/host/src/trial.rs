@@ -18,34 +18,24 @@ pub const LIMIT: Duration = Duration::from_secs(5);
 
 /// Guard numbers on either side of a buffer: more than a tile of the widest common stages.
 pub(crate) const GUARD: usize = 1 << 14;
-/// NaNs that no arithmetic produces, marking unwritten numbers.
-pub(crate) const UNTOUCHED: u32 = 0x7fc5_a7e1;
-pub(crate) const UNTOUCHED_64: u64 = 0x7ff8_5a7e_1c5a_7e1c;
-
 /// Stages with more parameters are not initialized for their trial: it takes long, and the run does it anyway.
 const MANY: usize = 1 << 20;
 
-/// Numbers with a marker value.
-trait Marked: Real + Pod {
+/// Numbers with a marker of what is unwritten: a NaN that no arithmetic produces.
+pub(crate) trait Marked: Real + Pod {
     const MARK: Self;
 
-    fn is_mark(self) -> bool;
+    fn is_mark(self) -> bool {
+        bytemuck::bytes_of(&self) == bytemuck::bytes_of(&Self::MARK)
+    }
 }
 
 impl Marked for f32 {
-    const MARK: Self = f32::from_bits(UNTOUCHED);
-
-    fn is_mark(self) -> bool {
-        self.to_bits() == UNTOUCHED
-    }
+    const MARK: Self = Self::from_bits(0x7fc5_a7e1);
 }
 
 impl Marked for f64 {
-    const MARK: Self = f64::from_bits(UNTOUCHED_64);
-
-    fn is_mark(self) -> bool {
-        self.to_bits() == UNTOUCHED_64
-    }
+    const MARK: Self = Self::from_bits(0x7ff8_5a7e_1c5a_7e1c);
 }
 
 /// A buffer between guard zones. Zeroed pages take no memory until written: a trial runs before the memory check.

@@ -1,112 +1,92 @@
 //! The stage behind the pointer that the host holds.
 
 use conefield_core::prelude::*;
-use conefield_core::registry::read;
-use conefield_core::registry::{Kind, StageType};
+use conefield_core::registry::{Kind, Settings, StageType, read};
 use conefield_core::settings::KnownVolume;
 use conefield_plugin_abi::*;
 use serde_json::Value;
+use std::any::{Any, type_name};
 use std::cell::RefCell;
 use std::ops::Range;
 
 /// A stage held by the host.
 pub struct Built {
-    pub stage: AnyStage,
-    /// For an encoder, a normalizer or a field.
-    map: Option<MapInfo>,
-    /// The known volume of an initializer.
-    pub volume: Option<KnownVolume>,
-    /// What a reduced stage kept of the original.
-    pub kept: (Vec<ConefieldRange>, Vec<usize>),
-    /// The grid shape of a penalty or an expansion.
-    pub shape: [usize; 3],
+    /// A box of what the functions of its table take, such as a `Box<dyn Loss>` or a `Box<Map>`.
+    stage: Box<dyn Any>,
+    pub describe: String,
 }
 
-/// Defines the kinds of stages with their settings, which may need the number of input channels, and the parts that
-/// stages make for a grid or a scan, each with its description.
-macro_rules! any_stage {
-    (
-        stages { $($kind:ident $($name:ident)?: $stage:ident from $spec:ident($($width:ident)?),)* }
-        parts { $($part:ident $part_name:ident: $described:pat => $description:expr,)* }
-    ) => {
-        /// A stage of any kind, or a part.
-        pub enum AnyStage {
-            $($kind(Box<dyn $stage>),)*
-            $($part(Box<dyn $part>),)*
-            /// An initializer whose weights are not read yet.
-            Waiting(Waiting),
-        }
-
-        $(impl From<Box<dyn $stage>> for AnyStage {
-            fn from(stage: Box<dyn $stage>) -> Self {
-                Self::$kind(stage)
-            }
-        })*
-
-        $(impl From<Box<dyn $part>> for AnyStage {
-            fn from(stage: Box<dyn $part>) -> Self {
-                Self::$part(stage)
-            }
-        })*
-
-        impl AnyStage {
-            /// The stage of type `t` with `settings`, which include the type.
-            fn new(t: &StageType, settings: Value, width: usize) -> Result<Self> {
-                let refused = |e: String| Error::invalid("spec", "", e, "settings of this type");
-                Ok(match t.kind {
-                    $(Kind::$kind => {
-                        $(let $width = width;)?
-                        Self::from(read::<dyn $spec>(settings).map_err(refused)?.build($($width)?)?)
-                    })*
-                    Kind::Initializer => Waiting::build(read::<dyn InitializerSpec>(settings).map_err(refused)?)?,
-                    other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
-                })
-            }
-
-            pub fn describe(&self) -> String {
-                match self {
-                    $(Self::$kind(stage) => stage.describe(),)*
-                    $(Self::$part($described) => $description,)*
-                    Self::Waiting(w) => format!("waits for {}", w.path),
-                }
-            }
-        }
-
-        impl Built {
-            $($(pub fn $name(&self) -> Result<&dyn $stage> {
-                match &self.stage {
-                    AnyStage::$kind(stage) => Ok(stage.as_ref()),
-                    other => Err(other.is_no(stringify!($name))),
-                }
-            })?)*
-
-            $(pub fn $part_name(&self) -> Result<&dyn $part> {
-                match &self.stage {
-                    AnyStage::$part(stage) => Ok(stage.as_ref()),
-                    other => Err(other.is_no(stringify!($part_name))),
-                }
-            })*
-        }
-    };
+/// The settings of a stage.
+fn settings<T: Settings + ?Sized + 'static>(settings: Value) -> Result<Box<T>> {
+    read(settings).map_err(|e| Error::invalid("spec", "", e, "settings of this type"))
 }
 
-any_stage! {
-    stages {
-        Encoder encoder: Encoder from EncoderSpec(),
-        Normalizer: Normalizer from NormalizerSpec(width),
-        Field: Field from FieldSpec(width),
-        Projector projector: Projector from ProjectorSpec(),
-        Loss loss: Loss from LossSpec(),
-        Prior prior: Prior from PriorSpec(),
-        Regularizer regularizer: Regularizer from RegularizerSpec(),
-        DataTerm data_term: DataTerm from DataTermSpec(),
-        Basis basis: Basis from BasisSpec(),
+impl Built {
+    /// The stage of type `t` with `keys`, its settings without their type; some need the number of input channels.
+    pub fn new(t: &StageType, mut keys: Value, width: usize) -> Result<Self> {
+        let Some(table) = keys.as_object_mut() else {
+            return Err(Error::invalid("spec", "", &keys, "a table of settings"));
+        };
+        table.insert("type".into(), t.name.into());
+        macro_rules! built {
+            ($spec:ident) => {{
+                let stage = settings::<dyn $spec>(keys)?.build()?;
+                let describe = stage.describe();
+                Self::of(stage, describe)
+            }};
+        }
+        Ok(match t.kind {
+            Kind::Encoder => Map::of(Rows::Encoder(settings::<dyn EncoderSpec>(keys)?.build()?)).built(),
+            Kind::Normalizer => Map::of(Rows::Normalizer(settings::<dyn NormalizerSpec>(keys)?.build(width)?)).built(),
+            Kind::Field => Map::of(Rows::Field(settings::<dyn FieldSpec>(keys)?.build(width)?)).built(),
+            Kind::Projector => built!(ProjectorSpec),
+            Kind::Loss => built!(LossSpec),
+            Kind::Prior => built!(PriorSpec),
+            Kind::Regularizer => built!(RegularizerSpec),
+            Kind::DataTerm => built!(DataTermSpec),
+            Kind::Basis => built!(BasisSpec),
+            Kind::Initializer => Waiting::build(settings::<dyn InitializerSpec>(keys)?)?,
+            other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
+        })
     }
-    parts {
-        Initializer initializer: stage => stage.describe(),
-        Penalty penalty: _ => String::new(),
-        Misfit misfit: stage => stage.describe(),
-        Expansion expansion: _ => String::new(),
+
+    /// The host's object for `stage`.
+    pub fn of<T: ?Sized + 'static>(stage: Box<T>, describe: String) -> Self {
+        Self { stage: Box::new(stage), describe }
+    }
+
+    /// The stage as what a function takes.
+    pub fn get<T: ?Sized + 'static>(&self) -> Result<&T> {
+        self.stage.downcast_ref::<Box<T>>().map(|stage| &**stage).ok_or_else(is_no::<T>)
+    }
+
+    /// As [`Self::get`], mutable.
+    pub fn get_mut<T: ?Sized + 'static>(&mut self) -> Result<&mut T> {
+        self.stage.downcast_mut::<Box<T>>().map(|stage| &mut **stage).ok_or_else(is_no::<T>)
+    }
+}
+
+/// The error for a stage of a different kind than requested.
+fn is_no<T: ?Sized>() -> Error {
+    Error::unsupported("this stage", format!("it is no {}", type_name::<T>()))
+}
+
+/// What a stage made for one grid, with the grid's shape.
+pub struct OnGrid<T: ?Sized> {
+    pub shape: [usize; 3],
+    pub part: Box<T>,
+}
+
+/// An initializer, with its known volume.
+pub struct Filling {
+    pub initializer: Box<dyn Initializer>,
+    pub volume: Option<KnownVolume>,
+}
+
+impl Filling {
+    pub fn built(initializer: Box<dyn Initializer>) -> Built {
+        let (volume, describe) = (initializer.volume(), initializer.describe());
+        Built::of(Box::new(Self { initializer, volume }), describe)
     }
 }
 
@@ -118,119 +98,97 @@ pub struct Waiting {
 
 impl Waiting {
     /// Builds the initializer, or returns the settings if it needs a weights file.
-    fn build(spec: Box<dyn InitializerSpec>) -> Result<AnyStage> {
+    fn build(spec: Box<dyn InitializerSpec>) -> Result<Built> {
         let asked = RefCell::new(None);
         let built = spec.build(&|path| {
             asked.replace(Some(path.to_owned()));
             Err(Error::unsupported(path, "it is not read yet"))
         });
         match asked.into_inner() {
-            Some(path) => Ok(AnyStage::Waiting(Self { spec, path })),
-            None => built.map(AnyStage::Initializer),
+            Some(path) => {
+                let describe = format!("waits for {path}");
+                Ok(Built::of(Box::new(Self { spec, path }), describe))
+            }
+            None => built.map(Filling::built),
         }
     }
 
     /// The initializer with these weights.
-    pub fn with(&self, weights: &Weights) -> Result<AnyStage> {
+    pub fn with(&self, weights: &Weights) -> Result<Built> {
         let only = |path: &str| {
             let why = || Error::unsupported(path, "an initializer from a plugin has one weights file");
             (path == self.path).then(|| weights.clone()).ok_or_else(why)
         };
-        self.spec.build(&only).map(AnyStage::Initializer)
+        self.spec.build(&only).map(Filling::built)
     }
 }
 
-/// Properties of a map that the host queries repeatedly.
-pub struct MapInfo {
+/// A stage that maps rows.
+pub enum Rows {
+    Encoder(Box<dyn Encoder>),
+    Normalizer(Box<dyn Normalizer>),
+    Field(Box<dyn Field>),
+}
+
+/// The same with properties that the host queries repeatedly.
+pub struct Map {
+    rows: Rows,
     pub info: ConefieldInfo,
     pub blocks: Vec<Parameter>,
     pub partition: Vec<Range<usize>>,
+    /// What a reduced stage kept of the original: parameters, and channels on the other side.
+    pub kept: (Vec<ConefieldRange>, Vec<usize>),
 }
 
-impl Built {
-    /// The stage of type `t` with `settings`, which have no type key.
-    pub fn new(t: &StageType, mut settings: Value, width: usize) -> Result<Self> {
-        let Some(keys) = settings.as_object_mut() else {
-            return Err(Error::invalid("spec", "", &settings, "a table of settings"));
-        };
-        keys.insert("type".into(), t.name.into());
-        Ok(Self::of(AnyStage::new(t, settings, width)?))
+impl Map {
+    pub fn of(rows: Rows) -> Self {
+        let stage = rows.stage();
+        let i = stage.info();
+        let partition = if i.grads == GradKind::Scatter { stage.partition() } else { vec![] };
+        let blocks = stage.parameters();
+        let mut info = info(&i, blocks.len(), partition.len());
+        info.coarse_to_fine = matches!(&rows, Rows::Encoder(e) if e.coarse_to_fine()).into();
+        info.double_precision = stage.reference().is_some().into();
+        Self { rows, info, blocks, partition, kept: (vec![], vec![]) }
     }
 
-    /// The host's object for `stage`.
-    pub fn of(stage: impl Into<AnyStage>) -> Self {
-        let stage = stage.into();
-        let map = stage.map().map(|s| {
-            let i = s.info();
-            let partition = if i.grads == GradKind::Scatter { s.partition() } else { vec![] };
-            let blocks = s.parameters();
-            let mut info = info(&i, blocks.len(), partition.len());
-            info.coarse_to_fine = matches!(&stage, AnyStage::Encoder(e) if e.coarse_to_fine()).into();
-            info.double_precision = s.reference().is_some().into();
-            MapInfo { info, blocks, partition }
-        });
-        let volume = if let AnyStage::Initializer(i) = &stage { i.volume() } else { None };
-        Self { stage, map, volume, kept: (vec![], vec![]), shape: [0; 3] }
+    pub fn built(self) -> Built {
+        let describe = self.stage().describe();
+        Built::of(Box::new(self), describe)
     }
 
-    /// Returns the stage, whatever its kind.
-    pub fn any(&self) -> Result<&Self> {
-        Ok(self)
+    pub fn stage(&self) -> &dyn Stage {
+        self.rows.stage()
     }
 
-    /// As [`Self::any`], mutable.
-    pub fn any_mut(&mut self) -> Result<&mut Self> {
-        Ok(self)
-    }
-
-    /// As a map of rows, with its properties.
-    pub fn map(&self) -> Result<(&dyn Stage, &MapInfo)> {
-        self.stage.map().zip(self.map.as_ref()).ok_or_else(|| self.stage.is_no("encoder, normalizer or field"))
-    }
-
-    /// As a mutable penalty.
-    pub fn penalty_mut(&mut self) -> Result<&mut dyn Penalty> {
-        match &mut self.stage {
-            AnyStage::Penalty(penalty) => Ok(penalty.as_mut()),
-            other => Err(other.is_no("penalty")),
+    pub fn encoder(&self) -> Result<&dyn Encoder> {
+        match &self.rows {
+            Rows::Encoder(encoder) => Ok(encoder.as_ref()),
+            _ => Err(is_no::<dyn Encoder>()),
         }
     }
 
     /// The stage without some of its channels.
     pub fn reduced(&self, side: u32, keep: &[usize]) -> Result<Self> {
-        fn of<S: ?Sized>(reduced: Reduced<S>) -> Built
-        where
-            AnyStage: From<Box<S>>,
-        {
-            let Reduced { stage, params, channels } = reduced;
-            let params = params.iter().map(|r| ConefieldRange { start: r.start, end: r.end }).collect();
-            Built { kept: (params, channels), ..Built::of(stage) }
+        fn of<S: ?Sized>(reduced: Reduced<S>, rows: impl FnOnce(Box<S>) -> Rows) -> Map {
+            let params = reduced.params.iter().map(|r| ConefieldRange { start: r.start, end: r.end }).collect();
+            Map { kept: (params, reduced.channels), ..Map::of(rows(reduced.stage)) }
         }
-        Ok(match (&self.stage, side) {
-            (AnyStage::Encoder(e), CONEFIELD_OUTPUTS) => of(e.keep_outputs(keep)?),
-            (AnyStage::Normalizer(n), CONEFIELD_INPUTS) => of(n.keep_inputs(keep)?),
-            (AnyStage::Field(f), CONEFIELD_INPUTS) => of(f.keep_inputs(keep)?),
+        Ok(match (&self.rows, side) {
+            (Rows::Encoder(e), CONEFIELD_OUTPUTS) => of(e.keep_outputs(keep)?, Rows::Encoder),
+            (Rows::Normalizer(n), CONEFIELD_INPUTS) => of(n.keep_inputs(keep)?, Rows::Normalizer),
+            (Rows::Field(f), CONEFIELD_INPUTS) => of(f.keep_inputs(keep)?, Rows::Field),
             _ => return Err(Error::unsupported("this stage", "channels cannot be left out on that side")),
         })
     }
 }
 
-impl AnyStage {
-    /// As an encoder, normalizer or field.
-    fn map(&self) -> Option<&dyn Stage> {
+impl Rows {
+    fn stage(&self) -> &dyn Stage {
         match self {
-            Self::Encoder(s) => Some(s.as_ref()),
-            Self::Normalizer(s) => Some(s.as_ref()),
-            Self::Field(s) => Some(s.as_ref()),
-            _ => None,
-        }
-    }
-
-    /// The error for a stage of a different kind than requested.
-    fn is_no(&self, kind: &str) -> Error {
-        match self {
-            Self::Waiting(w) => Error::unsupported(&w.path, "the weights were not handed over"),
-            _ => Error::unsupported("this stage", format!("it is no {kind}")),
+            Self::Encoder(s) => s.as_ref(),
+            Self::Normalizer(s) => s.as_ref(),
+            Self::Field(s) => s.as_ref(),
         }
     }
 }

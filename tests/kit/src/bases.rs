@@ -1,6 +1,6 @@
 //! Properties of a basis: a linear map without negative entries, and its exact adjoint.
 
-use crate::call::{differing, settle};
+use crate::call::{differing, no_fault, on_threads, settle};
 use crate::gradients::no_double;
 use crate::voxels::{above, apart, dot, flat, noise};
 use crate::{Outcome, Report};
@@ -8,7 +8,6 @@ use conefield_core::basis::{Basis, BasisOperator, Expansion};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::simd::Real;
 use ndarray::Array3;
-use rayon::ThreadPoolBuilder;
 
 /// Largest mismatch of `<Bx, y>` and `<x, Bᵀy>` relative to `‖Bx‖·‖y‖`, in double and in single precision.
 const ADJOINT: [f64; 2] = [1e-12, 1e-5];
@@ -17,7 +16,7 @@ const SINGLE: f64 = 1e-5;
 
 /// Checks all properties of a basis.
 pub fn check_basis(basis: &dyn Basis) -> Report {
-    let mut report = Report { stage: basis.describe(), entries: vec![] };
+    let mut report = Report::of(basis.describe());
     report.add("builds", || builds(basis));
     let made: Result<Vec<_>, _> = grids().iter().map(|grid| basis.on(grid).map(|b| (*grid, b))).collect();
     let Ok(all) = made else { return report };
@@ -30,8 +29,7 @@ pub fn check_basis(basis: &dyn Basis) -> Report {
     report.add("no negative entries", || no_negative_entries(&all));
     report.add("samples", || samples(&all, if double { 1e-6 } else { SINGLE }));
     report.add("threads", || threads(&all));
-    let fault = |(_, basis): &(VoxelGrid, Box<dyn Expansion>)| basis.fault().err().map(|e| e.to_string());
-    report.add("no fault", || settle(all.iter().find_map(fault), "none was reported"));
+    report.add("no fault", || no_fault(all.iter().try_for_each(|(_, basis)| basis.fault())));
     report
 }
 
@@ -198,10 +196,6 @@ fn threads(all: &Made) -> Outcome {
         };
         all.iter().flat_map(of).collect()
     };
-    let want = both();
-    let complaint = [1, 3].into_iter().find_map(|n| {
-        let pool = ThreadPoolBuilder::new().num_threads(n).build().ok()?;
-        differing(&format!("{n} threads, number"), &pool.install(both), &want)
-    });
+    let complaint = on_threads(both, |n, a, b| differing(&format!("{n}, number"), a, b));
     settle(complaint, "1 and 3 threads")
 }

@@ -1,20 +1,17 @@
 //! Behaviour of a stage with its inputs: sizes, buffers, threads, extreme numbers.
 
-use crate::call::{
-    Before, Guarded, backward, data, differing, error, forward, forward_in_passes, forward_over, gradients, params,
-    rows_of, settle, within,
-};
+use crate::call::{Before, Guarded, Loaded, Subject, differing, error, rows_of, settle, within};
 use crate::{Options, Outcome};
 use conefield_core::arena::{Block, Layout, Weights};
-use conefield_core::stage::{GradKind, Grads, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{GradKind, Grads, Tile, TileMut};
 use std::collections::BTreeSet;
 
 /// Rows of the tile that is split into others; more than a host uses, and not a multiple of anything.
 const ROWS: usize = 301;
 
 /// Counts and kinds are consistent, and an identity stage is one.
-pub fn info(stage: &dyn Stage, options: &Options) -> Outcome {
-    let info = stage.info();
+pub fn info(of: &Subject<'_>) -> Outcome {
+    let info = of.stage.info();
     let complaint = if info.input == 0 || info.output == 0 {
         Some(format!("{} channels in, {} out", info.input, info.output))
     } else if (info.params == 0) != (info.grads == GradKind::None) {
@@ -22,8 +19,8 @@ pub fn info(stage: &dyn Stage, options: &Options) -> Outcome {
     } else if info.grads == GradKind::Scatter && info.tape > 0 {
         Some(format!("scattered gradients and a tape of {}", info.tape))
     } else if info.identity {
-        let (x, _) = data::<f32>(&info, options, 9);
-        let [y, _] = forward(stage.kernel(), &info, &params(stage, options), &x, 9);
+        let (x, _) = of.single().data(9);
+        let [y, _] = of.single().forward(&x, 9);
         differing("an identity's output", &y, &x)
     } else {
         None
@@ -32,11 +29,11 @@ pub fn info(stage: &dyn Stage, options: &Options) -> Outcome {
 }
 
 /// Blocks are consecutive, cover all parameters and have unique names.
-pub fn parameters(stage: &dyn Stage) -> Outcome {
+pub fn parameters(of: &Subject<'_>) -> Outcome {
     let mut names = BTreeSet::new();
     let mut end = 0;
     let mut complaint = None;
-    for p in stage.parameters() {
+    for p in of.stage.parameters() {
         let r = p.range();
         if r.start != end {
             complaint = complaint.or(Some(format!("{} starts at {}, the block before ends at {end}", p.name, r.start)));
@@ -46,7 +43,7 @@ pub fn parameters(stage: &dyn Stage) -> Outcome {
         }
         end = r.end;
     }
-    let total = stage.info().params;
+    let total = of.stage.info().params;
     if end != total {
         complaint = complaint.or(Some(format!("blocks hold {end} parameters, info says {total}")));
     }
@@ -54,34 +51,25 @@ pub fn parameters(stage: &dyn Stage) -> Outcome {
 }
 
 /// Initial parameters are finite, complete and repeatable.
-pub fn init(stage: &dyn Stage, options: &Options) -> Outcome {
-    let n = stage.info().params;
+pub fn init(of: &Subject<'_>) -> Outcome {
+    let n = of.stage.info().params;
     let (mut a, mut b) = (vec![f32::NAN; n], vec![1e9; n]);
-    stage.init(options.seed, &mut a);
-    stage.init(options.seed, &mut b);
+    of.stage.init(of.options.seed, &mut a);
+    of.stage.init(of.options.seed, &mut b);
     let wild = a.iter().position(|v| !v.is_finite()).map(|i| format!("parameter {i} starts as {}", a[i]));
     settle(wild.or_else(|| differing("with the same seed, parameter", &a, &b)), "finite and repeatable")
 }
 
-fn by_row(stage: &dyn Stage) -> Result<(), Outcome> {
-    if stage.info().scope == Scope::Row { Ok(()) } else { Err(Outcome::Skipped("its rows look at each other".into())) }
-}
-
 /// Rows do not depend on their tile.
-pub fn tile_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
-    if let Err(skip) = by_row(stage) {
-        return skip;
-    }
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
-    let (x, dy) = data(&info, options, ROWS);
-    let [y, _] = forward(k, &info, &p, &x, ROWS);
-    let [_, dx] = gradients(k, &info, &p, &x, &dy, ROWS);
+pub fn tile_outputs(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
+    let (x, dy) = s.data(ROWS);
+    let [y, _, dx] = s.pass(&x, &dy, ROWS);
     for size in [1, 7, 64, 256] {
         for at in (0..ROWS).step_by(size) {
             let n = size.min(ROWS - at);
             let (x, dy) = (rows_of(&x, ROWS, at, n), rows_of(&dy, ROWS, at, n));
-            let [part, _] = forward(k, &info, &p, &x, n);
-            let [_, part_dx] = gradients(k, &info, &p, &x, &dy, n);
+            let [part, _, part_dx] = s.pass(&x, &dy, n);
             let what = format!("tiles of {size}, from row {at}: ");
             let complaint = differing(&(what.clone() + "output"), &part, &rows_of(&y, ROWS, at, n))
                 .or_else(|| differing(&(what + "input gradient"), &part_dx, &rows_of(&dx, ROWS, at, n)));
@@ -94,18 +82,16 @@ pub fn tile_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
 }
 
 /// The kernel for points off any ray treats each row as a ray of one sample.
-pub fn points(stage: &dyn Stage, options: &Options) -> Outcome {
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
-    let Some(points) = k.points() else { return Outcome::Skipped("none".into()) };
+pub fn points(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
+    let Some(kernel) = s.kernel.points() else { return Outcome::Skipped("none".into()) };
     let n = 37;
-    let (x, dy) = data(&info, options, n);
-    let [y, _] = forward(points, &info, &p, &x, n);
-    let [grads, dx] = gradients(points, &info, &p, &x, &dy, n);
-    let mut sum = vec![0.0; info.params];
+    let (x, dy) = s.data(n);
+    let [y, grads, dx] = Loaded { kernel, ..s.clone() }.pass(&x, &dy, n);
+    let mut sum = vec![0.0; s.info.params];
     for i in 0..n {
         let (x, dy) = (rows_of(&x, n, i, 1), rows_of(&dy, n, i, 1));
-        let [one, _] = forward(k, &info, &p, &x, 1);
-        let [one_grads, one_dx] = gradients(k, &info, &p, &x, &dy, 1);
+        let [one, one_grads, one_dx] = s.pass(&x, &dy, 1);
         let complaint = differing(&format!("row {i}: output"), &rows_of(&y, n, i, 1), &one)
             .or_else(|| differing(&format!("row {i}: input gradient"), &rows_of(&dx, n, i, 1), &one_dx));
         if complaint.is_some() {
@@ -117,35 +103,29 @@ pub fn points(stage: &dyn Stage, options: &Options) -> Outcome {
 }
 
 /// All passes in order give the result of forward.
-pub fn passes(stage: &dyn Stage, options: &Options) -> Outcome {
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
+pub fn passes(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
     let n = 37;
-    let (x, _) = data(&info, options, n);
-    let (whole, parts) = (forward(k, &info, &p, &x, n), forward_in_passes(k, &info, &p, &x, n));
+    let (x, _) = s.data(n);
+    let (whole, parts) = (s.forward(&x, n), s.forward_in_passes(&x, n));
     let complaint = differing("in passes, output", &parts[0], &whole[0]);
     settle(
         complaint.or_else(|| differing("in passes, tape", &parts[1], &whole[1])),
-        &format!("{}, together the bits of forward", k.passes()),
+        &format!("{}, together the bits of forward", s.kernel.passes()),
     )
 }
 
 /// Gradients do not depend on the split into tiles, except for rounding.
-pub fn tile_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
-    if let Err(skip) = by_row(stage) {
-        return skip;
-    }
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
-    if info.params == 0 {
-        return Outcome::Skipped("no parameters".into());
-    }
-    let (x, dy) = data(&info, options, ROWS);
-    let [whole, _] = gradients(k, &info, &p, &x, &dy, ROWS);
+pub fn tile_gradients(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
+    let (x, dy) = s.data(ROWS);
+    let [_, whole, _] = s.pass(&x, &dy, ROWS);
     let mut worst = 0.0f64;
     for size in [1, 7, 64, 256] {
-        let mut sum = vec![0.0f64; info.params];
+        let mut sum = vec![0.0f64; s.info.params];
         for at in (0..ROWS).step_by(size) {
             let n = size.min(ROWS - at);
-            let [g, _] = gradients(k, &info, &p, &rows_of(&x, ROWS, at, n), &rows_of(&dy, ROWS, at, n), n);
+            let [_, g, _] = s.pass(&rows_of(&x, ROWS, at, n), &rows_of(&dy, ROWS, at, n), n);
             sum.iter_mut().zip(g).for_each(|(s, g)| *s += f64::from(g));
         }
         worst = worst.max(error(&whole, &sum));
@@ -154,55 +134,49 @@ pub fn tile_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
 }
 
 /// Previous contents of output and tape do not matter.
-pub fn outputs_overwrite(stage: &dyn Stage, options: &Options) -> Outcome {
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
+pub fn outputs_overwrite(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
     let n = 37;
-    let (x, _) = data(&info, options, n);
-    let [want, _] = forward(k, &info, &p, &x, n);
-    let [y, _] = forward_over(k, &info, &p, &x, n, 3.0);
+    let (x, _) = s.data(n);
+    let [want, _] = s.forward(&x, n);
+    let [y, _] = s.forward_over(&x, n, 3.0);
     let hole = want.iter().position(|v| v.is_nan()).map(|i| format!("output {i} is NaN"));
     settle(hole.or_else(|| differing("output", &y, &want)), "every output is written")
 }
 
 /// Parameter gradients are accumulated, with and without an input gradient.
-pub fn gradients_add(stage: &dyn Stage, options: &Options) -> Outcome {
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
-    if info.params == 0 {
-        return Outcome::Skipped("no parameters".into());
-    }
+pub fn gradients_add(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
     let n = 37;
-    let (x, dy) = data(&info, options, n);
-    let run = |grads, dx| backward(k, &info, &p, &x, &dy, n, 0..info.params, Before { grads, dx });
-    let [plain, _] = run(0.0, Some(0.0));
-    let [alone, _] = run(0.0, None);
+    let (x, dy) = s.data(n);
+    let run = |grads, dx| s.backward(&x, &dy, n, 0..s.info.params, Before { grads, dx });
+    let [_, plain, _] = run(0.0, Some(0.0));
+    let [_, alone, _] = run(0.0, None);
     if let Some(complaint) = differing("without an input gradient, gradient", &alone, &plain) {
         return Outcome::Failed(complaint);
     }
     let start = plain.iter().fold(1.0f32, |m, g| m.max(g.abs()));
-    let [added, _] = run(start, Some(0.0));
+    let [_, added, _] = run(start, Some(0.0));
     let want: Vec<f64> = plain.iter().map(|&g| f64::from(start) + f64::from(g)).collect();
     within(&format!("on top of {start:.2}"), error(&added, &want), 1e-5)
 }
 
 /// The input gradient is overwritten.
-pub fn input_gradient_overwrites(stage: &dyn Stage, options: &Options) -> Outcome {
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
+pub fn input_gradient_overwrites(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
     let n = 37;
-    let (x, dy) = data(&info, options, n);
-    let run = |dx| backward(k, &info, &p, &x, &dy, n, 0..info.params, Before { grads: 0.0, dx: Some(dx) });
-    let [[_, clean], [_, seven], [_, nan]] = [0.0, 7.0, f32::NAN].map(run);
+    let (x, dy) = s.data(n);
+    let run = |dx| s.backward(&x, &dy, n, 0..s.info.params, Before { grads: 0.0, dx: Some(dx) });
+    let [[.., clean], [.., seven], [.., nan]] = [0.0, 7.0, f32::NAN].map(run);
     let hole = nan.iter().position(|v| v.is_nan()).map(|i| format!("input gradient {i} was not written"));
     let complaint = hole.or_else(|| differing("over 7, input gradient", &seven, &clean));
     settle(complaint.or_else(|| differing("over NaN, input gradient", &nan, &clean)), "nothing of before is left")
 }
 
 /// Ranges are disjoint and cover every parameter.
-pub fn partition(stage: &dyn Stage) -> Outcome {
-    let info = stage.info();
-    if info.grads != GradKind::Scatter {
-        return Outcome::Skipped("gradients are not scattered".into());
-    }
-    let mut ranges = stage.partition();
+pub fn partition(of: &Subject<'_>) -> Outcome {
+    let params = of.stage.info().params;
+    let mut ranges = of.stage.partition();
     ranges.sort_by_key(|r| r.start);
     let mut end = 0;
     for r in &ranges {
@@ -211,22 +185,19 @@ pub fn partition(stage: &dyn Stage) -> Outcome {
         }
         end = r.end;
     }
-    let complaint = (end != info.params).then(|| format!("ranges end at {end} of {}", info.params));
+    let complaint = (end != params).then(|| format!("ranges end at {end} of {params}"));
     settle(complaint, &format!("{} ranges", ranges.len()))
 }
 
 /// A range's gradients are bit-identical to that part of all gradients.
-pub fn partition_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
-    if info.grads != GradKind::Scatter {
-        return Outcome::Skipped("gradients are not scattered".into());
-    }
-    let (x, dy) = data(&info, options, ROWS);
-    let [all, _] = gradients(k, &info, &p, &x, &dy, ROWS);
-    let ranges = stage.partition();
+pub fn partition_gradients(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
+    let (x, dy) = s.data(ROWS);
+    let [_, all, _] = s.pass(&x, &dy, ROWS);
+    let ranges = of.stage.partition();
     for r in &ranges {
         let before = Before { grads: 0.0, dx: None };
-        let [part, _] = backward(k, &info, &p, &x, &dy, ROWS, r.clone(), before);
+        let [_, part, _] = s.backward(&x, &dy, ROWS, r.clone(), before);
         if let Some(complaint) = differing(&format!("range {r:?}, gradient"), &part, &all[r.clone()]) {
             return Outcome::Failed(complaint);
         }
@@ -235,18 +206,19 @@ pub fn partition_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
 }
 
 /// Nothing outside the buffers is written, and inputs stay unchanged.
-pub fn guards(stage: &dyn Stage, options: &Options) -> Outcome {
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
-    let ranges = if info.grads == GradKind::Scatter { stage.partition() } else { vec![] };
+pub fn guards(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
+    let ranges = if s.info.grads == GradKind::Scatter { of.stage.partition() } else { vec![] };
     for n in [1, 7, 64] {
-        let (x, dy) = data(&info, options, n);
-        let (p1, x1, dy1) = (p.clone(), x.clone(), dy.clone());
-        for range in ranges.iter().cloned().chain([0..info.params]) {
-            let [mut y, mut tape, mut grads, mut dx] =
-                [info.output * n, info.tape * n, range.len(), info.input * n].map(|len| Guarded::new(len, 0.0));
-            k.forward(&p, Tile::new(&x, n), TileMut::new(y.inner(), n), TileMut::new(tape.inner(), n));
-            k.backward(
-                &p,
+        let (x, dy) = s.data(n);
+        let (p1, x1, dy1) = (s.params.clone(), x.clone(), dy.clone());
+        for range in ranges.iter().cloned().chain([0..s.info.params]) {
+            let [mut y, mut tape] = s.outputs(n, 0.0);
+            let [mut grads, mut dx] = [range.len(), s.info.input * n].map(|len| Guarded::new(len, 0.0));
+            let (to, left) = (TileMut::new(y.inner(), n), TileMut::new(tape.inner(), n));
+            s.kernel.forward(&s.params, Tile::new(&x, n), to, left);
+            s.kernel.backward(
+                &s.params,
                 Tile::new(&x, n),
                 TileMut::new(tape.inner(), n),
                 Tile::new(&dy, n),
@@ -262,7 +234,7 @@ pub fn guards(stage: &dyn Stage, options: &Options) -> Outcome {
                 return Outcome::Failed(format!("{n} rows, {complaint}"));
             }
         }
-        let changed = differing("changed: parameter", &p, &p1)
+        let changed = differing("changed: parameter", &s.params, &p1)
             .or_else(|| differing("changed: input", &x, &x1))
             .or_else(|| differing("changed: output gradient", &dy, &dy1));
         if let Some(changed) = changed {
@@ -273,15 +245,11 @@ pub fn guards(stage: &dyn Stage, options: &Options) -> Outcome {
 }
 
 /// Concurrent calls from several threads are bit-identical to a single call.
-pub fn threads(stage: &dyn Stage, options: &Options) -> Outcome {
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
+pub fn threads(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
     let n = 100;
-    let (x, dy) = data(&info, options, n);
-    let all = || {
-        let [y, _] = forward(k, &info, &p, &x, n);
-        let [g, dx] = gradients(k, &info, &p, &x, &dy, n);
-        [y, g, dx].concat()
-    };
+    let (x, dy) = s.data(n);
+    let all = || s.pass(&x, &dy, n).concat();
     let want = all();
     let found: Vec<Vec<f32>> = std::thread::scope(|scope| {
         let started: Vec<_> = (0..4).map(|_| scope.spawn(|| (0..3).map(|_| all()).collect::<Vec<_>>())).collect();
@@ -293,10 +261,9 @@ pub fn threads(stage: &dyn Stage, options: &Options) -> Outcome {
 }
 
 /// Finite inputs at the limits of their range give finite outputs, and backward does not panic.
-pub fn extremes(stage: &dyn Stage, options: &Options) -> Outcome {
-    let (info, k) = (stage.info(), stage.kernel());
-    let mut p = vec![0.0; info.params];
-    stage.init(options.seed, &mut p);
+pub fn extremes(of: &Subject<'_>) -> Outcome {
+    let as_it_starts = Options { params: None, ..of.options.clone() };
+    let s = Loaded::of(of.stage, &as_it_starts);
     let values = [0.0f32, -0.0, 1e-40, -1e-40, f32::MIN_POSITIVE, 1.0, -1.0, 1e30, -1e30];
     let rows: Vec<Vec<f32>> = values
         .iter()
@@ -304,16 +271,15 @@ pub fn extremes(stage: &dyn Stage, options: &Options) -> Outcome {
             let first = |c: usize| if c == 0 { v } else { 0.5 };
             let signs = |c: usize| if c.is_multiple_of(2) { v } else { -v };
             [
-                vec![v; info.input],
-                (0..info.input).map(first).collect(),
-                (0..info.input).map(signs).collect::<Vec<f32>>(),
+                vec![v; s.info.input],
+                (0..s.info.input).map(first).collect(),
+                (0..s.info.input).map(signs).collect::<Vec<f32>>(),
             ]
         })
         .collect();
     let n = rows.len();
-    let x: Vec<f32> = (0..info.input).flat_map(|c| rows.iter().map(move |r| r[c])).collect();
-    let [y, _] = forward(k, &info, &p, &x, n);
-    gradients(k, &info, &p, &x, &vec![1.0; info.output * n], n);
+    let x: Vec<f32> = (0..s.info.input).flat_map(|c| rows.iter().map(move |r| r[c])).collect();
+    let [y, ..] = s.pass(&x, &vec![1.0; s.info.output * n], n);
     let wild = y.iter().position(|v| !v.is_finite()).map(|i| {
         let row = &rows[i % n];
         format!("channel {} is {} where the inputs are {:e}, {:e}, …", i / n, y[i], row[0], row[row.len().min(2) - 1])
@@ -326,50 +292,43 @@ const SIDE: usize = 17;
 
 /// Outputs and input gradients are finite for all usual inputs: for a stage that reads points, a grid that includes the
 /// faces and corners of the cube, since random points miss a corner.
-pub fn finite(stage: &dyn Stage, options: &Options) -> Outcome {
-    if let Err(skip) = by_row(stage) {
-        return skip;
-    }
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
+pub fn finite(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
     let n = SIDE.pow(3);
-    let (mut x, dy) = data::<f32>(&info, options, n);
-    if info.input == 3 {
-        let (low, width) = (options.inputs.start, options.inputs.end - options.inputs.start);
+    let (mut x, dy) = s.data(n);
+    if s.info.input == 3 {
+        let inputs = &of.options.inputs;
+        let (low, width) = (inputs.start, inputs.end - inputs.start);
         let at = |i: usize| (low + width * (i % SIDE) as f64 / (SIDE - 1) as f64) as f32;
         x = [SIDE * SIDE, SIDE, 1].iter().flat_map(|step| (0..n).map(move |i| at(i / step))).collect();
     }
-    let [y, _] = forward(k, &info, &p, &x, n);
-    let [_, dx] = gradients(k, &info, &p, &x, &dy, n);
+    let [y, _, dx] = s.pass(&x, &dy, n);
     let wild = |what: &str, values: &[f32]| {
         let i = values.iter().position(|v| !v.is_finite())?;
-        let inputs: Vec<String> = (0..info.input.min(3)).map(|c| format!("{:.3}", x[c * n + i % n])).collect();
+        let inputs: Vec<String> = (0..s.info.input.min(3)).map(|c| format!("{:.3}", x[c * n + i % n])).collect();
         Some(format!("{what} {} is {} where the inputs are {}", i / n, values[i], inputs.join(", ")))
     };
     settle(wild("channel", &y).or_else(|| wild("input gradient", &dx)), &format!("at {n} inputs"))
 }
 
 /// NaN and infinities do not leave their rows.
-pub fn poison(stage: &dyn Stage, options: &Options) -> Outcome {
-    if let Err(skip) = by_row(stage) {
-        return skip;
-    }
-    let (info, k, p) = (stage.info(), stage.kernel(), params::<f32>(stage, options));
+pub fn poison(of: &Subject<'_>) -> Outcome {
+    let s = of.single();
     let n = 83;
-    let (clean, dy) = data::<f32>(&info, options, n);
+    let (clean, dy) = s.data(n);
     let mut x = clean.clone();
     let bad = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
     let poisoned = |i: usize| i % 5 == 2;
     for i in (0..n).filter(|&i| poisoned(i)) {
-        for c in 0..info.input {
+        for c in 0..s.info.input {
             // Some rows are poisoned in one channel, others in all.
-            if i % 2 == 0 || c == i % info.input {
+            if i % 2 == 0 || c == i % s.info.input {
                 x[c * n + i] = bad[i % 3];
             }
         }
     }
     let pure = |x: &[f32]| {
-        let [y, _] = forward(k, &info, &p, x, n);
-        let [_, dx] = gradients(k, &info, &p, x, &dy, n);
+        let [y, _, dx] = s.pass(x, &dy, n);
         let keep = |v: Vec<f32>| -> Vec<f32> {
             v.into_iter().enumerate().filter(|(j, _)| !poisoned(j % n)).map(|(_, v)| v).collect()
         };
@@ -384,21 +343,21 @@ pub fn poison(stage: &dyn Stage, options: &Options) -> Outcome {
 }
 
 /// Parameters are restored by name.
-pub fn save_and_load(stage: &dyn Stage, options: &Options) -> Outcome {
-    let p: Vec<f32> = params(stage, options);
+pub fn save_and_load(of: &Subject<'_>) -> Outcome {
+    let p = &of.single().params;
     let block = |b: conefield_core::stage::Parameter| Block {
         range: b.range(),
         name: format!("stage.{}", b.name),
         shape: b.shape,
     };
-    let layout = Layout { blocks: stage.parameters().into_iter().map(block).collect() };
-    let saved = Weights::from_arena(&layout, &p, |_| true);
+    let layout = Layout { blocks: of.stage.parameters().into_iter().map(block).collect() };
+    let saved = Weights::from_arena(&layout, p, |_| true);
     let mut back = vec![f32::NAN; p.len()];
     match saved.load("conformance", &layout, &mut back, |_| true) {
         Err(e) => Outcome::Failed(e.to_string()),
         Ok(report) => {
             let unused = report.unused.first().map(|u| format!("{} was not loaded", u.0));
-            settle(unused.or_else(|| differing("parameter", &back, &p)), &format!("{} tensors", report.loaded.len()))
+            settle(unused.or_else(|| differing("parameter", &back, p)), &format!("{} tensors", report.loaded.len()))
         }
     }
 }

@@ -1,10 +1,13 @@
 //! Calls of a stage's kernels on random data, and comparisons.
 
 use crate::{Options, Outcome};
+use conefield_core::error::Result;
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Info, Kernel, Stage, Tile, TileMut};
+use rayon::ThreadPoolBuilder;
 use std::ops::Range;
+use std::sync::OnceLock;
 
 /// A sequence of random numbers.
 pub struct Draw(u64, u64);
@@ -29,26 +32,6 @@ impl Draw {
     pub fn many<R: Real>(&mut self, range: &Range<f64>, n: usize) -> Vec<R> {
         (0..n).map(|_| R::of(self.from(range))).collect()
     }
-}
-
-/// Parameters as defined by `options`.
-pub fn params<R: Real>(stage: &dyn Stage, options: &Options) -> Vec<R> {
-    let n = stage.info().params;
-    match options.params {
-        Some(range) => Draw::new(options.seed, 1).many(&(-range..range), n),
-        None => {
-            let mut p = vec![0.0f32; n];
-            stage.init(options.seed, &mut p);
-            p.into_iter().map(|v| R::of(f64::from(v))).collect()
-        }
-    }
-}
-
-/// Inputs and output gradients for `rows` rows.
-pub fn data<R: Real>(info: &Info, options: &Options, rows: usize) -> (Vec<R>, Vec<R>) {
-    let x = Draw::new(options.seed, 2).many(&options.inputs, info.input * rows);
-    let dy = Draw::new(options.seed, 3).many(&(-1.0..1.0), info.output * rows);
-    (x, dy)
 }
 
 const GUARD: usize = 64;
@@ -83,36 +66,43 @@ impl<R: Real> Guarded<R> {
     }
 }
 
-/// Output and tape. Both hold NaN before the call.
-pub fn forward<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], rows: usize) -> [Vec<R>; 2] {
-    forward_over(k, info, params, x, rows, R::of(f64::NAN))
+/// A stage under test. What its checks draw is drawn once.
+pub struct Subject<'a> {
+    pub stage: &'a dyn Stage,
+    pub options: &'a Options,
+    single: OnceLock<Loaded<'a, f32>>,
+    double: OnceLock<Option<Loaded<'a, f64>>>,
 }
 
-/// Output and tape. Both hold `before` before the call.
-pub fn forward_over<R: Real>(
-    k: &dyn Kernel<R>,
-    info: &Info,
-    params: &[R],
-    x: &[R],
-    rows: usize,
-    before: R,
-) -> [Vec<R>; 2] {
-    let [mut y, mut tape] = [info.output, info.tape].map(|c| Guarded::new(c * rows, before));
-    k.forward(params, Tile::new(x, rows), TileMut::new(y.inner(), rows), TileMut::new(tape.inner(), rows));
-    [y.into_inner(), tape.into_inner()]
-}
-
-/// [`forward`] in separate passes.
-pub fn forward_in_passes<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], rows: usize) -> [Vec<R>; 2] {
-    let [mut y, mut tape] = [info.output, info.tape].map(|c| Guarded::new(c * rows, R::of(f64::NAN)));
-    for pass in 0..k.passes() {
-        let (y, tape) = (TileMut::new(y.inner(), rows), TileMut::new(tape.inner(), rows));
-        k.forward_pass(pass, params, Tile::new(x, rows), y, tape);
+impl<'a> Subject<'a> {
+    pub fn new(stage: &'a dyn Stage, options: &'a Options) -> Self {
+        Self { stage, options, single: OnceLock::new(), double: OnceLock::new() }
     }
-    [y.into_inner(), tape.into_inner()]
+
+    /// The kernel that trains.
+    pub fn single(&self) -> &Loaded<'a, f32> {
+        self.single.get_or_init(|| Loaded::of(self.stage, self.options))
+    }
+
+    /// The kernel in double precision, if there is one.
+    pub fn double(&self) -> Option<&Loaded<'a, f64>> {
+        let reference = || self.stage.reference().map(|kernel| Loaded::new(self.stage, kernel, self.options));
+        self.double.get_or_init(reference).as_ref()
+    }
 }
 
-/// State before [`backward`].
+/// A kernel with parameters.
+#[derive(Clone)]
+pub struct Loaded<'a, R: Real> {
+    pub kernel: &'a dyn Kernel<R>,
+    pub info: Info,
+    pub options: &'a Options,
+    pub params: Vec<R>,
+    /// Inputs around which the kernel is smooth; see `gradients`.
+    pub smooth: OnceLock<Option<(Vec<R>, f64)>>,
+}
+
+/// State before [`Loaded::backward`].
 #[derive(Clone, Copy)]
 pub struct Before<R> {
     /// Gradients before the call.
@@ -121,42 +111,85 @@ pub struct Before<R> {
     pub dx: Option<R>,
 }
 
-impl<R: Real> Before<R> {
-    pub fn clean() -> Self {
-        Self { grads: R::ZERO, dx: Some(R::ZERO) }
+impl<'a> Loaded<'a, f32> {
+    /// The kernel of `stage` that trains.
+    pub fn of(stage: &'a dyn Stage, options: &'a Options) -> Self {
+        Self::new(stage, stage.kernel(), options)
     }
 }
 
-/// Gradients of the parameters `range`, and the input gradient (empty if not requested).
-pub fn backward<R: Real>(
-    k: &dyn Kernel<R>,
-    info: &Info,
-    params: &[R],
-    x: &[R],
-    dy: &[R],
-    rows: usize,
-    range: Range<usize>,
-    before: Before<R>,
-) -> [Vec<R>; 2] {
-    let [_, left] = forward(k, info, params, x, rows);
-    let mut tape = Guarded::new(left.len(), R::ZERO);
-    tape.inner().copy_from_slice(&left);
-    let mut grads = Guarded::new(range.len(), before.grads);
-    let mut dx = before.dx.map(|v| Guarded::new(info.input * rows, v));
-    k.backward(
-        params,
-        Tile::new(x, rows),
-        TileMut::new(tape.inner(), rows),
-        Tile::new(dy, rows),
-        Grads { values: grads.inner(), range },
-        dx.as_mut().map(|dx| TileMut::new(dx.inner(), rows)),
-    );
-    [grads.into_inner(), dx.map(Guarded::into_inner).unwrap_or_default()]
-}
+impl<'a, R: Real> Loaded<'a, R> {
+    /// A kernel of `stage` with parameters as defined by `options`.
+    pub fn new(stage: &dyn Stage, kernel: &'a dyn Kernel<R>, options: &'a Options) -> Self {
+        let info = stage.info();
+        let params = match options.params {
+            Some(range) => Draw::new(options.seed, 1).many(&(-range..range), info.params),
+            None => {
+                let mut p = vec![0.0f32; info.params];
+                stage.init(options.seed, &mut p);
+                p.into_iter().map(|v| R::of(f64::from(v))).collect()
+            }
+        };
+        Self { kernel, info, options, params, smooth: OnceLock::new() }
+    }
 
-/// Gradients of all parameters, and the input gradient.
-pub fn gradients<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], dy: &[R], rows: usize) -> [Vec<R>; 2] {
-    backward(k, info, params, x, dy, rows, 0..info.params, Before::clean())
+    /// Inputs and output gradients for `rows` rows.
+    pub fn data(&self, rows: usize) -> (Vec<R>, Vec<R>) {
+        let x = Draw::new(self.options.seed, 2).many(&self.options.inputs, self.info.input * rows);
+        let dy = Draw::new(self.options.seed, 3).many(&(-1.0..1.0), self.info.output * rows);
+        (x, dy)
+    }
+
+    /// Output and tape. Both hold NaN before the call.
+    pub fn forward(&self, x: &[R], rows: usize) -> [Vec<R>; 2] {
+        self.forward_over(x, rows, R::of(f64::NAN))
+    }
+
+    /// Output and tape. Both hold `before` before the call.
+    pub fn forward_over(&self, x: &[R], rows: usize, before: R) -> [Vec<R>; 2] {
+        let [mut y, mut tape] = self.outputs(rows, before);
+        let (to, left) = (TileMut::new(y.inner(), rows), TileMut::new(tape.inner(), rows));
+        self.kernel.forward(&self.params, Tile::new(x, rows), to, left);
+        [y.into_inner(), tape.into_inner()]
+    }
+
+    /// [`Self::forward`] in separate passes.
+    pub fn forward_in_passes(&self, x: &[R], rows: usize) -> [Vec<R>; 2] {
+        let [mut y, mut tape] = self.outputs(rows, R::of(f64::NAN));
+        for pass in 0..self.kernel.passes() {
+            let (to, left) = (TileMut::new(y.inner(), rows), TileMut::new(tape.inner(), rows));
+            self.kernel.forward_pass(pass, &self.params, Tile::new(x, rows), to, left);
+        }
+        [y.into_inner(), tape.into_inner()]
+    }
+
+    /// Room for output and tape, filled with `before`.
+    pub fn outputs(&self, rows: usize, before: R) -> [Guarded<R>; 2] {
+        [self.info.output, self.info.tape].map(|c| Guarded::new(c * rows, before))
+    }
+
+    /// Output, gradients of the parameters `range`, and the input gradient (empty if not requested).
+    pub fn backward(&self, x: &[R], dy: &[R], rows: usize, range: Range<usize>, before: Before<R>) -> [Vec<R>; 3] {
+        let [y, left] = self.forward(x, rows);
+        let mut tape = Guarded::new(left.len(), R::ZERO);
+        tape.inner().copy_from_slice(&left);
+        let mut grads = Guarded::new(range.len(), before.grads);
+        let mut dx = before.dx.map(|v| Guarded::new(self.info.input * rows, v));
+        self.kernel.backward(
+            &self.params,
+            Tile::new(x, rows),
+            TileMut::new(tape.inner(), rows),
+            Tile::new(dy, rows),
+            Grads { values: grads.inner(), range },
+            dx.as_mut().map(|dx| TileMut::new(dx.inner(), rows)),
+        );
+        [y, grads.into_inner(), dx.map(Guarded::into_inner).unwrap_or_default()]
+    }
+
+    /// Output, gradients of all parameters, and the input gradient.
+    pub fn pass(&self, x: &[R], dy: &[R], rows: usize) -> [Vec<R>; 3] {
+        self.backward(x, dy, rows, 0..self.info.params, Before { grads: R::ZERO, dx: Some(R::ZERO) })
+    }
 }
 
 /// Rows `at..at + n` of channels with `rows` rows.
@@ -201,4 +234,22 @@ pub fn within(what: &str, found: f64, limit: f64) -> Outcome {
 /// Failed with the complaint, or passed without one.
 pub fn settle(complaint: Option<String>, fine: &str) -> Outcome {
     complaint.map_or_else(|| Outcome::Passed(fine.into()), Outcome::Failed)
+}
+
+/// The first difference between the results of `run` on one and on three threads and here; `differ` gets a word of where,
+/// what was found and what is wanted.
+pub fn on_threads<T: Send>(
+    run: impl Fn() -> T + Sync,
+    differ: impl Fn(&str, &T, &T) -> Option<String>,
+) -> Option<String> {
+    let want = run();
+    [1, 3].into_iter().find_map(|n| {
+        let pool = ThreadPoolBuilder::new().num_threads(n).build().ok()?;
+        differ(&format!("{n} threads"), &pool.install(&run), &want)
+    })
+}
+
+/// Passed if no function reported a fault.
+pub fn no_fault(fault: Result<()>) -> Outcome {
+    settle(fault.err().map(|e| e.to_string()), "none was reported")
 }

@@ -1,6 +1,6 @@
 //! Stages reduced to some of their channels.
 
-use crate::call::{channels_of, data, differing, error, forward, gradients, params};
+use crate::call::{Loaded, channels_of, differing, error};
 use crate::{Options, Outcome, check};
 use conefield_core::error::{Error, Result};
 use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
@@ -50,6 +50,18 @@ fn whole(stage: &dyn Stage, options: &Options) -> Option<String> {
     (!report.passed()).then(|| format!("the smaller stage fails {:?}:\n{report}", report.failed()))
 }
 
+/// A stage with its parameters, and the smaller one with those `ranges` of them.
+fn pair<'a>(
+    full: &'a dyn Stage,
+    small: &'a dyn Stage,
+    ranges: &[Range<usize>],
+    options: &'a Options,
+) -> (Loaded<'a, f32>, Loaded<'a, f32>) {
+    let full = Loaded::of(full, options);
+    let params = gather(ranges, &full.params);
+    (full, Loaded { params, ..Loaded::of(small, options) })
+}
+
 /// Kept channels are bit-identical; gradients are those for a zero gradient of the removed channels.
 fn same_outputs(
     full: &dyn Stage,
@@ -59,24 +71,19 @@ fn same_outputs(
     keep: &[usize],
     options: &Options,
 ) -> Option<String> {
-    let (info, less) = (full.info(), small.info());
     if let Some(complaint) = counts(full, small, ranges, inputs.len(), keep.len()) {
         return Some(complaint);
     }
-    let p: Vec<f32> = params(full, options);
-    let q = gather(ranges, &p);
-    let (x, mut dy) = data::<f32>(&info, options, ROWS);
-    for c in (0..info.output).filter(|c| !keep.contains(c)) {
+    let (full, small) = pair(full, small, ranges, options);
+    let (x, mut dy) = full.data(ROWS);
+    for c in (0..full.info.output).filter(|c| !keep.contains(c)) {
         dy[c * ROWS..(c + 1) * ROWS].fill(0.0);
     }
     let (x1, dy1) = (channels_of(&x, ROWS, inputs), channels_of(&dy, ROWS, keep));
-    let [y, _] = forward(full.kernel(), &info, &p, &x, ROWS);
-    let [y1, _] = forward(small.kernel(), &less, &q, &x1, ROWS);
+    let ([y, g, dx], [y1, g1, dx1]) = (full.pass(&x, &dy, ROWS), small.pass(&x1, &dy1, ROWS));
     if let Some(complaint) = differing("output", &y1, &channels_of(&y, ROWS, keep)) {
         return Some(complaint);
     }
-    let [g, dx] = gradients(full.kernel(), &info, &p, &x, &dy, ROWS);
-    let [g1, dx1] = gradients(small.kernel(), &less, &q, &x1, &dy1, ROWS);
     let e = error(&g1, &gather(ranges, &g)).max(error(&dx1, &channels_of(&dx, ROWS, inputs)));
     (e > ROUNDING).then(|| format!("gradients are off by {e:.1e}"))
 }
@@ -149,6 +156,11 @@ pub fn resolutions(stage: &dyn Encoder) -> Outcome {
     Outcome::Passed(format!("{low} to {high} cells along the cube's side"))
 }
 
+/// Runs the kit on a stage with some of `n` inputs; with all of them it is the stage of the report.
+fn some(n: usize, stage: &dyn Stage, options: &Options) -> Option<String> {
+    if stage.info().input < n { whole(stage, options) } else { None }
+}
+
 /// A normalizer with fewer inputs is a reduced stage of the same kind.
 pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
     let info = stage.info();
@@ -163,7 +175,7 @@ pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
         if complaint.is_none() && keep.len() == info.input {
             complaint = same_outputs(stage, small, &r.params, keep, outputs, options);
         }
-        Ok(complaint.or_else(|| whole(r.stage.as_ref(), options)))
+        Ok(complaint.or_else(|| some(info.input, small, options)))
     })
 }
 
@@ -176,18 +188,14 @@ pub fn field_inputs(stage: &dyn Field, options: &Options) -> Outcome {
         if let Some(c) = counts(stage, small, &r.params, keep.len(), info.output) {
             return Ok(Some(c));
         }
-        let p: Vec<f32> = params(stage, options);
-        let q = gather(&r.params, &p);
-        let (mut x, dy) = data::<f32>(&info, options, ROWS);
+        let (full, less) = pair(stage, small, &r.params, options);
+        let (mut x, dy) = full.data(ROWS);
         for c in (0..info.input).filter(|c| !keep.contains(c)) {
             x[c * ROWS..(c + 1) * ROWS].fill(0.0);
         }
         let x1 = channels_of(&x, ROWS, keep);
-        let [y, _] = forward(stage.kernel(), &info, &p, &x, ROWS);
-        let [y1, _] = forward(small.kernel(), &small.info(), &q, &x1, ROWS);
-        let [g, dx] = gradients(stage.kernel(), &info, &p, &x, &dy, ROWS);
-        let [g1, dx1] = gradients(small.kernel(), &small.info(), &q, &x1, &dy, ROWS);
+        let ([y, g, dx], [y1, g1, dx1]) = (full.pass(&x, &dy, ROWS), less.pass(&x1, &dy, ROWS));
         let e = error(&y1, &y).max(error(&g1, &gather(&r.params, &g))).max(error(&dx1, &channels_of(&dx, ROWS, keep)));
-        Ok((e > ROUNDING).then(|| format!("off by {e:.1e}")).or_else(|| whole(small, options)))
+        Ok((e > ROUNDING).then(|| format!("off by {e:.1e}")).or_else(|| some(info.input, small, options)))
     })
 }

@@ -1,12 +1,11 @@
 //! Properties of a data term: a convex function of residuals, its derivative and a bound of its curvature.
 
-use crate::call::{differing, settle};
-use crate::voxels::{above, noise};
+use crate::call::{differing, no_fault, on_threads, settle};
+use crate::voxels::{above, flat, noise};
 use crate::{Outcome, Report};
 use conefield_core::data_term::{DataTerm, Misfit};
 use conefield_core::random::{mix, unit};
 use ndarray::{Array3, Axis};
-use rayon::ThreadPoolBuilder;
 
 /// Standard deviation of the scan's noise.
 const SIGMA: f32 = 0.02;
@@ -20,7 +19,7 @@ const ERROR: f64 = 2e-3;
 
 /// Checks all properties of a data term.
 pub fn check_data_term(term: &dyn DataTerm) -> Report {
-    let mut report = Report { stage: term.describe(), entries: vec![] };
+    let mut report = Report::of(term.describe());
     let scan = scan();
     let of = match term.of(scan.view()) {
         Ok(of) => On { of, measured: scan },
@@ -38,7 +37,7 @@ pub fn check_data_term(term: &dyn DataTerm) -> Report {
     report.add("spread of noise", || spread(of));
     report.add("finite", || finite(term));
     report.add("threads", || threads(of));
-    report.add("no fault", || settle(of.of.fault().err().map(|e| e.to_string()), "none was reported"));
+    report.add("no fault", || no_fault(of.of.fault()));
     report
 }
 
@@ -137,7 +136,8 @@ fn differences(of: &On) -> Outcome {
         all += 1;
         if (near - far).abs() <= KINK * top {
             smooth += 1;
-            worst = worst.max((f64::from(derivative[pixel]) - near).abs() / top);
+            let e = (f64::from(derivative[pixel]) - near).abs() / top;
+            worst = if e.is_nan() { f64::INFINITY } else { worst.max(e) };
         }
     }
     let few = (2 * smooth < all).then(|| format!("smooth at {smooth} of {all} pixels"));
@@ -229,16 +229,10 @@ fn finite(term: &dyn DataTerm) -> Outcome {
 }
 
 fn threads(of: &On) -> Outcome {
-    let run = || {
-        let (value, r) = at(of, &ALL, &noise([3, 24, 40], 6));
-        (value, r.iter().copied().collect::<Vec<f32>>())
-    };
-    let want = run();
-    let complaint = [1, 3].into_iter().find_map(|n| {
-        let pool = ThreadPoolBuilder::new().num_threads(n).build().ok()?;
-        let (value, found) = pool.install(run);
-        let other = (value != want.0).then(|| format!("{n} threads: {value} instead of {}", want.0));
-        other.or_else(|| differing(&format!("{n} threads, pixel"), &found, &want.1))
+    let run = || at(of, &ALL, &noise([3, 24, 40], 6));
+    let complaint = on_threads(run, |n, (value, found), (want, wanted)| {
+        let other = (value != want).then(|| format!("{n}: {value} instead of {want}"));
+        other.or_else(|| differing(&format!("{n}, pixel"), &flat(found), &flat(wanted)))
     });
     settle(complaint, "1 and 3 threads")
 }

@@ -1,9 +1,9 @@
 //! Backward against differences of forward, and single against double precision.
 
-use crate::call::{Draw, error, forward, gradients, params, within};
+use crate::call::{Draw, Loaded, Subject, error, within};
 use crate::{Options, Outcome};
 use conefield_core::simd::Real;
-use conefield_core::stage::{Info, Kernel, Scope, Stage};
+use conefield_core::stage::Scope;
 
 /// Maximum number of parameters and inputs differenced one by one.
 const SINGLES: usize = 400;
@@ -26,8 +26,8 @@ fn steps<R: Real>(options: &Options) -> Steps {
 }
 
 /// `Σ dy·y`, summed in double precision.
-fn loss<R: Real>(k: &dyn Kernel<R>, info: &Info, params: &[R], x: &[R], dy: &[R], rows: usize) -> f64 {
-    let [y, _] = forward(k, info, params, x, rows);
+fn loss<R: Real>(of: &Loaded<'_, R>, x: &[R], dy: &[R], rows: usize) -> f64 {
+    let [y, _] = of.forward(x, rows);
     y.iter().zip(dy).map(|(y, d)| y.f64() * d.f64()).sum()
 }
 
@@ -39,25 +39,13 @@ pub fn slope(h: f64, mut f: impl FnMut(f64) -> f64) -> f64 {
 }
 
 /// Inputs around which the stage is smooth, with the longest step over which it is.
-fn smooth_rows<R: Real>(
-    k: &dyn Kernel<R>,
-    info: &Info,
-    params: &[R],
-    options: &Options,
-    rows: usize,
-) -> Option<(Vec<R>, f64)> {
-    let all = steps::<R>(options).all;
-    all.iter().find_map(|&h| rows_smooth_over(h, k, info, params, options, rows).map(|x| (x, h)))
+fn smooth_rows<'a, R: Real>(of: &'a Loaded<'_, R>) -> Option<&'a (Vec<R>, f64)> {
+    let find = || steps::<R>(of.options).all.iter().find_map(|&h| rows_smooth_over(h, of).map(|x| (x, h)));
+    of.smooth.get_or_init(find).as_ref()
 }
 
-fn rows_smooth_over<R: Real>(
-    h: f64,
-    k: &dyn Kernel<R>,
-    info: &Info,
-    params: &[R],
-    options: &Options,
-    rows: usize,
-) -> Option<Vec<R>> {
+fn rows_smooth_over<R: Real>(h: f64, of: &Loaded<'_, R>) -> Option<Vec<R>> {
+    let (info, options, rows) = (&of.info, of.options, of.options.rows);
     let mut draw = Draw::new(options.seed, 4);
     // Rows of a ray are drawn together, others one by one.
     let each = if info.scope == Scope::Ray { rows } else { 1 };
@@ -68,7 +56,7 @@ fn rows_smooth_over<R: Real>(
         let mut at = |c: usize, d: f64| {
             let keep = x[c];
             x[c] = R::of(keep.f64() + d);
-            let l = loss(k, info, params, &x, &dy, each);
+            let l = loss(of, &x, &dy, each);
             x[c] = keep;
             l
         };
@@ -93,11 +81,8 @@ fn rows_smooth_over<R: Real>(
 const NO_ROWS: &str = "no rows found around which the stage is smooth";
 
 /// The gradient of every parameter, one by one and along directions through all of them.
-pub fn parameters(stage: &dyn Stage, options: &Options) -> Outcome {
-    match stage.reference() {
-        Some(k) => parameters_in(stage, k, options),
-        None => coarse(parameters_in(stage, stage.kernel(), options)),
-    }
+pub fn parameters(of: &Subject<'_>) -> Outcome {
+    of.double().map_or_else(|| coarse(parameters_in(of.single())), parameters_in)
 }
 
 /// The outcome of a stage whose differences are in single precision.
@@ -110,16 +95,12 @@ fn coarse(outcome: Outcome) -> Outcome {
     }
 }
 
-fn parameters_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Options) -> Outcome {
-    let info = stage.info();
-    if info.params == 0 {
-        return Outcome::Skipped("no parameters".into());
-    }
-    let rows = options.rows;
-    let mut p: Vec<R> = params(stage, options);
-    let Some((x, _)) = smooth_rows(k, &info, &p, options, rows) else { return no_rows::<R>() };
+fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
+    let Some((x, _)) = smooth_rows(of) else { return no_rows::<R>() };
+    let (info, options, rows) = (&of.info, of.options, of.options.rows);
     let dy: Vec<R> = Draw::new(options.seed, 5).many(&(-1.0..1.0), info.output * rows);
-    let [g, _] = gradients(k, &info, &p, &x, &dy, rows);
+    let [_, g, _] = of.pass(x, &dy, rows);
+    let mut moved = of.clone();
     let Steps { all, tolerance } = steps::<R>(options);
     let h = all[0];
     let largest = g.iter().map(|g| g.f64().abs()).fold(0.0, f64::max);
@@ -135,12 +116,12 @@ fn parameters_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Option
         some.into_iter().chain((0..SINGLES / 2).map(|_| draw.below(info.params))).collect()
     };
     for &i in &chosen {
-        let keep = p[i];
+        let keep = of.params[i];
         let want = slope(h, |d| {
-            p[i] = R::of(keep.f64() + d);
-            loss(k, &info, &p, &x, &dy, rows)
+            moved.params[i] = R::of(keep.f64() + d);
+            loss(&moved, x, &dy, rows)
         });
-        p[i] = keep;
+        moved.params[i] = keep;
         let scale = g[i].f64().abs().max(want.abs()) + 1e-2 * largest + 1e-9;
         let e = (g[i].f64() - want).abs() / scale;
         if e.is_nan() || e > tolerance {
@@ -153,14 +134,12 @@ fn parameters_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Option
             let mut draw = Draw::new(options.seed, 100 + direction);
             (0..info.params).map(|_| draw.from(&(-1.0..1.0))).collect()
         };
-        let base = p.clone();
         let want = slope(h, |d| {
-            for ((p, b), v) in p.iter_mut().zip(&base).zip(&v) {
-                *p = R::of(b.f64() + d * v);
+            for ((p, start), v) in moved.params.iter_mut().zip(&of.params).zip(&v) {
+                *p = R::of(start.f64() + d * v);
             }
-            loss(k, &info, &p, &x, &dy, rows)
+            loss(&moved, x, &dy, rows)
         });
-        p = base;
         let found: f64 = g.iter().zip(&v).map(|(g, v)| g.f64() * v).sum();
         let norm = g.iter().map(|g| g.f64() * g.f64()).sum::<f64>().sqrt();
         let e = (found - want).abs() / (found.abs().max(want.abs()) + 1e-2 * norm + 1e-9);
@@ -174,25 +153,19 @@ fn parameters_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Option
 }
 
 /// The gradient of every input.
-pub fn inputs(stage: &dyn Stage, options: &Options) -> Outcome {
-    match stage.reference() {
-        Some(k) => inputs_in(stage, k, options),
-        None => coarse(inputs_in(stage, stage.kernel(), options)),
-    }
+pub fn inputs(of: &Subject<'_>) -> Outcome {
+    of.double().map_or_else(|| coarse(inputs_in(of.single())), inputs_in)
 }
 
-fn inputs_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Options) -> Outcome {
-    let info = stage.info();
-    let rows = options.rows;
-    let p: Vec<R> = params(stage, options);
-    let Some((mut x, h)) = smooth_rows(k, &info, &p, options, rows) else { return no_rows::<R>() };
-    let dy: Vec<R> = Draw::new(options.seed, 7).many(&(-1.0..1.0), info.output * rows);
-    let [_, dx] = gradients(k, &info, &p, &x, &dy, rows);
+fn inputs_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
+    let Some((x, h)) = smooth_rows(of) else { return no_rows::<R>() };
+    let (mut x, h, rows) = (x.clone(), *h, of.options.rows);
+    let dy: Vec<R> = Draw::new(of.options.seed, 7).many(&(-1.0..1.0), of.info.output * rows);
+    let [y, _, dx] = of.pass(&x, &dy, rows);
     // Rounding of the loss, which differences divide by the step. Layer normalization of two channels has hardly any slope.
-    let [y, _] = forward(k, &info, &p, &x, rows);
     let size: f64 = y.iter().zip(&dy).map(|(y, d)| (y.f64() * d.f64()).abs()).sum();
     let rounding = 8.0 * f64::EPSILON * size / h;
-    let tolerance = steps::<R>(options).tolerance;
+    let tolerance = steps::<R>(of.options).tolerance;
     let largest = dx.iter().map(|g| g.f64().abs()).fold(0.0, f64::max);
     let mut worst = 0.0f64;
     let stride = x.len().div_ceil(SINGLES);
@@ -200,7 +173,7 @@ fn inputs_in<R: Real>(stage: &dyn Stage, k: &dyn Kernel<R>, options: &Options) -
         let keep = x[i];
         let want = slope(h, |d| {
             x[i] = R::of(keep.f64() + d);
-            loss(k, &info, &p, &x, &dy, rows)
+            loss(of, &x, &dy, rows)
         });
         x[i] = keep;
         let scale = dx[i].f64().abs().max(want.abs()) + 1e-2 * largest + 1e-9;
@@ -224,13 +197,11 @@ pub fn no_rows<R: Real>() -> Outcome {
     if size_of::<R>() == 8 { Outcome::Failed(text) } else { Outcome::Skipped(text) }
 }
 
-/// Inputs at which both precisions select the same cells and sides of kinks.
-pub fn shared(stage: &dyn Stage, k: &dyn Kernel<f64>, options: &Options) -> Option<[Vec<f64>; 3]> {
-    let info = stage.info();
-    let p: Vec<f64> = params(stage, options);
-    let (x, _) = smooth_rows(k, &info, &p, options, options.rows)?;
-    let dy = Draw::new(options.seed, 8).many(&(-1.0..1.0), info.output * options.rows);
-    Some([p, x, dy])
+/// Inputs at which both precisions select the same cells and sides of kinks, and output gradients.
+pub fn shared(of: &Loaded<'_, f64>) -> Option<[Vec<f64>; 2]> {
+    let (x, _) = smooth_rows(of)?;
+    let dy = Draw::new(of.options.seed, 8).many(&(-1.0..1.0), of.info.output * of.options.rows);
+    Some([x.clone(), dy])
 }
 
 pub fn narrow(v: &[f64]) -> Vec<f32> {
@@ -244,22 +215,27 @@ pub fn no_double() -> Outcome {
     Outcome::Skipped(text.into())
 }
 
+/// Calls `compare` with the reference, inputs and output gradients.
+fn with_double(of: &Subject<'_>, compare: impl FnOnce(&Loaded<'_, f64>, &[f64], &[f64]) -> Outcome) -> Outcome {
+    let Some(double) = of.double() else { return no_double() };
+    let Some([x, dy]) = shared(double) else { return no_rows::<f64>() };
+    compare(double, &x, &dy)
+}
+
 /// Outputs of the training kernel against the reference.
-pub fn single_outputs(stage: &dyn Stage, options: &Options) -> Outcome {
-    let Some(k) = stage.reference() else { return no_double() };
-    let Some([p, x, _]) = shared(stage, k, options) else { return no_rows::<f64>() };
-    let info = stage.info();
-    let [want, _] = forward(k, &info, &p, &x, options.rows);
-    let [y, _] = forward(stage.kernel(), &info, &narrow(&p), &narrow(&x), options.rows);
-    within("outputs", error(&y, &want), options.single)
+pub fn single_outputs(of: &Subject<'_>) -> Outcome {
+    with_double(of, |double, x, _| {
+        let [want, _] = double.forward(x, of.options.rows);
+        let [y, _] = of.single().forward(&narrow(x), of.options.rows);
+        within("outputs", error(&y, &want), of.options.single)
+    })
 }
 
 /// Gradients of the training kernel against the reference.
-pub fn single_gradients(stage: &dyn Stage, options: &Options) -> Outcome {
-    let Some(k) = stage.reference() else { return no_double() };
-    let Some([p, x, dy]) = shared(stage, k, options) else { return no_rows::<f64>() };
-    let info = stage.info();
-    let [g, dx] = gradients(k, &info, &p, &x, &dy, options.rows);
-    let [g32, dx32] = gradients(stage.kernel(), &info, &narrow(&p), &narrow(&x), &narrow(&dy), options.rows);
-    within("parameters and inputs", error(&g32, &g).max(error(&dx32, &dx)), 4.0 * options.single)
+pub fn single_gradients(of: &Subject<'_>) -> Outcome {
+    with_double(of, |double, x, dy| {
+        let [_, g, dx] = double.pass(x, dy, of.options.rows);
+        let [_, g32, dx32] = of.single().pass(&narrow(x), &narrow(dy), of.options.rows);
+        within("parameters and inputs", error(&g32, &g).max(error(&dx32, &dx)), 4.0 * of.options.single)
+    })
 }

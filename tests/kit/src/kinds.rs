@@ -1,23 +1,15 @@
 //! The checks of each kind, for a stage that its settings build.
 
+use crate::losses::ready;
 use crate::{
     Options, Outcome, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
     check_loss_wgsl, check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl,
-    check_regularizer, check_voxel_projector, check_wgsl, ready,
+    check_regularizer, check_voxel_projector, check_wgsl,
 };
-use conefield_core::arena::Weights;
-use conefield_core::basis::BasisSpec;
-use conefield_core::data_term::DataTermSpec;
-use conefield_core::error::{Error, Result, ensure};
-use conefield_core::loss::Loss;
+use conefield_core::prelude::*;
 use conefield_core::registry::{Kind, Origin, Settings, read, stage_types};
-use conefield_core::regularizer::RegularizerSpec;
 use conefield_core::runner::Runner;
-use conefield_core::settings::{
-    EncoderSpec, FieldSpec, InitializerSpec, LossSpec, NormalizerSpec, PriorSpec, ProjectorSpec,
-};
 use conefield_core::spec::check;
-use conefield_core::stage::Stage;
 use conefield_core::voxel::VoxelProjectorSpec;
 use serde_json::Value;
 
@@ -44,31 +36,32 @@ impl With<'_> {
     }
 
     fn rows(&self, report: Report, stage: &dyn Stage, options: &Options) -> Report {
-        self.on_device(report, stage.wgsl().is_some(), |device| {
-            check_wgsl(stage, options, &|s, p, x, dy, rows| device.pass(s, p, x, dy, rows))
-        })
+        self.on_device(report, stage.wgsl().is_some(), |device| check_wgsl(stage, options, device))
     }
 
     fn loss(&self, loss: &dyn Loss) -> Report {
-        self.on_device(check_loss(loss), loss.wgsl().is_some(), |device| {
-            check_loss_wgsl(loss, &|loss, pairs| device.losses(loss, pairs))
-        })
+        self.on_device(check_loss(loss), loss.wgsl().is_some(), |device| check_loss_wgsl(loss, device))
     }
 
-    /// [`Self::rows`] at the largest width.
-    fn last(&self, width: usize, report: Report, stage: &dyn Stage, options: &Options) -> Report {
-        let is_last = self.widths.iter().all(|other| *other <= width);
-        if is_last { self.rows(report, stage, options) } else { report }
-    }
-
-    /// The report of each width. The stage may refuse all but one: a field may accept only the channels of a point, a
-    /// normalizer only whole levels.
-    fn wide(&self, check: impl Fn(usize, &Options) -> Result<Report>) -> Result<Vec<(Option<usize>, Report)>> {
+    /// The report of each width, with WGSL at the largest. The stage may refuse all but one: a field may accept only the
+    /// channels of a point, a normalizer only whole levels.
+    fn wide<S: ?Sized>(
+        &self,
+        build: impl Fn(usize) -> Result<Box<S>>,
+        check: fn(&S, &Options) -> Report,
+        stage: fn(&S) -> &dyn Stage,
+    ) -> Result<Vec<(Option<usize>, Report)>> {
         let options = (self.options)(Options::features());
+        let largest = self.widths.iter().max();
         let (mut found, mut refused) = (vec![], None);
         for width in self.widths {
-            match check(*width, &options) {
-                Ok(report) => found.push((Some(*width), report)),
+            match build(*width) {
+                Ok(built) => {
+                    let report = check(&built, &options);
+                    let last = Some(width) == largest;
+                    let report = if last { self.rows(report, stage(&built), &options) } else { report };
+                    found.push((Some(*width), report));
+                }
                 Err(e) => refused = Some(e),
             }
         }
@@ -117,26 +110,16 @@ pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(
         }
         Kind::Normalizer => {
             let spec = of::<dyn NormalizerSpec>(settings)?;
-            with.wide(|width, options| {
-                let stage = spec.build(width)?;
-                let report = check_normalizer(stage.as_ref(), options);
-                Ok(with.last(width, report, stage.as_ref(), options))
-            })
+            with.wide::<dyn Normalizer>(|width| spec.build(width), check_normalizer, |stage| stage)
         }
         Kind::Field => {
             let spec = of::<dyn FieldSpec>(settings)?;
-            with.wide(|width, options| {
-                let stage = spec.build(width)?;
-                let report = check_field(stage.as_ref(), options);
-                Ok(with.last(width, report, stage.as_ref(), options))
-            })
+            with.wide::<dyn Field>(|width| spec.build(width), check_field, |stage| stage)
         }
         Kind::Projector => {
             let stage = of::<dyn ProjectorSpec>(settings)?.build()?;
             let report = check_projector(stage.as_ref());
-            one(with.on_device(report, stage.wgsl().is_some(), |device| {
-                check_projector_wgsl(stage.as_ref(), &|p, rays| device.samples(p, rays))
-            }))
+            one(with.on_device(report, stage.wgsl().is_some(), |device| check_projector_wgsl(stage.as_ref(), device)))
         }
         Kind::Initializer => {
             let none = |path: &str| -> Result<Weights> { Err(Error::unsupported(path, "no weights are read here")) };
@@ -149,9 +132,8 @@ pub fn check_type(kind: Kind, settings: &Value, with: &With<'_>) -> Result<Vec<(
         }
         Kind::Prior => {
             let stage = of::<dyn PriorSpec>(settings)?.build()?;
-            one(with.on_device(check_prior(stage.as_ref()), stage.wgsl().is_some(), |device| {
-                check_prior_wgsl(stage.as_ref(), &|prior, values| device.penalty(prior, values))
-            }))
+            let report = check_prior(stage.as_ref());
+            one(with.on_device(report, stage.wgsl().is_some(), |device| check_prior_wgsl(stage.as_ref(), device)))
         }
         Kind::Regularizer => one(check_regularizer(of::<dyn RegularizerSpec>(settings)?.build()?.as_ref())),
         Kind::DataTerm => one(check_data_term(of::<dyn DataTermSpec>(settings)?.build()?.as_ref())),

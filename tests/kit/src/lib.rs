@@ -21,7 +21,8 @@ mod voxels;
 mod weights;
 mod wgsl;
 
-use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
+use call::Subject;
+use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Scope, Stage};
 use std::fmt;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -29,14 +30,14 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 pub use bases::check_basis;
 pub use data_terms::check_data_term;
 pub use kinds::{WIDTHS, With, check_package, check_type};
-pub use losses::{Compare, check_loss, check_loss_wgsl, ready};
-pub use priors::{Penalise, check_prior, check_prior_wgsl};
+pub use losses::{check_loss, check_loss_wgsl};
+pub use priors::{check_prior, check_prior_wgsl};
 pub use rays::check_projector;
 pub use regularizers::check_regularizer;
 pub use settings::check_settings;
 pub use voxels::check_voxel_projector;
 pub use weights::check_initializer;
-pub use wgsl::{Pass, Sample, check_projector_wgsl, check_wgsl};
+pub use wgsl::{check_projector_wgsl, check_wgsl};
 
 /// Options of the checks.
 #[derive(Debug, Clone, PartialEq)]
@@ -89,6 +90,10 @@ pub struct Report {
 }
 
 impl Report {
+    fn of(stage: String) -> Self {
+        Self { stage, entries: vec![] }
+    }
+
     /// Names of the violated properties.
     pub fn failed(&self) -> Vec<&'static str> {
         self.entries.iter().filter(|(_, o)| matches!(o, Outcome::Failed(_))).map(|(n, _)| *n).collect()
@@ -124,32 +129,62 @@ impl fmt::Display for Report {
     }
 }
 
+/// A property, why it does not apply to a stage, and its check.
+type Property = (&'static str, fn(&Info) -> Option<&'static str>, fn(&Subject<'_>) -> Outcome);
+
+/// The properties that any stage must have, in order.
+const PROPERTIES: [Property; 23] = [
+    ("info", always, behaviour::info),
+    ("parameters", always, behaviour::parameters),
+    ("init", always, behaviour::init),
+    ("finite differences: parameters", without_parameters, gradients::parameters),
+    ("finite differences: inputs", always, gradients::inputs),
+    ("single precision: outputs", always, gradients::single_outputs),
+    ("single precision: gradients", always, gradients::single_gradients),
+    ("tile sizes: outputs", along_rays, behaviour::tile_outputs),
+    ("points off any ray", always, behaviour::points),
+    ("passes", always, behaviour::passes),
+    ("tile sizes: gradients", |i| along_rays(i).or(without_parameters(i)), behaviour::tile_gradients),
+    ("outputs overwrite", always, behaviour::outputs_overwrite),
+    ("gradients add", without_parameters, behaviour::gradients_add),
+    ("input gradient overwrites", always, behaviour::input_gradient_overwrites),
+    ("partition", not_scattered, behaviour::partition),
+    ("partition gradients", not_scattered, behaviour::partition_gradients),
+    ("guards", always, behaviour::guards),
+    ("threads", always, behaviour::threads),
+    ("extremes", always, behaviour::extremes),
+    ("finite", along_rays, behaviour::finite),
+    ("poison rows", along_rays, behaviour::poison),
+    ("save and load", always, behaviour::save_and_load),
+    ("no fault", always, |of| call::no_fault(of.stage.fault())),
+];
+
+fn always(_: &Info) -> Option<&'static str> {
+    None
+}
+
+fn along_rays(info: &Info) -> Option<&'static str> {
+    (info.scope == Scope::Ray).then_some("its rows look at each other")
+}
+
+fn without_parameters(info: &Info) -> Option<&'static str> {
+    (info.params == 0).then_some("no parameters")
+}
+
+fn not_scattered(info: &Info) -> Option<&'static str> {
+    (info.grads != GradKind::Scatter).then_some("gradients are not scattered")
+}
+
 /// Checks all properties that any stage must have.
 pub fn check(stage: &dyn Stage, options: &Options) -> Report {
-    let mut report = Report { stage: stage.describe(), entries: vec![] };
-    report.add("info", || behaviour::info(stage, options));
-    report.add("parameters", || behaviour::parameters(stage));
-    report.add("init", || behaviour::init(stage, options));
-    report.add("finite differences: parameters", || gradients::parameters(stage, options));
-    report.add("finite differences: inputs", || gradients::inputs(stage, options));
-    report.add("single precision: outputs", || gradients::single_outputs(stage, options));
-    report.add("single precision: gradients", || gradients::single_gradients(stage, options));
-    report.add("tile sizes: outputs", || behaviour::tile_outputs(stage, options));
-    report.add("points off any ray", || behaviour::points(stage, options));
-    report.add("passes", || behaviour::passes(stage, options));
-    report.add("tile sizes: gradients", || behaviour::tile_gradients(stage, options));
-    report.add("outputs overwrite", || behaviour::outputs_overwrite(stage, options));
-    report.add("gradients add", || behaviour::gradients_add(stage, options));
-    report.add("input gradient overwrites", || behaviour::input_gradient_overwrites(stage, options));
-    report.add("partition", || behaviour::partition(stage));
-    report.add("partition gradients", || behaviour::partition_gradients(stage, options));
-    report.add("guards", || behaviour::guards(stage, options));
-    report.add("threads", || behaviour::threads(stage, options));
-    report.add("extremes", || behaviour::extremes(stage, options));
-    report.add("finite", || behaviour::finite(stage, options));
-    report.add("poison rows", || behaviour::poison(stage, options));
-    report.add("save and load", || behaviour::save_and_load(stage, options));
-    report.add("no fault", || call::settle(stage.fault().err().map(|e| e.to_string()), "none was reported"));
+    let mut report = Report::of(stage.describe());
+    let of = Subject::new(stage, options);
+    for (name, skipped, property) in PROPERTIES {
+        report.add(name, || match skipped(&stage.info()) {
+            Some(why) => Outcome::Skipped(why.into()),
+            None => property(&of),
+        });
+    }
     report
 }
 

@@ -1,13 +1,10 @@
 //! Properties of a loss: a correct derivative, a minimum where both values agree, behaviour for extreme numbers.
 
-use crate::call::{Draw, settle, within};
+use crate::call::{Draw, no_fault, settle, within};
 use crate::gradients::slope;
 use crate::{Outcome, Report};
-use conefield_core::error::Result;
 use conefield_core::loss::{Loss, NoiseModel};
-
-/// Runs a loss's WGSL on pairs of a predicted and a measured value. Returns the loss and its derivative for each.
-pub type Compare<'a> = dyn Fn(&dyn Loss, &[[f32; 2]]) -> Result<Vec<[f32; 2]>> + 'a;
+use conefield_core::runner::Runner;
 
 /// Largest relative error of the derivative against differences.
 const TOLERANCE: f64 = 1e-6;
@@ -16,7 +13,7 @@ const SINGLE: f64 = 1e-5;
 
 /// Checks all properties of a loss.
 pub fn check_loss(loss: &dyn Loss) -> Report {
-    let mut report = Report { stage: loss.describe(), entries: vec![] };
+    let mut report = Report::of(loss.describe());
     report.add("finite differences", || derivative(loss));
     report.add("least where values agree", || least(loss));
     report.add("extremes", || extremes(loss));
@@ -26,14 +23,14 @@ pub fn check_loss(loss: &dyn Loss) -> Report {
         settle(changed.map(|[p, m]| format!("predicted {p}, measured {m}: another value")), "the same bits twice")
     });
     report.add("learns from a scan", || learns(loss));
-    report.add("no fault", || settle(loss.fault().err().map(|e| e.to_string()), "none was reported"));
+    report.add("no fault", || no_fault(loss.fault()));
     report
 }
 
-/// Checks all properties of a loss's WGSL.
-pub fn check_loss_wgsl(loss: &dyn Loss, run: &Compare<'_>) -> Report {
-    let mut report = Report { stage: loss.describe(), entries: vec![] };
-    report.add("WGSL parity", || parity(loss, run));
+/// Checks all properties of a loss's WGSL, which it must have.
+pub fn check_loss_wgsl(loss: &dyn Loss, device: &dyn Runner) -> Report {
+    let mut report = Report::of(loss.describe());
+    report.add("WGSL parity", || parity(loss, device));
     report
 }
 
@@ -147,12 +144,9 @@ fn learns(loss: &dyn Loss) -> Outcome {
     )
 }
 
-fn parity(loss: &dyn Loss, run: &Compare<'_>) -> Outcome {
-    if loss.wgsl().is_none() {
-        return Outcome::Skipped("it offers none".into());
-    }
+fn parity(loss: &dyn Loss, device: &dyn Runner) -> Outcome {
     let pairs: Vec<[f32; 2]> = pairs().into_iter().map(|p| p.map(|v| v as f32)).collect();
-    let found = match run(loss, &pairs) {
+    let found = match device.losses(loss, &pairs) {
         Ok(found) => found,
         Err(e) => return Outcome::Failed(e.to_string()),
     };

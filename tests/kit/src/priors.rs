@@ -1,13 +1,10 @@
 //! Properties of a prior of a field: a correct gradient, additive sums, behaviour for extreme numbers.
 
-use crate::call::{Draw, Guarded, error, settle, within};
+use crate::call::{Draw, Guarded, error, no_fault, settle, within};
 use crate::gradients::slope;
 use crate::{Outcome, Report};
-use conefield_core::error::Result;
 use conefield_core::prior::Prior;
-
-/// Runs a prior's WGSL on the values of one block. Returns the penalty and its derivatives.
-pub type Penalise<'a> = dyn Fn(&dyn Prior, &[f32]) -> Result<(f32, Vec<f32>)> + 'a;
+use conefield_core::runner::Runner;
 
 /// Largest error of the gradient against differences, relative to the largest derivative.
 const TOLERANCE: f64 = 1e-6;
@@ -18,7 +15,7 @@ const SINGLES: usize = 200;
 
 /// Checks all properties of a prior.
 pub fn check_prior(prior: &dyn Prior) -> Report {
-    let mut report = Report { stage: prior.describe(), entries: vec![] };
+    let mut report = Report::of(prior.describe());
     report.add("blocks", || {
         let blocks = prior.blocks();
         let refused = blocks.validate().err().map(|e| e.to_string());
@@ -37,13 +34,13 @@ pub fn check_prior(prior: &dyn Prior) -> Report {
         let same: bool = bits(&a) == (bits(&b) as (u64, Vec<u64>));
         settle((!same).then(|| "other numbers the second time".into()), "the same bits twice")
     });
-    report.add("no fault", || settle(prior.fault().err().map(|e| e.to_string()), "none was reported"));
+    report.add("no fault", || no_fault(prior.fault()));
     report
 }
 
-/// Checks all properties of a prior's WGSL.
-pub fn check_prior_wgsl(prior: &dyn Prior, device: &Penalise<'_>) -> Report {
-    let mut report = Report { stage: prior.describe(), entries: vec![] };
+/// Checks all properties of a prior's WGSL, which it must have.
+pub fn check_prior_wgsl(prior: &dyn Prior, device: &dyn Runner) -> Report {
+    let mut report = Report::of(prior.describe());
     report.add("WGSL parity", || parity(prior, device));
     report
 }
@@ -132,14 +129,11 @@ fn poison(prior: &dyn Prior) -> Outcome {
     settle(value.is_finite().then(|| format!("the penalty is {value} where a value is NaN")), "NaN stays visible")
 }
 
-fn parity(prior: &dyn Prior, device: &Penalise<'_>) -> Outcome {
-    if prior.wgsl().is_none() {
-        return Outcome::Skipped("it offers none".into());
-    }
+fn parity(prior: &dyn Prior, device: &dyn Runner) -> Outcome {
     let values = drawn(prior);
     let (value, slopes) = run(prior, &values, 1.0);
     let single: Vec<f32> = values.iter().map(|&v| v as f32).collect();
-    match device(prior, &single) {
+    match device.penalty(prior, &single) {
         Ok((found, found_slopes)) => {
             let e = error(&[found], &[value]).max(error(&found_slopes, &slopes));
             within("penalty and derivatives", e, SINGLE)

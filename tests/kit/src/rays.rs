@@ -1,6 +1,6 @@
 //! Properties of a projector that samples rays: bounded, finite, reproducible samples, and an exact adjoint.
 
-use crate::call::{Draw, settle};
+use crate::call::{Draw, no_fault, settle};
 use crate::{Outcome, Report};
 use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
 
@@ -15,7 +15,7 @@ pub fn check_projector(projector: &dyn Projector) -> Report {
 }
 
 fn as_it_is(projector: &dyn Projector) -> Report {
-    let mut report = Report { stage: projector.describe(), entries: vec![] };
+    let mut report = Report::of(projector.describe());
     report.add("samples are bounded", || bounded(projector));
     report.add("samples are finite", || finite(projector));
     report.add("samples lie on their ray", || on_their_ray(projector));
@@ -26,7 +26,7 @@ fn as_it_is(projector: &dyn Projector) -> Report {
     report.add("adjoint", || adjoint(projector));
     report.add("adjoint overwrites", || overwrites(projector));
     report.add("threads", || threads(projector));
-    report.add("no fault", || settle(projector.fault().err().map(|e| e.to_string()), "none was reported"));
+    report.add("no fault", || no_fault(projector.fault()));
     report
 }
 

@@ -1,7 +1,8 @@
 //! Properties of a regularizer: a convex penalty and its proximal map.
 
-use crate::call::{differing, settle};
+use crate::call::{differing, no_fault, on_threads, settle};
 use crate::{Outcome, Report};
+use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::place::Host;
 use conefield_core::random::{mix, unit};
@@ -9,7 +10,6 @@ use conefield_core::regularizer::{Bounds, Penalty, Regularizer};
 use conefield_core::scan::ScanHeader;
 use conefield_core::space::Space;
 use ndarray::{Array3, ArrayView3};
-use rayon::ThreadPoolBuilder;
 use std::sync::Arc;
 
 /// Calls after which an iterative proximal map must have converged.
@@ -21,7 +21,7 @@ const TAUS: [f32; 3] = [0.01, 0.1, 1.0];
 
 /// Checks all properties of a regularizer.
 pub fn check_regularizer(regularizer: &dyn Regularizer) -> Report {
-    let mut report = Report { stage: regularizer.describe(), entries: vec![] };
+    let mut report = Report::of(regularizer.describe());
     report.add("value", || value(regularizer));
     report.add("convex", || convex(regularizer));
     report.add("weight", || weight(regularizer));
@@ -34,7 +34,7 @@ pub fn check_regularizer(regularizer: &dyn Regularizer) -> Report {
     report.add("state", || state(regularizer));
     report.add("tally", || tally(regularizer));
     report.add("threads", || threads(regularizer));
-    report.add("no fault", || no_fault(regularizer));
+    report.add("no fault", || no_fault(grids().iter().try_for_each(|grid| fault(regularizer, grid))));
     report
 }
 
@@ -285,21 +285,14 @@ fn threads(regularizer: &dyn Regularizer) -> Outcome {
         (0..5).for_each(|_| penalty.prox(&v, 0.1, &mut u));
         u
     };
-    let want = run();
-    let complaint = [1, 3].into_iter().find_map(|n| {
-        let pool = ThreadPoolBuilder::new().num_threads(n).build().ok()?;
-        differing(&format!("{n} threads, coefficient"), &pool.install(run), &want)
-    });
+    let complaint = on_threads(run, |n, a, b| differing(&format!("{n}, coefficient"), a, b));
     settle(complaint, "1 and 3 threads")
 }
 
-/// No fault, whatever was called.
-fn no_fault(regularizer: &dyn Regularizer) -> Outcome {
-    let complaint = grids().iter().find_map(|grid| {
-        let (mut penalty, v) = (on(regularizer, grid), noise(grid, 10));
-        let u = prox(penalty.as_mut(), &v, 0.1);
-        value_of(penalty.as_ref(), grid, &u);
-        penalty.fault().err().map(|e| e.to_string())
-    });
-    settle(complaint, "none was reported")
+/// What a penalty reports after calls.
+fn fault(regularizer: &dyn Regularizer, grid: &VoxelGrid) -> Result<()> {
+    let (mut penalty, v) = (on(regularizer, grid), noise(grid, 10));
+    let u = prox(penalty.as_mut(), &v, 0.1);
+    value_of(penalty.as_ref(), grid, &u);
+    penalty.fault()
 }

@@ -11,7 +11,7 @@ pub fn check_settings<T>(name: &str, settings: &Value) -> Report
 where
     T: Settings + Serialize + ?Sized + 'static,
 {
-    let mut report = Report { stage: format!("settings of {} {name:?}", T::KIND), entries: vec![] };
+    let mut report = Report::of(format!("settings of {} {name:?}", T::KIND));
     let written = |value: Value| -> Result<Value, String> {
         let settings: Box<T> = read(value)?;
         serde_json::to_value(&settings).map_err(|e| e.to_string())

@@ -1,13 +1,12 @@
 //! Properties of a voxel projector: a linear operator that measures lengths, and its exact adjoint.
 
-use crate::call::{differing, error, settle};
+use crate::call::{differing, error, on_threads, settle};
 use crate::{Outcome, Report};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, Ray, Vec3, View, VoxelGrid};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use ndarray::{Array3, Axis, Zip};
-use rayon::ThreadPoolBuilder;
 use std::f64::consts::TAU;
 
 /// Largest mismatch of `<Ax, y>` and `<x, Aᵀy>` relative to `‖Ax‖·‖y‖`, in double and in single precision.
@@ -22,7 +21,7 @@ const REFINED: f64 = 1.5;
 
 /// Checks all properties of a voxel projector.
 pub fn check_voxel_projector(projector: &dyn VoxelProjector) -> Report {
-    let mut report = Report { stage: projector.describe(), entries: vec![] };
+    let mut report = Report::of(projector.describe());
     let (single, double) = (projector.operator(), projector.reference());
     report.add("adjoint: double precision", || adjoint(double, ADJOINT[0]));
     report.add("adjoint: single precision", || adjoint(single, ADJOINT[1]));
@@ -291,19 +290,12 @@ fn threads(op: &dyn VoxelOperator<f32>) -> Outcome {
     let (x, y) = (noise::<f32>(g.volume.shape, 1), noise::<f32>(pixels(&g, views.len()), 2));
     let both = || [flat(&forward(op, &g, &views, &x)), flat(&back(op, &g, &views, &y))].concat();
     let want = both();
-    let mut complaint = None;
-    for n in [1, 3] {
-        let Ok(pool) = ThreadPoolBuilder::new().num_threads(n).build() else {
-            return Outcome::Skipped(format!("no pool of {n} threads"));
-        };
-        complaint = complaint.or_else(|| differing(&format!("{n} threads, number"), &pool.install(both), &want));
-    }
     let found: Vec<Vec<f32>> = std::thread::scope(|scope| {
         let started: Vec<_> = (0..3).map(|_| scope.spawn(both)).collect();
         started.into_iter().filter_map(|t| t.join().ok()).collect()
     });
     let missing = (found.len() != 3).then(|| "a caller panicked".to_string());
-    let complaint = complaint.or(missing);
+    let complaint = on_threads(both, |n, a, b| differing(&format!("{n}, number"), a, b)).or(missing);
     let complaint = complaint.or_else(|| found.iter().find_map(|f| differing("several callers, number", f, &want)));
     settle(complaint, "1 and 3 threads, 3 callers")
 }

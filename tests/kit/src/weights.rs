@@ -8,7 +8,7 @@ use conefield_core::settings::Initializer;
 
 /// Checks all properties of an initializer, on the layout of a small pipeline.
 pub fn check_initializer(initializer: &dyn Initializer) -> Report {
-    let mut report = Report { stage: initializer.describe(), entries: vec![] };
+    let mut report = Report::of(initializer.describe());
     let layout = layout();
     report.add("applies", || match run(initializer, &layout) {
         Ok((_, found)) => {

@@ -1,37 +1,28 @@
 //! A stage's WGSL on a device against its Rust code: double precision, single precision and the device side by side.
 
-use crate::call::{Draw, error, forward, gradients};
+use crate::call::{Draw, Subject, error, within};
 use crate::gradients::{narrow, no_rows, shared};
 use crate::rays::{rays, samples};
 use crate::{Options, Outcome, Report};
-use conefield_core::error::Result;
-use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
-
-/// Runs a stage's WGSL on parameters, inputs and output gradients (channel-major, with this number of rows). Returns
-/// outputs, gradients of the parameters and gradients of the inputs.
-pub type Pass<'a> = dyn Fn(&dyn Stage, &[f32], &[f32], &[f32], usize) -> Result<[Vec<f32>; 3]> + 'a;
-
-/// Runs a projector's WGSL on rays, each with its seed if positions are random.
-pub type Sample<'a> = dyn Fn(&dyn Projector, &[(UnitRay, Option<u64>)]) -> Result<Vec<Samples>> + 'a;
+use conefield_core::runner::Runner;
+use conefield_core::stage::{Projector, Stage};
 
 /// Repetitions of the rows around which a stage is smooth: several workgroups, the last one partly filled.
 const ROUNDS: usize = 9;
 
-/// Checks all properties of a stage's WGSL.
-pub fn check_wgsl(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Report {
-    let mut report = Report { stage: stage.describe(), entries: vec![] };
-    report.add("WGSL parity", || parity(stage, options, pass));
-    report.add("WGSL extremes", || extremes(stage, options, pass));
+/// Checks all properties of a stage's WGSL, which it must have.
+pub fn check_wgsl(stage: &dyn Stage, options: &Options, device: &dyn Runner) -> Report {
+    let mut report = Report::of(stage.describe());
+    let of = Subject::new(stage, options);
+    report.add("WGSL parity", || parity(&of, device));
+    report.add("WGSL extremes", || extremes(&of, device));
     report
 }
 
 /// Outputs and gradients against double precision, reported beside single precision on the CPU. The device may have the
 /// same error, and four times as much in gradients, because their sums have no fixed order.
-fn parity(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
-    let info = stage.info();
-    if stage.wgsl().is_none() {
-        return Outcome::Skipped(if info.identity { "left out on a device".into() } else { "it offers none".into() });
-    }
+fn parity(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
+    let (stage, options) = (of.stage, of.options);
     let rounds = |v: &[f64], change: bool| -> Vec<f64> {
         let n = options.rows;
         let of = |c: &[f64]| -> Vec<f64> {
@@ -42,16 +33,15 @@ fn parity(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
         v.chunks_exact(n).flat_map(of).collect()
     };
     let rows = ROUNDS * options.rows;
-    let Some(k) = stage.reference() else { return single_only(stage, options, pass) };
-    let Some([p, x, dy]) = shared(stage, k, options) else { return no_rows::<f64>() };
+    let Some(double) = of.double() else { return single_only(of, device) };
+    let single = of.single();
+    let Some([x, dy]) = shared(double) else { return no_rows::<f64>() };
     let (x, dy) = (rounds(&x, false), narrow(&rounds(&dy, true)));
     let dy64: Vec<f64> = dy.iter().map(|&v| f64::from(v)).collect();
-    let [y64, _] = forward(k, &info, &p, &x, rows);
-    let [g64, dx64] = gradients(k, &info, &p, &x, &dy64, rows);
-    let (p, x) = (narrow(&p), narrow(&x));
-    let [y32, _] = forward(stage.kernel(), &info, &p, &x, rows);
-    let [g32, dx32] = gradients(stage.kernel(), &info, &p, &x, &dy, rows);
-    let [y, g, dx] = match pass(stage, &p, &x, &dy, rows) {
+    let [y64, g64, dx64] = double.pass(&x, &dy64, rows);
+    let x = narrow(&x);
+    let [y32, g32, dx32] = single.pass(&x, &dy, rows);
+    let [y, g, dx] = match device.pass(stage, &single.params, &x, &dy, rows) {
         Ok(found) => found,
         Err(e) => return Outcome::Failed(e.to_string()),
     };
@@ -74,39 +64,31 @@ fn parity(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
 }
 
 /// Against single precision on the CPU, if there is no double precision.
-fn single_only(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
-    let info = stage.info();
-    let rows = ROUNDS * options.rows;
-    let p: Vec<f32> = crate::call::params(stage, options);
-    let (x, dy) = crate::call::data(&info, options, rows);
-    let [y32, _] = forward(stage.kernel(), &info, &p, &x, rows);
-    let [g32, dx32] = gradients(stage.kernel(), &info, &p, &x, &dy, rows);
-    match pass(stage, &p, &x, &dy, rows) {
+fn single_only(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
+    let (single, rows) = (of.single(), ROUNDS * of.options.rows);
+    let (x, dy) = single.data(rows);
+    let [y32, g32, dx32] = single.pass(&x, &dy, rows);
+    match device.pass(of.stage, &single.params, &x, &dy, rows) {
         Err(e) => Outcome::Failed(e.to_string()),
         Ok([y, g, dx]) => {
             let e = error(&y, &y32).max(error(&g, &g32) / 4.0).max(error(&dx, &dx32) / 4.0);
-            crate::call::within("against single precision on the CPU", e, 2.0 * options.single)
+            within("against single precision on the CPU", e, 2.0 * of.options.single)
         }
     }
 }
 
 /// The device gives finite numbers wherever the CPU does: for zeros, denormals (which it may flush to zero) and huge
 /// numbers.
-fn extremes(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
-    let info = stage.info();
-    if stage.wgsl().is_none() {
-        return Outcome::Skipped("no WGSL".into());
-    }
-    let p: Vec<f32> = crate::call::params(stage, options);
+fn extremes(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
+    let (single, options) = (of.single(), of.options);
     let rows = 70;
     for value in [0.0f32, -0.0, 1e-40, 1e-30, 1.0, -1.0, 1e30, -1e30] {
         let mut draw = Draw::new(options.seed, 41);
-        let mut x: Vec<f32> = draw.many(&options.inputs, info.input * rows);
+        let mut x: Vec<f32> = draw.many(&options.inputs, single.info.input * rows);
         x.iter_mut().step_by(3).for_each(|v| *v = value);
-        let dy: Vec<f32> = draw.many(&(-1.0..1.0), info.output * rows);
-        let [y32, _] = forward(stage.kernel(), &info, &p, &x, rows);
-        let [g32, dx32] = gradients(stage.kernel(), &info, &p, &x, &dy, rows);
-        let [y, g, dx] = match pass(stage, &p, &x, &dy, rows) {
+        let dy: Vec<f32> = draw.many(&(-1.0..1.0), single.info.output * rows);
+        let [y32, g32, dx32] = single.pass(&x, &dy, rows);
+        let [y, g, dx] = match device.pass(of.stage, &single.params, &x, &dy, rows) {
             Ok(found) => found,
             Err(e) => return Outcome::Failed(e.to_string()),
         };
@@ -123,23 +105,20 @@ fn extremes(stage: &dyn Stage, options: &Options, pass: &Pass<'_>) -> Outcome {
     Outcome::Passed("finite wherever the CPU is".into())
 }
 
-/// Checks all properties of a projector's WGSL.
-pub fn check_projector_wgsl(projector: &dyn Projector, sample: &Sample<'_>) -> Report {
-    let mut report = Report { stage: projector.describe(), entries: vec![] };
-    report.add("WGSL parity", || same_samples(projector, sample));
+/// Checks all properties of a projector's WGSL, which it must have.
+pub fn check_projector_wgsl(projector: &dyn Projector, device: &dyn Runner) -> Report {
+    let mut report = Report::of(projector.describe());
+    report.add("WGSL parity", || same_samples(projector, device));
     report
 }
 
 /// Largest difference of positions and weights, in cube sides: rounding of positions two cube sides from the origin.
 const PLACES: f32 = 2e-6;
 
-fn same_samples(projector: &dyn Projector, sample: &Sample<'_>) -> Outcome {
-    if projector.wgsl().is_none() {
-        return Outcome::Skipped("it offers none".into());
-    }
+fn same_samples(projector: &dyn Projector, device: &dyn Runner) -> Outcome {
     let seeds = [None, Some(5), Some(0xfedc_ba98_7654_3210)];
     let all: Vec<_> = rays().into_iter().flat_map(|r| seeds.map(|s| (r, s))).collect();
-    let found = match sample(projector, &all) {
+    let found = match device.samples(projector, &all) {
         Ok(found) => found,
         Err(e) => return Outcome::Failed(e.to_string()),
     };

@@ -387,7 +387,7 @@ pub fn checkpoint(dir: &Path) {
     written(conefield_io::write_checkpoint(dir.join("c.safetensors"), &tensors(), &text));
 }
 
-/// `spec.toml`: the shipped `ni-naf`.
+/// `spec.toml`: the shipped `naf`.
 pub fn spec_toml(dir: &Path) {
     let naf = include_str!("../../../conefield/specs/naf.toml");
     put(&dir.join("spec.toml"), naf.as_bytes());

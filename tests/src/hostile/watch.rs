@@ -62,8 +62,8 @@ pub struct Seen {
     pub most_bytes: usize,
     /// The longest time.
     pub longest: Duration,
-    /// Each fault with the number of its mutation and the input.
-    pub faults: Vec<(u64, ReaderFault, Vec<u8>)>,
+    /// Each fault with what its input is, and the input, unpacked.
+    pub faults: Vec<(String, ReaderFault, Vec<u8>)>,
     /// Inputs whose end differs from those before them, unpacked. They are damaged further.
     pub found: Vec<Vec<u8>>,
 }
@@ -124,7 +124,7 @@ impl Parser {
     }
 
     /// Feeds the reader mutations with these numbers of its seed, which it must accept as it is, of `corpus` and of what
-    /// it ends differently on. `dir` is an empty folder, best one in memory. The same arguments give the same inputs.
+    /// it ends differently on, after `corpus` itself. `dir` is an empty folder, best one in memory. The same arguments give the same inputs.
     pub fn run(&self, dir: &Path, numbers: Range<u64>, corpus: &[Vec<u8>], bounds: Bounds, meter: Meter) -> Seen {
         let (seed, file) = self.prepare(dir);
         if let Err(e) = (self.read)(dir) {
@@ -135,32 +135,34 @@ impl Parser {
         pool.extend(corpus.iter().cloned());
         let mut shapes = HashSet::new();
         let mut seen = Seen { count: numbers.end - numbers.start, ..Seen::default() };
+        let feed = |seen: &mut Seen, what: String, input: &[u8]| -> Option<End> {
+            fs::write(&file, (self.pack)(input.to_vec())).expect("the seed's own file");
+            let (end, fault) = match once(meter, || (self.read)(dir)) {
+                Err(fault) => (None, Some(fault)),
+                Ok((end, bytes, time)) => {
+                    seen.most_bytes = seen.most_bytes.max(bytes);
+                    seen.longest = seen.longest.max(time);
+                    let hoard = (bytes > bounds.bytes).then_some(ReaderFault::Memory(bytes));
+                    (Some(end), hoard.or((time > bounds.time).then_some(ReaderFault::Time(time))))
+                }
+            };
+            seen.faults.extend(fault.map(|f| (what, f, input.to_vec())));
+            end
+        };
         // What is known comes first, so that only what is new counts as found.
-        for input in corpus {
-            fs::write(&file, (self.pack)(input.clone())).expect("the seed's own file");
-            if let Ok((end, ..)) = once(meter, || (self.read)(dir)) {
-                shapes.insert(end.as_deref().map(shape));
-            }
+        for (i, input) in corpus.iter().enumerate() {
+            let end = feed(&mut seen, format!("input {i} of the corpus"), input);
+            shapes.extend(end.map(|end| end.as_deref().map(shape)));
         }
         for number in numbers {
             let input = self.damaged(&pool, number);
-            fs::write(&file, (self.pack)(input.clone())).expect("the seed's own file");
-            let fault = match once(meter, || (self.read)(dir)) {
-                Err(fault) => Some(fault),
-                Ok((end, bytes, time)) => {
-                    seen.accepted += u64::from(end.is_none());
-                    seen.most_bytes = seen.most_bytes.max(bytes);
-                    seen.longest = seen.longest.max(time);
-                    let room = pool.len() < MOST_FOUND && input.len() <= longest;
-                    if room && shapes.insert(end.as_deref().map(shape)) {
-                        pool.push(input.clone());
-                        seen.found.push(input.clone());
-                    }
-                    let hoard = (bytes > bounds.bytes).then_some(ReaderFault::Memory(bytes));
-                    hoard.or((time > bounds.time).then_some(ReaderFault::Time(time)))
-                }
-            };
-            seen.faults.extend(fault.map(|f| (number, f, input)));
+            let Some(end) = feed(&mut seen, format!("mutation {number}"), &input) else { continue };
+            seen.accepted += u64::from(end.is_none());
+            let room = pool.len() < MOST_FOUND && input.len() <= longest;
+            if room && shapes.insert(end.as_deref().map(shape)) {
+                pool.push(input.clone());
+                seen.found.push(input);
+            }
         }
         seen
     }

@@ -2,14 +2,13 @@
 //!
 //! Both get the same numbers, exact in single precision. The differences come from the rounding of the work itself.
 
-use crate::common::{self, scan, spec};
+use crate::common::{apart, moved, pipeline, scan};
 use crate::page;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::backend::{TrainRay, Work};
-use conefield_core::pipeline::Model;
 use conefield_core::random::{mix, unit};
-use conefield_core::scene::Scene;
+use conefield_core::scene::{Scene, SceneSettings};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Kernel, Stage, Tile, TileMut};
@@ -17,13 +16,6 @@ use conefield_evaluation::report::{CurveOptions, curves_png};
 use conefield_solvers::losses::L2;
 use serde_json::{Value, json};
 use std::ops::Range;
-
-/// Largest difference as a share of the largest of `exact`; infinite where one is not finite.
-pub fn apart(found: &[f32], exact: &[f64]) -> f64 {
-    let top = exact.iter().fold(1e-300f64, |m, x| m.max(x.abs()));
-    let off = found.iter().zip(exact).map(|(a, b)| (f64::from(*a) - b).abs() / top);
-    off.fold(0.0, |m, e| if e.is_nan() { f64::INFINITY } else { m.max(e) })
-}
 
 /// A stage with data for it.
 pub struct Pair<'a> {
@@ -139,18 +131,16 @@ fn stages() -> Vec<(String, String, Errors, f64)> {
 fn step(rays: usize, samples: usize) -> [f64; 2] {
     let mut value = crate::scans::field();
     value["projector"]["samples"] = json!(samples);
-    let pipeline = common::pipeline(&spec(&value).unwrap());
+    let pipeline = pipeline(&value);
     let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
+    let scene = Scene::new(&scan, &SceneSettings::default()).unwrap();
     let rays: Vec<TrainRay> = (0..rays)
         .map(|i| {
             let ray = scene.pixel_ray(&scan.geometry, i % 8, 4 + (i * 5) % 8, 4 + (i * 3) % 8);
             TrainRay { ray, target: 0.05 + 0.2 * unit(mix(4, i as u64)) }
         })
         .collect();
-    let start = Model::random(common::pipeline(&spec(&value).unwrap()), 3).arena.params;
-    let moved = |(i, p): (usize, &f32)| p + 0.4 * (unit(mix(5, i as u64)) - 0.5);
-    let params: Vec<f32> = start.iter().enumerate().map(moved).collect();
+    let params = moved(&pipeline).arena.params;
     let exact: Vec<f64> = params.iter().map(|p| f64::from(*p)).collect();
     let work = Work { step: 4, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
     let single = Kernels::new(&pipeline, |s| s.kernel());

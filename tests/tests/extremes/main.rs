@@ -5,6 +5,7 @@
 //! table anew; otherwise all but the figures is compared.
 
 #[path = "../common/mod.rs"]
+#[allow(dead_code)]
 mod common;
 
 mod case;

@@ -1,12 +1,11 @@
 //! Scans at the edge: units, objects, photons, views, sizes, distances. A field and the classical solvers meet each.
 
 use crate::case::{Case, Seen};
-use crate::common::{scan, solve, truth, volume};
-use conefield_core::arena::Weights;
+use crate::common::{protocol, scan, solve, truth, volume};
 use conefield_core::error::Result;
 use conefield_core::scan::{Scan, Volume};
 use conefield_io::{Conversion, OpenBeam};
-use conefield_projectors::simulate::{Protocol, simulate};
+use conefield_projectors::simulate::simulate;
 use conefield_scans::counts::line_integrals;
 use ndarray::Array3;
 use serde_json::{Value, json};
@@ -40,7 +39,7 @@ fn method(name: &str) -> Value {
 
 /// A volume with every number finite, and times that training went back.
 fn made(method: &Value, scan: &Scan) -> Result<(Volume, u64)> {
-    let (solution, _) = solve(method, scan, &Weights::default())?;
+    let (solution, _) = solve(method, scan)?;
     let volume = solution.result.volume(&conefield_backend_cpu::Cpu::new())?;
     Ok((volume, solution.rollbacks))
 }
@@ -94,33 +93,22 @@ fn each(
     methods.iter().map(|&m| of(m)).collect()
 }
 
-fn protocol(change: &Value) -> Protocol {
-    let mut all = json!({
-        "dso": 500.0, "dsd": 750.0, "detector": [16, 16], "extent": {"side": [280.0, 280.0]},
-        "angles": {"even": {"views": 8}},
-    });
-    if let (Some(all), Some(change)) = (all.as_object_mut(), change.as_object()) {
-        all.extend(change.clone());
-    }
-    serde_json::from_value(all).unwrap()
-}
-
 fn of_truth(change: Value) -> impl Fn() -> Result<(Scan, Volume)> + Clone + Send {
-    move || Ok((simulate(&truth(), &protocol(&change))?, truth()))
+    move || Ok((simulate(&truth(), &protocol(change.clone()))?, truth()))
 }
 
-/// Every length and every attenuation times these.
-const SCALES: [(f64, f64); 10] = [
-    (1.0, 1e-12),
-    (1.0, 1e-6),
-    (1.0, 1e6),
-    (1.0, 1e12),
-    (1e-6, 1.0),
-    (1e-3, 1.0),
-    (1e3, 1.0),
-    (1e6, 1.0),
-    (1e6, 1e-12),
-    (1e-6, 1e12),
+/// Every length and every attenuation times these, in a unit of so many millimetres.
+const SCALES: [[f64; 3]; 10] = [
+    [1.0, 1e-12, 1.0],
+    [1.0, 1e-6, 1.0],
+    [1.0, 1e6, 1.0],
+    [1.0, 1e12, 1.0],
+    [1e-6, 1.0, 1.0],
+    [1e-3, 1.0, 1e-3],
+    [1e3, 1.0, 1e3],
+    [1e6, 1.0, 1.0],
+    [1e6, 1e-12, 1.0],
+    [1e-6, 1e12, 1e3],
 ];
 
 pub fn units() -> Vec<Case> {
@@ -130,14 +118,18 @@ pub fn units() -> Vec<Case> {
             let base = scan();
             let expected = psnr(&made(&method(name), &base)?.0, &truth(), 1.0);
             let mut worst = (0.0f64, String::new());
-            for (lengths, attenuation) in SCALES {
+            for [lengths, attenuation, unit] in SCALES {
                 let mut other = base.clone();
                 other.geometry = base.geometry.scaled(lengths);
+                other.unit.mm = unit;
                 other.projections.mapv_inplace(|a| (f64::from(a) * attenuation) as f32);
-                let found = psnr(&made(&method(name), &other)?.0, &truth(), lengths / attenuation);
-                let off = if found.is_finite() { (found - expected).abs() } else { f64::INFINITY };
+                let (volume, _) = made(&method(name), &other)?;
+                // Line integrals × a over lengths × l make a/l in 1/mm, and u times as much in 1/unit.
+                let found = psnr(&volume, &truth(), lengths / (attenuation * unit));
+                let fits = found.is_finite() && volume.grid.spacing == other.geometry.volume.spacing;
+                let off = if fits { (found - expected).abs() } else { f64::INFINITY };
                 if off > worst.0 {
-                    worst = (off, format!("lengths × {lengths:e}, attenuation × {attenuation:e}"));
+                    worst = (off, format!("lengths × {lengths:e}, attenuation × {attenuation:e}, unit {unit:e} mm"));
                 }
             }
             let wrong = (worst.0 > 1e-3).then(|| format!("{} dB at {}", worst.0, worst.1));
@@ -156,7 +148,7 @@ fn with_metal() -> Volume {
 }
 
 pub fn objects() -> Vec<Case> {
-    let metal = || Ok((simulate(&with_metal(), &protocol(&json!({})))?, with_metal()));
+    let metal = || Ok((simulate(&with_metal(), &protocol(json!({})))?, with_metal()));
     let mut all = each("metal of 100 times the rest", &["sart", "cgls", "asd-pocs", "fista-tv"], 1.0, metal);
     // The absolute difference leaves what few rays see to the end; FDK has streaks.
     all.extend(each("metal of 100 times the rest", &["field", "fdk"], 3.0, metal));
@@ -196,7 +188,7 @@ pub fn photons() -> Vec<Case> {
         all.extend(each(&format!("{i0} photons a pixel"), &["field", "sart", "fista-tv"], 1.0, some.clone()));
         all.extend(each(&format!("{i0} photons a pixel"), &["fdk"], 3.0, some));
     }
-    let starved = || Ok((simulate(&with_metal(), &protocol(&json!({"noise": "poisson:1e2"})))?, with_metal()));
+    let starved = || Ok((simulate(&with_metal(), &protocol(json!({"noise": "poisson:1e2"})))?, with_metal()));
     all.extend(each("no photon comes through the metal", &["field", "fdk", "sart", "cgls", "fista-tv"], 3.0, starved));
     let counts = |lit: usize| {
         // The first `lit` of 16 columns count; behind the rest nothing arrives.
@@ -255,7 +247,7 @@ pub fn sizes() -> Vec<Case> {
         let what = format!("volume of {} × {} × {}", shape[0], shape[1], shape[2]);
         // An odd number of rows, so that rays go through a thin slice.
         let detector = json!({"detector": [15, 64]});
-        let some = move || Ok((simulate(&flat(shape), &protocol(&detector))?, flat(shape)));
+        let some = move || Ok((simulate(&flat(shape), &protocol(detector.clone()))?, flat(shape)));
         all.extend(each(&what, &["field", "sart", "cgls", "fista-tv"], 1.0, some.clone()));
         all.extend(each(&what, &["fdk"], 3.0, some));
     }
@@ -297,7 +289,7 @@ pub fn distances() -> Vec<Case> {
 pub fn with(set: impl FnOnce(&mut Value)) -> Result<Seen> {
     let mut value = field();
     set(&mut value);
-    let (solution, records) = solve(&value, &scan(), &Weights::default())?;
+    let (solution, records) = solve(&value, &scan())?;
     let found = volume(&solution);
     let loss = records.last().and_then(|r| r.loss).unwrap_or(f64::NAN);
     let e = error(&found, &truth(), 1.0);

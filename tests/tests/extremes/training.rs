@@ -1,10 +1,9 @@
 //! Training at the edge: learning rates, and very long runs.
 
 use crate::case::{Case, Ends, Seen};
-use crate::common::{self, model, scan, solve, spec};
+use crate::common::{model, pipeline, scan, solve};
 use crate::scans::with;
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::Weights;
 use conefield_core::backend::{Adam, Backend, Work};
 use conefield_core::pipeline::Model;
 use conefield_solvers::losses::L1;
@@ -51,7 +50,7 @@ pub fn long() -> Vec<Case> {
                 "projector": {"type": "ray-march", "samples": 4},
                 "type": "neural-field", "training": {"steps": steps, "rays": 8, "report_every": steps / 10}, "optimizer": {"lr": 2e-3, "decay": "none"},
             });
-            solve(&value, &scan(), &Weights::default())
+            solve(&value, &scan())
         };
         let (_, first) = run(100_000)?;
         let (solution, records) = run(1_000_000)?;
@@ -86,16 +85,15 @@ pub fn long() -> Vec<Case> {
     vec![million, moments, field]
 }
 
-fn tiny(output: &str) -> Value {
+fn softplus() -> Value {
     let mut value = crate::scans::field();
-    value["field"]["output"] = json!(output);
+    value["field"]["output"] = json!("softplus");
     value
 }
 
 /// A million updates, the first of them with gradients of 1, the others with `gradient`; and the seconds that they took.
 fn updates(gradient: f32) -> (Model, f64) {
-    let pipeline = common::pipeline(&spec(&tiny("softplus")).unwrap());
-    let mut model = Model::random(pipeline, 1);
+    let mut model = Model::random(pipeline(&softplus()), 1);
     let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
     let begun = Instant::now();
     for step in 1..=1_000_000 {
@@ -107,8 +105,7 @@ fn updates(gradient: f32) -> (Model, f64) {
 
 /// Seconds of some steps of a field whose last bias is `bias`.
 fn steps(bias: f32) -> f64 {
-    let pipeline = common::pipeline(&spec(&tiny("softplus")).unwrap());
-    let mut model = Model::random(pipeline, 1);
+    let mut model = Model::random(pipeline(&softplus()), 1);
     let last = model.arena.params.len() - 1;
     model.arena.params[last] = bias;
     let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();

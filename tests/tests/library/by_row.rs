@@ -1,10 +1,7 @@
 //! Stages that are written for one row at a time, as encoder, normalizer and field.
 
 use conefield_conformance::{Options, check_encoder, check_field, check_normalizer};
-use conefield_core::by_row::{ByRow, Channels, ChannelsMut, Gradients, RowMap};
-use conefield_core::lanes::Lanes;
-use conefield_core::simd::Real;
-use conefield_core::stage::{Encoder, Field, GradKind, Grads, Kernel, Normalizer, Stage, Tile, TileMut};
+use conefield_core::prelude::*;
 
 /// `y_c = w_c·sin(x_a)·x_b + v`, where `a` and `b` are channels beside each other.
 struct Products {

@@ -1,9 +1,8 @@
 //! Training whose encoder opens level by level.
 
-use crate::common::{Stop, model, plan, psnr, scan, spec};
+use crate::common::{bits, goes_on, model, pipeline, planned, psnr, scan};
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::Weights;
-use conefield_core::checkpoint::Resume;
+use conefield_core::backend::Backend;
 use conefield_core::method::Job;
 use conefield_core::pipeline::Model;
 use serde_json::{Value, json};
@@ -28,12 +27,9 @@ fn opening(levels: usize, until: f64) -> Value {
 /// Closed channels are 0 and learn nothing; open ones are as they were, and so is the arena.
 #[test]
 fn a_pipeline_opens_and_closes_without_a_trace() {
-    let mut model = Model::random(crate::common::pipeline(&spec(&settings(hash_grid(), json!([]))).unwrap()), 3);
+    let mut model = Model::random(pipeline(&settings(hash_grid(), json!([]))), 3);
     let points: Vec<[f32; 3]> = (0..40).map(|i| [0.1, 0.37, 0.73].map(|k| (i as f32 * k).fract())).collect();
-    let encode = |model: &Model| {
-        use conefield_core::backend::Backend;
-        Cpu::new().compile(&model.pipeline).unwrap().0.encode(model, &points).unwrap()
-    };
+    let encode = |model: &Model| Cpu::new().compile(&model.pipeline).unwrap().0.encode(model, &points).unwrap();
     let (whole, layout) = (encode(&model), model.pipeline.layout().clone());
     model.pipeline.open(4).unwrap();
     assert_eq!(model.pipeline.open_channels(), 4);
@@ -79,25 +75,18 @@ fn levels_open_one_by_one() {
 #[test]
 fn a_run_resumes_to_the_same_bits() {
     let ((scan, held), backend) = (scan().split(&[1]).unwrap(), Cpu::new());
-    let spec = spec(&settings(hash_grid(), opening(2, 0.5))).unwrap();
-    let solve = |resume: Option<&Resume>, at| {
-        let mut stop = Stop::at(at);
-        let job = Job { seed: 7, held_out: Some(&held), resume, ..Job::new(&scan, &backend) };
-        let result = plan(&spec, &backend, &Weights::default()).unwrap().run(&job, &mut stop);
-        (result, stop)
-    };
-    let records = |s: &Stop| s.heard.iter().map(|r| (r.step, r.held_out, r.events.clone())).collect::<Vec<_>>();
-    let bits = |m: Model| m.arena.params.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
-    let (whole, heard) = solve(None, u64::MAX);
-    let whole = model(whole.unwrap());
-    assert_eq!(whole.pipeline.open_channels(), whole.pipeline.encoder.info().output);
-    let whole = bits(whole);
-    for at in [7, 15, 40] {
-        let (_, stopped) = solve(None, at);
-        let (again, second) = solve(stopped.kept.as_ref(), u64::MAX);
-        assert!(bits(model(again.unwrap())) == whole, "at {at}");
-        assert_eq!([records(&stopped), records(&second)].concat(), records(&heard), "at {at}");
-    }
+    let mut plan = planned(&settings(hash_grid(), opening(2, 0.5)), &backend).unwrap();
+    let job = Job { seed: 7, held_out: Some(&held), ..Job::new(&scan, &backend) };
+    goes_on(
+        plan.as_mut(),
+        &job,
+        |_| vec![7, 15, 40],
+        |solution| {
+            let model = model(solution.unwrap());
+            assert_eq!(model.pipeline.open_channels(), model.pipeline.encoder.info().output);
+            bits(&model.arena.params)
+        },
+    );
 }
 
 #[test]
@@ -107,8 +96,7 @@ fn encoders_without_levels_are_refused() {
         (json!({"type": "concat", "encoders": [hash_grid(), {"type": "identity"}]}), 1, ["concat", "coarse to fine"]),
         (hash_grid(), 5, ["callbacks.1.levels", "1 to 4"]),
     ] {
-        let spec = spec(&settings(encoder, opening(levels, 0.5))).unwrap();
-        let e = plan(&spec, &Cpu::new(), &Weights::default()).err().unwrap().to_string();
+        let e = planned(&settings(encoder, opening(levels, 0.5)), &Cpu::new()).err().unwrap().to_string();
         assert!(words.iter().all(|w| e.contains(w)), "{e}");
     }
 }

@@ -2,7 +2,6 @@
 //! refused in words.
 
 use crate::common::{scan, solve, volume};
-use conefield_core::arena::Weights;
 use serde_json::{Value, json};
 
 /// With their channels and whether these stand from coarse to fine.
@@ -63,7 +62,7 @@ fn pipeline(encoder: &Value, [normalizers, masks]: &[Value; 2], field: &Value, p
 
 /// Trains: the loss falls to less than half, the volume is finite. Returns how many channels the field reads.
 fn learns(name: &str, spec: &Value) -> usize {
-    let (solution, records) = solve(spec, &scan(), &Weights::default()).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let (solution, records) = solve(spec, &scan()).unwrap_or_else(|e| panic!("{name}: {e}"));
     let (first, last) = (records.first().unwrap().loss.unwrap(), records.last().unwrap().loss.unwrap());
     // A record every five steps, and others between them, so that there are at least ten.
     assert_eq!(solution.steps, 30, "{name}");
@@ -100,7 +99,7 @@ fn a_mask_that_is_never_decided_is_reported() {
     let (_, encoder, ..) = encoders().remove(0);
     let mask = json!([{"type": "fft-mask", "epoch": 1000}]);
     let spec = pipeline(&encoder, &[json!([]), mask], &mlp(), &projectors()[0]);
-    let (_, records) = solve(&spec, &scan(), &Weights::default()).unwrap();
+    let (_, records) = solve(&spec, &scan()).unwrap();
     let (last, before) = records.split_last().unwrap();
     assert!(before.iter().all(|r| r.events.is_empty()));
     assert_eq!(last.events.len(), 1);
@@ -120,57 +119,48 @@ fn voxels_behind_positions_learn() {
 }
 
 /// The refusal of `spec` holds every one of `words`.
-fn refused(what: &str, spec: &Value, words: &[&str]) {
-    match solve(spec, &scan(), &Weights::default()) {
-        Ok(_) => panic!("{what}: not refused"),
-        Err(e) => {
-            let e = e.to_string();
-            assert!(words.iter().all(|w| e.contains(w)), "{what}: {e:?} lacks one of {words:?}");
-        }
-    }
+fn refused(spec: &Value, words: &[&str]) {
+    let Err(e) = solve(spec, &scan()) else { panic!("{words:?}: not refused") };
+    let e = e.to_string();
+    assert!(words.iter().all(|w| e.contains(w)), "{e:?} lacks one of {words:?}");
 }
 
+/// Zero levels and zero samples are among the extremes.
 #[test]
 fn what_does_not_fit_is_refused_in_words() {
     let hash = json!({"type": "hash-grid", "levels": 4, "base_resolution": 3, "log2_table_size": 9});
     let none = [json!([]), json!([])];
     let march = &projectors()[0];
-    let good = pipeline(&hash, &none, &mlp(), march);
-    let with = |change: &dyn Fn(&mut Value)| {
-        let mut v = good.clone();
-        change(&mut v);
-        v
-    };
-
     let voxels = json!({"type": "voxel-grid", "resolution": 16});
-    refused("voxels behind features", &pipeline(&hash, &none, &voxels, march), &["8 channels", "identity"]);
+    refused(&pipeline(&hash, &none, &voxels, march), &["8 channels", "identity"]);
     let drops = [json!([]), json!([{"type": "fft-mask", "keep": [0, 2]}])];
     let spec = pipeline(&json!({"type": "identity"}), &drops, &voxels, march);
-    refused("voxels without a coordinate", &spec, &["voxel-grid", "all three coordinates"]);
-    for stage in ["encoder", "field", "projector"] {
-        let spec = with(&|v| drop(v.as_object_mut().unwrap().remove(stage)));
-        refused(stage, &spec, &[stage, "nothing", &format!("{stage} type")]);
+    refused(&spec, &["voxel-grid", "all three coordinates"]);
+    let good = pipeline(&hash, &none, &mlp(), march);
+    for key in ["encoder", "field", "projector", "type"] {
+        let mut spec = good.clone();
+        spec.as_object_mut().unwrap().remove(key);
+        let known = if key == "type" { "neural-field".to_owned() } else { format!("{key} type") };
+        refused(&spec, &[key, "nothing", &known]);
     }
-    refused(
-        "no method",
-        &with(&|v| drop(v.as_object_mut().unwrap().remove("type"))),
-        &["type", "nothing", "neural-field"],
-    );
-    refused("skip at the end", &with(&|v| v["field"]["skips"] = json!([3])), &["field.skips", "3", "1 to 2"]);
-    refused("skip at the start", &with(&|v| v["field"]["skips"] = json!([0])), &["field.skips", "0", "1 to 2"]);
-    for encoder in ["hash-grid", "dense-grid"] {
-        let spec = with(&|v| v["encoder"] = json!({"type": encoder, "levels": 0}));
-        refused("zero levels", &spec, &["encoder.levels", "found 0", "1 to 32"]);
+    let changes: [(fn(&mut Value), &[&str]); 8] = [
+        (|v| v["field"]["skips"] = json!([3]), &["field.skips", "3", "1 to 2"]),
+        (|v| v["field"]["skips"] = json!([0]), &["field.skips", "0", "1 to 2"]),
+        (|v| v["encoder"] = json!({"type": "dense-grid", "levels": 0}), &["encoder.levels", "found 0", "1 to 32"]),
+        (|v| v["encoder"] = json!({"type": "frequency", "bands": 0}), &["encoder.bands", "found 0"]),
+        (|v| v["encoder"] = json!({"type": "concat", "encoders": []}), &["encoder.encoders", "a list of 0"]),
+        (
+            |v| v["encoder"] = json!({"type": "concat", "encoders": [{"type": "hash-grid", "levels": 0}]}),
+            &["encoder.encoders.0.levels", "found 0"],
+        ),
+        (|v| v["field"]["type"] = json!("mlpp"), &["field.type", "mlpp", "mlp"]),
+        (|v| v["field"]["widht"] = json!(8), &["field.widht", "width"]),
+    ];
+    for (change, words) in changes {
+        let mut spec = good.clone();
+        change(&mut spec);
+        refused(&spec, words);
     }
-    let spec = with(&|v| v["encoder"] = json!({"type": "frequency", "bands": 0}));
-    refused("zero bands", &spec, &["encoder.bands", "found 0"]);
-    let spec = with(&|v| v["encoder"] = json!({"type": "concat", "encoders": []}));
-    refused("nothing to concat", &spec, &["encoder.encoders", "a list of 0"]);
-    let spec = with(&|v| v["encoder"] = json!({"type": "concat", "encoders": [{"type": "hash-grid", "levels": 0}]}));
-    refused("zero levels in a concat", &spec, &["encoder.encoders.0.levels", "found 0"]);
-    refused("unknown type", &with(&|v| v["field"]["type"] = json!("mlpp")), &["field.type", "mlpp", "mlp"]);
-    refused("unknown setting", &with(&|v| v["field"]["widht"] = json!(8)), &["field.widht", "width"]);
-    refused("zero samples", &with(&|v| v["projector"]["samples"] = json!(0)), &["projector.samples", "1 to 65536"]);
 }
 
 /// "All finer channels" needs an order: side by side, encoders have none, nor have coordinates. Frequency bands do.
@@ -182,7 +172,7 @@ fn finer_channels_without_an_order_are_refused() {
         if ordered {
             learns(name, &spec);
         } else {
-            refused(name, &spec, &["callbacks.0.scope", "coarse to fine", "\"channel\""]);
+            refused(&spec, &["callbacks.0.scope", "coarse to fine", "\"channel\""]);
         }
     }
 }

@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-/// What each crate depends on, by short name; a user's crates alone, without tests and examples.
-type Needs = BTreeMap<String, BTreeSet<String>>;
+/// What each crate or module depends on, by short name.
+pub type Needs = BTreeMap<String, BTreeSet<String>>;
 
 /// Crates that only developers build.
 const OWN: [&str; 4] = ["tests", "benches", "examples", "one-dependency"];
@@ -19,6 +19,7 @@ fn manifest(path: &Path) -> toml::Table {
     std::fs::read_to_string(path).unwrap().parse().unwrap()
 }
 
+/// A user's crates alone, without tests and examples.
 fn needs() -> Needs {
     let workspace = manifest(&root().join("Cargo.toml"));
     let members = workspace["workspace"]["members"].as_array().unwrap();
@@ -36,11 +37,11 @@ fn needs() -> Needs {
     all
 }
 
-/// The row of each crate: one above the highest of those it depends on.
+/// The row of each crate or module: one above the highest of those it depends on.
 ///
 /// # Errors
-/// The crates that depend on each other in a circle.
-fn rows(needs: &Needs) -> Result<BTreeMap<&str, usize>, Vec<&str>> {
+/// Those that depend on each other in a circle, and what depends on them.
+pub fn rows(needs: &Needs) -> Result<BTreeMap<&str, usize>, Vec<&str>> {
     let mut rows = BTreeMap::new();
     while rows.len() < needs.len() {
         let before = rows.len();

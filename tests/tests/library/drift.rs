@@ -1,9 +1,8 @@
 //! The drift that the callback `drift` logs: what it measures, and what it leaves alone.
 
-use crate::common::{Heard, Stop, model, plan, scan, solve, spec};
+use crate::common::{Heard, goes_on, model, pipeline, planned, scan, solve, state};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
-use conefield_core::arena::Weights;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::host;
@@ -50,7 +49,7 @@ fn events(records: &[Record]) -> Vec<String> {
 
 #[test]
 fn stages_on_the_host_compute_what_the_backend_does() {
-    let model = Model::random(crate::common::pipeline(&spec(&settings()).unwrap()), 3);
+    let model = Model::random(pipeline(&settings()), 3);
     let (mut exe, _) = Cpu::new().compile(&model.pipeline).unwrap();
     // More than a tile of rows, and not a whole number of tiles.
     let points: Vec<[f32; 3]> = (0..300).map(|i| [0.1, 0.37, 0.73].map(|k| (i as f32 * k).fract())).collect();
@@ -70,9 +69,9 @@ fn stages_on_the_host_compute_what_the_backend_does() {
 
 #[test]
 fn a_field_that_moves_by_a_known_amount_drifts_by_it() {
-    let (scan, spec, cpu) = (scan(), spec(&settings()).unwrap(), Cpu::new());
+    let (scan, cpu) = (scan(), Cpu::new());
     let scene = Scene::new(&scan, &SceneSettings::default()).unwrap();
-    let model = Model::random(crate::common::pipeline(&spec), 3);
+    let model = Model::random(pipeline(&settings()), 3);
     let exe = cpu.compile(&model.pipeline).unwrap().0;
     let job = Job { seed: 3, ..Job::new(&scan, &cpu) };
     let mut heard = Heard::default();
@@ -108,24 +107,23 @@ fn a_field_that_moves_by_a_known_amount_drifts_by_it() {
 #[test]
 fn drift_is_logged_where_it_is_asked_for_and_changes_nothing() {
     let scan = scan();
-    let none = Weights::default();
-    let (solution, records) = solve(&settings(), &scan, &none).unwrap();
+    let (solution, records) = solve(&settings(), &scan).unwrap();
     let found = drift(&records);
     let steps: Vec<[u64; 2]> = found.iter().map(|d| [d.from_step, d.step]).collect();
     assert_eq!(steps, [[0, 12], [12, 24], [24, 36]]);
     assert!(found.iter().all(|d| d.mean_l1 > 0.0 && d.mean_l1.is_finite()), "{found:?}");
     assert!((found[1].epoch - 3.0).abs() < 1e-12);
-    let (plain, without) = solve(&with("/callbacks", json!([{"type": "rollback"}])), &scan, &none).unwrap();
+    let (plain, without) = solve(&with("/callbacks", json!([{"type": "rollback"}])), &scan).unwrap();
     assert!(drift(&without).is_empty() && !serde_json::to_string(&without[0]).unwrap().contains("drift"));
     assert_eq!(model(solution).arena.params, model(plain).arena.params);
     // A rate too small to change a number leaves nothing to see.
-    let (_, still) = solve(&with("/optimizer/lr", json!(1e-30)), &scan, &none).unwrap();
+    let (_, still) = solve(&with("/optimizer/lr", json!(1e-30)), &scan).unwrap();
     assert!(drift(&still).iter().all(|d| d.mean_l1 == 0.0) && drift(&still).len() == 3);
 }
 
 #[test]
 fn an_interval_in_which_channels_are_masked_has_no_drift() {
-    let (solution, records) = solve(&masked(), &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve(&masked(), &scan()).unwrap();
     assert_eq!(model(solution).masks().len(), 1, "nothing was masked");
     let steps: Vec<u64> = drift(&records).iter().map(|d| d.step).collect();
     assert_eq!(steps, [12, 36]);
@@ -133,39 +131,36 @@ fn an_interval_in_which_channels_are_masked_has_no_drift() {
     assert!(said.iter().any(|e| e.contains("no drift from step 12 to 24")), "{said:?}");
 }
 
-fn stopped(value: &Value, at: u64) -> Stop {
-    let (scan, spec, cpu) = (scan(), spec(value).unwrap(), Cpu::new());
-    let mut stop = Stop::at(at);
+/// What a run that is interrupted after step 14 goes on from.
+fn stopped() -> Resume {
+    let (scan, cpu, mut heard) = (scan(), Cpu::new(), Heard::until(14));
     let job = Job { seed: 7, ..Job::new(&scan, &cpu) };
-    assert!(plan(&spec, &cpu, &Weights::default()).unwrap().run(&job, &mut stop).is_err());
-    stop
+    assert!(planned(&settings(), &cpu).unwrap().run(&job, &mut heard).is_err());
+    heard.kept.unwrap()
 }
 
-fn resumed(value: &Value, resume: &Resume) -> Result<Vec<Record>> {
-    let (scan, spec, cpu) = (scan(), spec(value).unwrap(), Cpu::new());
-    let mut heard = Heard::default();
+fn resumed(value: &Value, resume: &Resume) -> Result<()> {
+    let (scan, cpu) = (scan(), Cpu::new());
     let job = Job { seed: 7, resume: Some(resume), ..Job::new(&scan, &cpu) };
-    plan(&spec, &cpu, &Weights::default())?.run(&job, &mut heard)?;
-    Ok(heard.0)
+    planned(value, &cpu)?.run(&job, &mut Heard::default()).map(drop)
 }
 
 #[test]
 fn a_resumed_run_finds_the_same_drift_to_the_bit() {
+    let (scan, cpu) = (scan(), Cpu::new());
     for settings in [settings(), masked()] {
-        let whole = solve(&settings, &scan(), &Weights::default()).unwrap().1;
+        let mut plan = planned(&settings, &cpu).unwrap();
+        let job = Job { seed: 7, ..Job::new(&scan, &cpu) };
         // Between two looks, at one, after a mask that spoilt the recording, and before any.
-        for at in [5, 12, 14, 18, 24] {
-            let stop = stopped(&settings, at);
-            let records = [stop.heard, resumed(&settings, &stop.kept.unwrap()).unwrap()].concat();
-            assert_eq!(drift(&records), drift(&whole), "at {at}");
-            assert_eq!(events(&records), events(&whole), "at {at}");
-        }
+        let steps = |_: &_| vec![5, 12, 14, 18, 24];
+        let (_, records) = goes_on(plan.as_mut(), &job, steps, |solution| state(&model(solution.unwrap()).arena));
+        assert!(!drift(&records).is_empty());
     }
 }
 
 #[test]
 fn a_recording_of_another_shape_is_refused() {
-    let mut resume = stopped(&settings(), 14).kept.unwrap();
+    let mut resume = stopped();
     let features = Arc::make_mut(&mut resume.weights).tensors.remove("drift.features").unwrap();
     let refused = |resume: &Resume, words: &[&str]| {
         let e = resumed(&settings(), resume).unwrap_err().to_string();
@@ -179,7 +174,7 @@ fn a_recording_of_another_shape_is_refused() {
 /// State that is missing or that nothing takes is refused with the name of whose it is.
 #[test]
 fn a_checkpoint_of_other_callbacks_is_refused() {
-    let kept = stopped(&settings(), 14).kept.unwrap();
+    let kept = stopped();
     let refused = |settings: &Value, resume: &Resume, words: &[&str]| {
         let e = resumed(settings, resume).unwrap_err().to_string();
         assert!(words.iter().all(|w| e.contains(w)), "{e}");
@@ -205,10 +200,7 @@ fn times_and_sizes_that_are_none_are_refused() {
         (json!({"epochs": 3}), "epochs"),
     ] {
         drift["type"] = json!("drift");
-        let said = match spec(&with("/callbacks", json!([drift]))) {
-            Ok(spec) => plan(&spec, &Cpu::new(), &Weights::default()).err().map(|e| e.to_string()),
-            Err(e) => Some(e.to_string()),
-        };
-        assert!(said.as_ref().is_some_and(|s| s.contains(word)), "{said:?}");
+        let said = planned(&with("/callbacks", json!([drift])), &Cpu::new()).err().unwrap().to_string();
+        assert!(said.contains(word), "{said}");
     }
 }

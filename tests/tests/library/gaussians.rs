@@ -1,11 +1,10 @@
 //! Radiative Gaussians, in whole runs.
 
-use crate::common::{Stop, model, plan, psnr, scan, solve, spec};
+use crate::common::{goes_on, model, planned, psnr, scan, solve, state};
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::Weights;
-use conefield_core::checkpoint::Resume;
-use conefield_core::method::{Job, Solution};
+use conefield_core::method::{Job, Record};
 use serde_json::{Value, json};
+use std::sync::LazyLock;
 
 fn settings() -> Value {
     json!({
@@ -16,20 +15,23 @@ fn settings() -> Value {
     })
 }
 
-fn bits(solution: Solution) -> Vec<u32> {
-    let arena = model(solution).arena;
-    [&arena.params, &arena.first, &arena.second].into_iter().flat_map(|p| p.iter().map(|x| x.to_bits())).collect()
+/// A longer run.
+pub fn longer() -> Value {
+    let mut s = settings();
+    s["training"]["steps"] = json!(150);
+    s
 }
+
+/// What [`longer`] comes to on the CPU: PSNR and records.
+pub static ON_CPU: LazyLock<(f64, Vec<Record>)> = LazyLock::new(|| psnr(&longer(), &Cpu::new()));
 
 #[test]
 fn training_explains_the_views() {
-    let mut s = settings();
-    s["training"]["steps"] = json!(150);
-    let (found, records) = psnr(&s, &Cpu::new());
+    let (found, records) = &*ON_CPU;
     let losses: Vec<f64> = records.iter().filter_map(|r| r.loss).collect();
     println!("{found:.2} dB, losses {losses:?}");
     // An empty volume has 10.8 dB.
-    assert!(found > 17.0, "{found} dB");
+    assert!(*found > 17.0, "{found} dB");
     let largest = losses.iter().fold(0.0f64, |m, l| m.max(*l));
     assert!(losses[losses.len() - 1] < 0.5 * largest, "{losses:?}");
 }
@@ -38,7 +40,7 @@ fn training_explains_the_views() {
 fn threads_change_no_bit() {
     let run = |threads: usize, s: &Value| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| bits(solve(s, &scan(), &Weights::default()).unwrap().0))
+        pool.install(|| state(&model(solve(s, &scan()).unwrap().0).arena))
     };
     let mut s = settings();
     let one = run(1, &s);
@@ -51,19 +53,9 @@ fn threads_change_no_bit() {
 #[test]
 fn a_run_resumes_to_the_same_bits() {
     let (scan, backend) = (scan(), Cpu::new());
-    let spec = spec(&settings()).unwrap();
-    let solve = |resume: Option<&Resume>, at| {
-        let mut stop = Stop::at(at);
-        let job = Job { seed: 7, resume, ..Job::new(&scan, &backend) };
-        let result = plan(&spec, &backend, &Weights::default()).unwrap().run(&job, &mut stop);
-        (result, stop)
-    };
-    let whole = bits(solve(None, u64::MAX).0.unwrap());
-    for at in [3, 10, 25] {
-        let (_, stopped) = solve(None, at);
-        let again = solve(stopped.kept.as_ref(), u64::MAX).0.unwrap();
-        assert!(bits(again) == whole, "at {at}");
-    }
+    let mut plan = planned(&settings(), &backend).unwrap();
+    let job = Job { seed: 7, ..Job::new(&scan, &backend) };
+    goes_on(plan.as_mut(), &job, |_| vec![3, 10, 25], |solution| state(&model(solution.unwrap()).arena));
 }
 
 #[test]
@@ -78,7 +70,7 @@ fn settings_out_of_range_are_refused() {
     ] {
         let mut s = settings();
         s[key] = value;
-        let e = spec(&s).and_then(|s| plan(&s, &Cpu::new(), &Weights::default()).map(drop)).unwrap_err().to_string();
+        let e = planned(&s, &Cpu::new()).err().unwrap().to_string();
         assert!(words.iter().all(|w| e.contains(w)), "{key}: {e}");
     }
 }

@@ -1,7 +1,8 @@
 //! Gaussians on a device agree with the CPU's: gradients, updates, values, line integrals, whole runs.
 
-use crate::common::psnr;
+use crate::common::{protocol, psnr};
 use crate::device::backends;
+use crate::gaussians::{ON_CPU, longer};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::{Limits, Wgpu};
 use conefield_core::backend::{Adam, Backend, BlockWork, Executable, Work};
@@ -14,7 +15,7 @@ use conefield_core::scan::Scan;
 use conefield_core::scene::{Scene, SceneSettings};
 use conefield_core::settings::{LossSpec, PriorSpec};
 use conefield_core::stage::UnitGrid;
-use conefield_projectors::simulate::{Protocol, simulate};
+use conefield_projectors::simulate::simulate;
 use conefield_solvers::gaussians::control::Pulls;
 use conefield_solvers::gaussians::device::training::DeviceTraining;
 use conefield_solvers::gaussians::shape::{FREE, NUMBERS};
@@ -31,11 +32,10 @@ const MOST: usize = 151;
 
 /// Five views of 37 × 45 pixels; from a cone, or from a source so far away that its rays are parallel.
 fn views(source: f64) -> Scan {
-    let protocol: Protocol = serde_json::from_value(json!({
+    let protocol = protocol(json!({
         "dso": source, "dsd": source + 250.0, "detector": [37, 45], "extent": {"side": [200.0, 240.0]},
         "angles": {"even": {"views": 5}},
-    }))
-    .unwrap();
+    }));
     simulate(&crate::common::truth(), &protocol).unwrap()
 }
 
@@ -65,6 +65,15 @@ fn on_devices() -> Vec<(&'static str, &'static Wgpu)> {
     backends("Gaussians").into_iter().filter(|(limits, _)| *limits != "small buffers").collect()
 }
 
+/// Where the blocks of a prior begin.
+const CORNERS: [[f32; 3]; 2] = [[0.2, 0.3, 0.25], [0.45, 0.1, 0.5]];
+
+const ADAM: Adam = Adam { lr: 1e-4, beta1: 0.9, beta2: 0.999, eps: 1e-8, step: 1 };
+
+fn no_pulls() -> Arc<Mutex<Pulls>> {
+    Arc::new(Mutex::new(Pulls::new(MOST)))
+}
+
 struct Both {
     scan: Scan,
     scene: Scene,
@@ -84,23 +93,20 @@ impl Both {
         Self { scan, scene, rule, loss: LossSpec::build(&L1 {}).unwrap(), priors }
     }
 
-    fn on(&self, backend: &dyn Backend, resident: bool, pulls: &Arc<Mutex<Pulls>>) -> Box<dyn Executable> {
-        match backend.device() {
-            None => {
-                let views = Views::new(&self.scan, &self.scene, ViewTraining::PADDING);
-                Box::new(ViewTraining::new(self.rule, views, pulls.clone()))
-            }
-            Some(device) => {
-                let views = (Views::new(&self.scan, &self.scene, 0), resident);
-                let parts = (self.loss.as_ref(), &self.priors[..]);
-                Box::new(DeviceTraining::new(device, MOST, self.rule, views, parts, pulls.clone()).unwrap())
-            }
-        }
+    /// The work on a device, or on the CPU without one. Views stay on the device if they are `resident`.
+    fn on(&self, device: Option<Box<dyn Device>>, resident: bool, pulls: &Arc<Mutex<Pulls>>) -> Box<dyn Executable> {
+        let Some(device) = device else {
+            let views = Views::new(&self.scan, &self.scene, ViewTraining::PADDING);
+            return Box::new(ViewTraining::new(self.rule, views, pulls.clone()));
+        };
+        let views = (Views::new(&self.scan, &self.scene, 0), resident);
+        let parts = (self.loss.as_ref(), &self.priors[..]);
+        Box::new(DeviceTraining::new(device, MOST, self.rule, views, parts, pulls.clone()).unwrap())
     }
 
-    fn blocks<'a>(&'a self, corners: &'a [[f32; 3]]) -> Vec<BlockWork<'a>> {
+    fn blocks(&self) -> Vec<BlockWork<'_>> {
         let spacing = [0.03, 0.035, 0.04];
-        self.priors.iter().map(|p| BlockWork { prior: p.as_ref(), corners, spacing }).collect()
+        self.priors.iter().map(|p| BlockWork { prior: p.as_ref(), corners: &CORNERS, spacing }).collect()
     }
 
     fn work<'a>(&'a self, step: u64, priors: &'a [BlockWork<'a>]) -> Work<'a> {
@@ -137,18 +143,16 @@ fn gradients_and_updates_are_those_of_the_cpu() {
         {
             let what = format!("{limits}, source at {source}, ssim {ssim}, prior {prior}");
             let both = Both::new(source, ssim, prior);
-            let corners = [[0.2, 0.3, 0.25], [0.45, 0.1, 0.5]];
-            let priors = both.blocks(&corners);
+            let priors = both.blocks();
             let backends: [&dyn Backend; 2] = [&Cpu::new(), backend];
             let [host, device] = backends.map(|backend| {
-                let pulls = Arc::new(Mutex::new(Pulls::new(MOST)));
-                let (mut model, mut exe) = (mixture(0.01), both.on(backend, resident, &pulls));
+                let pulls = no_pulls();
+                let (mut model, mut exe) = (mixture(0.01), both.on(backend.device(), resident, &pulls));
                 let mut stats = vec![];
                 for step in 0..2 {
                     stats.push(exe.step(&mut model, &both.work(step, &priors)).unwrap());
                     if step == 0 {
-                        let adam = Adam { lr: 1e-4, beta1: 0.9, beta2: 0.999, eps: 1e-8, step: 1 };
-                        exe.update(&mut model, &adam).unwrap();
+                        exe.update(&mut model, &ADAM).unwrap();
                     }
                 }
                 exe.fetch(&mut model).unwrap();
@@ -207,15 +211,9 @@ fn values_and_line_integrals_are_those_of_the_cpu() {
 
 #[test]
 fn a_run_ends_where_the_cpu_does() {
-    let settings = json!({
-        "type": "gaussians", "most": 1500, "start": {"count": 800, "threshold": 0.1, "sites": "cells"}, "ssim": 0.1,
-        "training": {"steps": 150, "report_every": 50}, "optimizer": {"lr": 0.01},
-        "priors": [{"type": "total-variation", "weight": 0.01, "blocks": 1, "edge": 6}],
-        "density_control": {"every": 10, "pull": 1e-4},
-    });
-    let (wanted, _) = psnr(&settings, &Cpu::new());
+    let (wanted, _) = &*ON_CPU;
     for (limits, backend) in on_devices() {
-        let (found, records) = psnr(&settings, backend);
+        let (found, records) = psnr(&longer(), backend);
         println!("{limits}: {found:.3} dB, the CPU {wanted:.3} dB");
         assert!((found - wanted).abs() < 0.3, "{found} {wanted}");
         assert!(records.iter().any(|r| r.events.iter().any(|e| e.contains("cloned"))), "no density control");
@@ -292,18 +290,13 @@ fn a_step_moves_numbers_and_launches_few_kernels() {
             (true, 0.5, true, 160, 44),
         ] {
             let both = Both::new(500.0, ssim, prior);
-            let corners = [[0.2, 0.3, 0.25], [0.45, 0.1, 0.5]];
-            let priors = both.blocks(&corners);
+            let priors = both.blocks();
             let counts = Arc::new(Mutex::new([0; 2]));
             let device = Box::new(Watched { inner: backend.device().unwrap(), counts: counts.clone(), fault: None });
-            let views = (Views::new(&both.scan, &both.scene, 0), resident);
-            let parts = (both.loss.as_ref(), &both.priors[..]);
-            let pulls = Arc::new(Mutex::new(Pulls::new(MOST)));
-            let (mut model, adam) = (mixture(0.01), Adam { lr: 1e-4, beta1: 0.9, beta2: 0.999, eps: 1e-8, step: 1 });
-            let mut exe = DeviceTraining::new(device, MOST, both.rule, views, parts, pulls).unwrap();
+            let (mut model, mut exe) = (mixture(0.01), both.on(Some(device), resident, &no_pulls()));
             let mut step = |step| {
                 exe.step(&mut model, &both.work(step, &priors)).unwrap();
-                exe.update(&mut model, &adam).unwrap();
+                exe.update(&mut model, &ADAM).unwrap();
             };
             // The first one loads the Gaussians, and makes the buffers.
             step(0);
@@ -356,18 +349,9 @@ fn a_faulty_kernel_is_found() {
     ];
     let Some((_, backend)) = on_devices().into_iter().next() else { return };
     let both = Both::new(500.0, 0.5, true);
-    let corners = [[0.2, 0.3, 0.25], [0.45, 0.1, 0.5]];
     let gradients = |device: Option<Box<dyn Device>>| {
-        let (mut model, pulls) = (mixture(0.01), Arc::new(Mutex::new(Pulls::new(MOST))));
-        let mut exe: Box<dyn Executable> = match device {
-            None => both.on(&Cpu::new(), true, &pulls),
-            Some(device) => {
-                let views = (Views::new(&both.scan, &both.scene, 0), true);
-                let parts = (both.loss.as_ref(), &both.priors[..]);
-                Box::new(DeviceTraining::new(device, MOST, both.rule, views, parts, pulls).unwrap())
-            }
-        };
-        exe.step(&mut model, &both.work(0, &both.blocks(&corners))).unwrap();
+        let (mut model, mut exe) = (mixture(0.01), both.on(device, true, &no_pulls()));
+        exe.step(&mut model, &both.work(0, &both.blocks())).unwrap();
         exe.fetch(&mut model).unwrap();
         model.arena.grads
     };

@@ -1,10 +1,9 @@
 //! Training that runs away is found out, goes back, and ends in words if that does not help.
 
-use crate::common::{Stop, model, plan, scan, solve, solve_on, spec};
+use crate::common::{goes_on, model, planned, scan, solve, solve_on, state};
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::{Arena, Weights};
+use conefield_core::arena::Arena;
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
-use conefield_core::checkpoint::Resume;
 use conefield_core::error::{Error, Result};
 use conefield_core::method::{Job, Record, Solution};
 use conefield_core::pipeline::{Model, Pipeline};
@@ -126,15 +125,11 @@ impl Executable for Remote {
 }
 
 fn run(value: &Value, fault: Fault) -> Result<(Solution, Vec<Record>)> {
-    solve_on(&Faulty { fault, device: None }, value, &scan(), &Weights::default())
-}
-
-fn bits(arena: &Arena) -> Vec<u32> {
-    [&arena.params, &arena.first, &arena.second].into_iter().flat_map(|p| p.iter().map(|x| x.to_bits())).collect()
+    solve_on(&Faulty { fault, device: None }, value, &scan())
 }
 
 fn outcome(solution: Solution) -> Vec<u32> {
-    bits(&model(solution).arena)
+    state(&model(solution).arena)
 }
 
 /// What was said of going back, with the step of the record.
@@ -147,7 +142,7 @@ fn events(records: &[Record]) -> Vec<(u64, String)> {
 fn what_never_diverges_keeps_its_bits() {
     let mut off = settings(130);
     off["callbacks"] = json!([]);
-    let plain = |s: &Value| solve(s, &scan(), &Weights::default()).unwrap();
+    let plain = |s: &Value| solve(s, &scan()).unwrap();
     let ((a, on), (b, without)) = (plain(&settings(130)), plain(&off));
     assert_eq!(a.rollbacks, 0);
     assert_eq!(on.iter().map(|r| r.loss).collect::<Vec<_>>(), without.iter().map(|r| r.loss).collect::<Vec<_>>());
@@ -238,25 +233,13 @@ fn a_run_that_went_back_resumes_to_the_same_bits() {
         (settings(170), Fault::Forever(163)),
         (masked, Fault::Loss(118)),
     ] {
-        let (scan, spec) = (scan(), spec(&value).unwrap());
-        let backend = Faulty { fault, device: None };
-        let mut plan = plan(&spec, &backend, &Weights::default()).unwrap();
-        let mut solve = |resume: Option<&Resume>, at| {
-            let mut stop = Stop::at(at);
-            let result = plan.run(&Job { seed: 7, resume, ..Job::new(&scan, &backend) }, &mut stop);
-            let result = result.map(|s| (s.rollbacks, outcome(s))).map_err(|e| e.to_string());
-            (result, stop)
-        };
-        let (whole, heard) = solve(None, u64::MAX);
-        assert!(whole.as_ref().map_or(true, |w| w.0 > 0));
-        for at in [1, 24, 26, 64, 99, 118, 124, 125, 131, 140, 165] {
-            let (stopped, first) = solve(None, at);
-            assert!(stopped.unwrap_err().contains("interrupted"));
-            let (again, second) = solve(first.kept.as_ref(), u64::MAX);
-            assert!(again == whole, "interrupted after step {at}");
-            let records = |s: &Stop| s.heard.iter().map(|r| (r.step, r.loss, r.events.clone())).collect::<Vec<_>>();
-            assert_eq!([records(&first), records(&second)].concat(), records(&heard), "after step {at}");
-        }
+        let (scan, backend) = (scan(), Faulty { fault, device: None });
+        let mut plan = planned(&value, &backend).unwrap();
+        let job = Job { seed: 7, ..Job::new(&scan, &backend) };
+        let steps = |_: &_| vec![1, 24, 26, 64, 99, 118, 124, 125, 131, 140, 165];
+        let ended = |solution: Result<Solution>| solution.map(|s| (s.rollbacks, outcome(s))).map_err(|e| e.to_string());
+        let (whole, _) = goes_on(plan.as_mut(), &job, steps, ended);
+        assert!(whole.map_or(true, |(rollbacks, _)| rollbacks > 0));
     }
 }
 
@@ -271,7 +254,7 @@ fn a_device_goes_back_too() {
             value["training"]["rays"] = json!(8);
             value["projector"]["samples"] = json!(4);
             let backend = Faulty { fault, device: Some(device) };
-            let (solution, _) = solve_on(&backend, &value, &scan(), &Weights::default()).unwrap();
+            let (solution, _) = solve_on(&backend, &value, &scan()).unwrap();
             (solution.rollbacks, model(solution).arena)
         };
         let (rollbacks, back) = after(131, Fault::Loss(130));

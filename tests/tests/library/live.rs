@@ -1,9 +1,8 @@
 //! Slices of a field while it trains.
 
-use crate::common::{model, plan, scan, spec, volume};
+use crate::common::{model, planned, scan, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
-use conefield_core::arena::Weights;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::{Job, Observer, Record};
 use conefield_core::parts::Part;
@@ -46,8 +45,8 @@ fn slices_are_those_of_the_field_and_change_nothing() {
         "projector": {"type": "ray-march", "samples": 20},
         "type": "neural-field", "callbacks": [{"type": "rollback"}, {"type": "fft-mask", "epoch": 2, "threshold": 1e-6}], "training": {"steps": 40, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.01},
     });
-    let (scan, spec, cpu) = (scan(), spec(&value).unwrap(), Cpu::new());
-    let mut plan = plan(&spec, &cpu, &Weights::default()).unwrap();
+    let (scan, cpu) = (scan(), Cpu::new());
+    let mut plan = planned(&value, &cpu).unwrap();
     let mut run = |every: u64| {
         let mut seen = Slices { every, step: 0, last: vec![], times: 0, losses: vec![] };
         let job = Job { seed: 7, ..Job::new(&scan, &cpu) };

@@ -1,6 +1,7 @@
 //! Stages, methods and backends together, through the library. One program for all: each program that is linked costs seconds.
 
 #[path = "../common/mod.rs"]
+#[allow(dead_code)]
 mod common;
 #[path = "../device/mod.rs"]
 mod device;

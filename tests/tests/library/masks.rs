@@ -1,36 +1,18 @@
 //! Masks in whole pipelines: what is removed, and that the rest computes the same as before.
 
-use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
-use conefield_core::stage::{Projector, Samples, Stage, Tile, TileMut, UnitRay};
+use crate::common::pipeline;
+use conefield_core::pipeline::Model;
+use conefield_core::stage::{Stage, Tile, TileMut};
 use serde_json::{Value, json};
 
-use conefield_encoders as _;
-use conefield_fields as _;
-
-struct Nothing;
-impl Projector for Nothing {
-    fn max_samples(&self, _: &UnitRay) -> usize {
-        0
-    }
-    fn sample(&self, _: &UnitRay, _: Option<u64>, _: &mut Samples) {}
-    fn describe(&self) -> String {
-        "nothing".into()
-    }
-}
-
-fn model(encoder: Value, normalizers: &[Value]) -> Model {
-    let encoder = serde_json::from_value::<Box<dyn EncoderSpec>>(encoder).unwrap().build().unwrap();
-    let mut width = encoder.info().output;
-    let mut built = vec![];
-    for n in normalizers {
-        let n = serde_json::from_value::<Box<dyn NormalizerSpec>>(n.clone()).unwrap().build(width).unwrap();
-        width = n.info().output;
-        built.push(n);
-    }
-    let field = json!({"type": "mlp", "width": 8});
-    let field = serde_json::from_value::<Box<dyn FieldSpec>>(field).unwrap().build(width).unwrap();
-    let mut model = Model::random(Pipeline::new(encoder, built, field, Box::new(Nothing)).unwrap(), 5);
+fn model(normalizers: Value) -> Model {
+    let mut model = Model::random(
+        pipeline(&json!({
+            "encoder": {"type": "dense-grid", "levels": 3, "base_resolution": 3}, "normalizers": normalizers,
+            "field": {"type": "mlp", "width": 8}, "projector": "ray-march", "type": "neural-field",
+        })),
+        5,
+    );
     for (i, p) in model.arena.params.iter_mut().enumerate() {
         *p += (i as f32).sin() * 0.2;
     }
@@ -62,14 +44,10 @@ fn points() -> Vec<[f32; 3]> {
     (0..50).map(|i| [0.37, 0.61, 0.83].map(|a| (i as f32 * a).fract())).collect()
 }
 
-fn dense() -> Value {
-    json!({"type": "dense-grid", "levels": 3, "base_resolution": 3})
-}
-
 /// Without a normalizer the rest of the pipeline is as if the masked channels were 0.
 #[test]
 fn masked_channels_count_as_zeros() {
-    let mut model = model(dense(), &[]);
+    let mut model = model(json!([]));
     let before = evaluate(&model, &points(), &[2, 3, 5]);
     model.mask(vec![0, 1, 4]).unwrap();
     assert_eq!((model.pipeline.encoder.info().output, model.masks()), (3, &[vec![0, 1, 4]][..]));
@@ -82,7 +60,7 @@ fn masked_channels_count_as_zeros() {
 /// A mask takes whole levels out of the encoder and channels out of the statistics.
 #[test]
 fn a_mask_removes_levels_and_parameters() {
-    let mut model = model(dense(), &[json!({"type": "layer-norm"})]);
+    let mut model = model(json!(["layer-norm"]));
     let features = evaluate(&model, &points(), &[]).swap_remove(0);
     let old = model.arena.params.len();
     model.mask(vec![0, 1]).unwrap();
@@ -96,7 +74,7 @@ fn a_mask_removes_levels_and_parameters() {
 
 #[test]
 fn channels_that_are_not_there_are_refused_and_nothing_changes() {
-    let mut model = model(dense(), &[]);
+    let mut model = model(json!([]));
     let old = model.arena.params.clone();
     for keep in [vec![], vec![1, 0], vec![6]] {
         let e = model.mask(keep).unwrap_err().to_string();

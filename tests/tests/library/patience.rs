@@ -1,9 +1,8 @@
 //! Training that ends when held-out views are no longer predicted better.
 
-use crate::common::{Stop, model, plan, scan, spec};
+use crate::common::{Heard, bits, goes_on, model, planned, scan};
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::Weights;
-use conefield_core::checkpoint::Resume;
+use conefield_core::Result;
 use conefield_core::method::{Best, Job, Limits, Record, Solution};
 use conefield_core::scan::Scan;
 use rand::{RngExt, SeedableRng};
@@ -33,15 +32,13 @@ fn settings(steps: u64, patience: Option<u64>) -> Value {
 }
 
 fn solve(value: &Value, (train, held): &(Scan, Scan), limits: Limits) -> (Solution, Vec<Record>) {
-    let (spec, backend) = (spec(value).unwrap(), Cpu::new());
+    let (backend, mut heard) = (Cpu::new(), Heard::default());
     let job = Job { seed: 7, held_out: Some(held), limits, ..Job::new(train, &backend) };
-    let mut heard = Stop::at(u64::MAX);
-    let solution = plan(&spec, &backend, &Weights::default()).unwrap().run(&job, &mut heard).unwrap();
-    (solution, heard.heard)
+    (planned(value, &backend).unwrap().run(&job, &mut heard).unwrap(), heard.records)
 }
 
 fn params(solution: Solution) -> Vec<u32> {
-    model(solution).arena.params.iter().map(|x| x.to_bits()).collect()
+    bits(&model(solution).arena.params)
 }
 
 /// The record with the least error, and how many came after it.
@@ -103,33 +100,24 @@ fn a_run_resumes_to_the_same_best() {
     let mut masked = settings(4000, Some(4));
     masked["callbacks"] = json!([{"type": "patience", "records": 4}, {"type": "fft-mask", "keep": [0, 1, 2, 3, 4]}]);
     for (value, masks) in [(settings(4000, Some(4)), false), (masked, true)] {
-        let (spec, backend) = (spec(&value).unwrap(), Cpu::new());
-        let mut plan = plan(&spec, &backend, &Weights::default()).unwrap();
-        let mut solve = |resume: Option<&Resume>, at| {
-            let mut stop = Stop::at(at);
-            let job = Job { seed: 7, held_out: Some(&held), resume, ..Job::new(&train, &backend) };
-            let result = plan.run(&job, &mut stop).map(|s| (s.steps, s.best, params(s))).map_err(|e| e.to_string());
-            (result, stop)
+        let backend = Cpu::new();
+        let mut plan = planned(&value, &backend).unwrap();
+        let job = Job { seed: 7, held_out: Some(&held), ..Job::new(&train, &backend) };
+        let around = |(steps, best, _): &(u64, Option<Best>, _)| {
+            let best = best.unwrap().step;
+            vec![1, 19, 20, 21, 47, 48, 49, 50, best, best + 1, steps - 1, *steps]
         };
-        let (whole, heard) = solve(None, u64::MAX);
-        let (steps, best, _) = whole.clone().unwrap();
+        let ended = |solution: Result<Solution>| solution.map(|s| (s.steps, s.best, params(s))).unwrap();
+        let ((steps, best, _), records) = goes_on(plan.as_mut(), &job, around, ended);
         let said = |r: &Record| r.events.iter().any(|e| e.contains("fft-mask: 5 of 8 channels kept"));
-        assert_eq!(heard.heard.iter().any(said), masks);
+        assert_eq!(records.iter().any(said), masks);
         assert!(steps < 4000 && best.is_some_and(|b| b.step == steps - 4 * 20), "{steps}, {best:?}");
-        for at in [1, 19, 20, 21, 47, 48, 49, 50, best.unwrap().step, best.unwrap().step + 1, steps - 1, steps] {
-            let (stopped, first) = solve(None, at);
-            assert!(stopped.unwrap_err().contains("interrupted"), "at {at}");
-            let (again, second) = solve(first.kept.as_ref(), u64::MAX);
-            assert!(again == whole, "interrupted after step {at}");
-            let records = |s: &Stop| s.heard.iter().map(|r| (r.step, r.held_out, r.events.clone())).collect::<Vec<_>>();
-            assert_eq!([records(&first), records(&second)].concat(), records(&heard), "after step {at}");
-        }
     }
 }
 
 #[test]
 fn its_needs_are_reported() {
-    let planned = |patience| plan(&spec(&settings(9, patience)).unwrap(), &Cpu::new(), &Weights::default());
+    let planned = |patience| planned(&settings(9, patience), &Cpu::new());
     let (with, without) = (planned(Some(3)).unwrap(), planned(None).unwrap());
     assert_eq!((with.needs_held_out(), without.needs_held_out()), (Some("callbacks.1".into()), None));
     let (header, parameters) = (scan().header(), with.outline().parameters() as u64);

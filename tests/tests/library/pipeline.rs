@@ -1,24 +1,24 @@
 //! Whole pipelines: the gradient of a step, the same bits on any number of threads, any unit, weights from another
 //! scan, and masked channels that leave the work.
 
-use crate::common::{Heard, model, plan, scan, solve, spec, truth, volume};
+use crate::common::{
+    Heard, bits, decibels, model, moved, pipeline, planned, point, protocol, rays, scan, solve, solve_from, truth,
+    volume,
+};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
 use conefield_core::Result;
 use conefield_core::arena::Weights;
-use conefield_core::backend::{BlockWork, TrainRay, Work};
+use conefield_core::backend::{Backend, BlockWork, Work};
 use conefield_core::loss::Loss;
 use conefield_core::method::{Limits, PretrainJob, Solution};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::random::{mix, unit};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::scene::Scene;
-use conefield_core::trained::{Placement, TrainedField};
-use conefield_projectors::simulate::{Protocol, simulate};
+use conefield_core::trained::TrainedField;
+use conefield_projectors::simulate::simulate;
 use conefield_solvers::losses::{Huber, L2};
 use conefield_solvers::priors::TotalVariation;
-use ndarray::Array3;
 use serde_json::{Value, json};
 
 fn settings() -> Value {
@@ -88,21 +88,14 @@ fn sample(pipeline: &Pipeline, grads: &[f64]) -> Vec<Vec<usize>> {
 
 /// Of a step of `count` rays, 50 points and 4 blocks of `edge`³.
 fn gradients_of(settings: &Value, count: usize, edge: usize) {
-    let pipeline = crate::common::pipeline(&spec(settings).unwrap());
-    let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
-    let mut rays = vec![];
-    for i in 0..count {
-        let ray = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
-        // Near and far from what the field says, so that Huber's two parts both occur.
-        rays.push(TrainRay { ray, target: if i % 2 == 0 { 0.5 } else { 3.0 } });
-    }
+    let pipeline = pipeline(settings);
+    // Near and far from what the field says, so that Huber's two parts both occur.
+    let rays = rays(count, |i| if i % 2 == 0 { 0.5 } else { 3.0 });
     // Rays that see nothing of the scene take part with a line integral of 0.
     let missed = rays.iter().filter(|r| r.ray.inside[0] == r.ray.inside[1]).count();
     assert!(missed <= count / 2, "{missed} of {count} rays miss the box");
-    let place = |i: u64| std::array::from_fn(|k| 0.05 + 0.9 * unit(mix(i, k as u64)));
-    let points: Vec<_> = (0..50).map(|i| (place(i), if i % 2 == 0 { 0.7 } else { 4.0 })).collect();
-    let corners: Vec<_> = (100..105).map(|i| place(i).map(|x: f32| 0.7 * x)).collect();
+    let points: Vec<_> = (0..50).map(|i| (point(i), if i % 2 == 0 { 0.7 } else { 4.0 })).collect();
+    let corners: Vec<_> = (100..105).map(|i| point(i).map(|x| 0.7 * x)).collect();
     let spacing = [0.06, 0.05, 0.07].map(|x| 3.0 * x / edge as f32);
     let fine = TotalVariation { weight: 0.3, edge, smoothing: 1e-2, ..TotalVariation::default() };
     // Points of one block fill no vector: rows after it are padding.
@@ -111,13 +104,7 @@ fn gradients_of(settings: &Value, count: usize, edge: usize) {
         BlockWork { prior: &fine, corners: &corners[..4], spacing },
         BlockWork { prior: &coarse, corners: &corners[4..], spacing: [0.1; 3] },
     ];
-    let params: Vec<f64> = Model::random(crate::common::pipeline(&spec(settings).unwrap()), 3)
-        .arena
-        .params
-        .iter()
-        .enumerate()
-        .map(|(i, &p)| f64::from(p) + 0.4 * (f64::from(unit(mix(5, i as u64))) - 0.5))
-        .collect();
+    let params: Vec<f64> = moved(&pipeline).arena.params.iter().map(|&p| f64::from(p)).collect();
     let losses: [&dyn Loss; 2] = [&L2 {}, &Huber { delta: 0.5 }];
     for loss in losses {
         let kernels = Kernels::new(&pipeline, |s| s.reference().unwrap());
@@ -177,10 +164,6 @@ fn a_steps_gradient_is_that_of_its_loss_in_other_pipelines() {
 
 // ---- threads ----
 
-fn bits(values: &[f32]) -> Vec<u32> {
-    values.iter().map(|v| v.to_bits()).collect()
-}
-
 #[test]
 fn the_number_of_threads_does_not_change_a_bit() {
     let mut s = settings();
@@ -194,7 +177,7 @@ fn the_number_of_threads_does_not_change_a_bit() {
     let scan = scan();
     let run = |threads: usize, s: &Value| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let (solution, records) = pool.install(|| solve(s, &scan, &Weights::default())).unwrap();
+        let (solution, records) = pool.install(|| solve(s, &scan)).unwrap();
         assert_eq!(solution.steps, 10);
         let volume = volume(&solution);
         let arena = &solution.result.field().unwrap().model.arena;
@@ -215,16 +198,12 @@ fn the_number_of_threads_does_not_change_a_bit() {
 
 #[test]
 fn noise_weights_come_from_the_scan() {
-    let protocol: Protocol = serde_json::from_value(json!({
-        "dso": 500.0, "dsd": 750.0, "detector": [64, 64], "extent": {"side": [280.0, 280.0]},
-        "angles": {"even": {"views": 8}},
-    }))
-    .unwrap();
+    let protocol = protocol(json!({"detector": [64, 64]}));
     let scan = simulate(&truth(), &protocol.with_noise("tigre:1e3,0".parse().unwrap(), 5)).unwrap();
     let run = |loss: &str| {
         let mut s = settings();
         s["loss"] = json!(loss);
-        let (solution, records) = solve(&s, &scan, &Weights::default()).unwrap();
+        let (solution, records) = solve(&s, &scan).unwrap();
         (model(solution).arena.params.to_vec(), records.last().unwrap().loss.unwrap())
     };
     let ([weighted, again], (plain, squares)) = ([(); 2].map(|()| run("noise-weighted")), run("l2"));
@@ -236,17 +215,19 @@ fn noise_weights_come_from_the_scan() {
 
 // ---- export ----
 
-fn restored(
-    value: &Value,
-    placement: &Placement,
-    load: &mut dyn FnMut(&mut Model) -> Result<()>,
-) -> Result<TrainedField> {
-    plan(&spec(value)?, &Cpu::new(), &Weights::default())?.restore(placement, load)
+/// The field that `value` trained, from its weights and its placement as it would come back from a file.
+fn restored(value: &Value, field: &TrainedField) -> TrainedField {
+    let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
+    let placement = serde_json::from_str(&serde_json::to_string(&field.placement()).unwrap()).unwrap();
+    let load = &mut |model: &mut Model| {
+        weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
+    };
+    planned(value, &Cpu::new()).unwrap().restore(&placement, load).unwrap()
 }
 
 #[test]
 fn a_field_evaluated_part_by_part_is_the_same_to_the_bit() {
-    let (solution, _) = solve(&settings(), &scan(), &Weights::default()).unwrap();
+    let (solution, _) = solve(&settings(), &scan()).unwrap();
     let whole = volume(&solution);
     let mut voxels = solution.result.voxels(&Cpu::new()).unwrap();
     for part in [[0..16, 0..16, 3..4], [0..1, 5..16, 0..16], [7..12, 2..3, 1..16], [15..16, 15..16, 15..16]] {
@@ -266,15 +247,10 @@ fn a_field_comes_back_from_its_weights() {
     let width = s["encoder"]["levels"].as_u64().unwrap() * s["encoder"]["features"].as_u64().unwrap_or(2);
     let kept: Vec<u64> = (0..width - 1).collect();
     s["callbacks"] = json!([{"type": "fft-mask", "keep": kept}]);
-    let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let (solution, _) = solve(&s, &scan()).unwrap();
     let field = solution.result.field().unwrap();
     assert_eq!(field.placement().masks.len(), 1);
-    let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
-    let placement = serde_json::from_str(&serde_json::to_string(&field.placement()).unwrap()).unwrap();
-    let again = restored(&s, &placement, &mut |model| {
-        weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
-    })
-    .unwrap();
+    let again = restored(&s, field);
     let whole = volume(&solution);
     let values = |n: usize| {
         let grid = again.scene.grid.with_longest(n);
@@ -288,73 +264,33 @@ fn a_field_comes_back_from_its_weights() {
 
 // ---- units ----
 
-fn psnr(volume: &Volume, scale: f64) -> f64 {
-    let truth = truth();
-    let square = |(a, b): (&f32, &f32)| (f64::from(*a) * scale - f64::from(*b)).powi(2);
-    let mse = volume.data.iter().zip(&truth.data).map(square).sum::<f64>() / volume.data.len() as f64;
-    10.0 * (0.02f64.powi(2) / mse).log10()
-}
-
-/// Lengths, the data set's unit and attenuation may be anything: the volume is the same, in its own unit.
+/// Line integrals times a over lengths times l make a/l in 1/mm. A share of what the scan takes by itself is of the scan
+/// alone, a fixed attenuation is not. `extremes` goes through scales and units.
 #[test]
-fn units_do_not_change_the_volume() {
-    let mut s = settings();
-    s["training"]["steps"] = json!(200);
-    // Half of what the scan takes by itself: also of the scan alone.
-    s["scene"] = json!({"attenuation": {"relative": 0.5}});
+fn a_relative_attenuation_knows_no_unit() {
     let base = scan();
-    let run = |scan: &Scan| volume(&solve(&s, scan, &Weights::default()).unwrap().0);
-    let expected = psnr(&run(&base), 1.0);
-    let empty = psnr(&Volume { data: Array3::zeros(base.geometry.volume.shape), ..run(&base) }, 1.0);
-    assert!(expected > empty + 1.2, "the run itself makes a volume: {expected} dB, an empty one {empty} dB");
-    for (lengths, unit_mm, attenuation) in [
-        (1e3, 1.0, 1.0),
-        (1e-3, 1.0, 1.0),
-        (1e3, 1e3, 1.0),
-        (1e-3, 1e-3, 1.0),
-        (1.0, 1e3, 1.0),
-        (1.0, 1.0, 1e-6),
-        (1.0, 1.0, 1e6),
-        (1e3, 1e3, 1e-6),
-        (1e-3, 1.0, 1e6),
-    ] {
-        let mut other = base.clone();
-        other.geometry = base.geometry.scaled(lengths);
-        other.unit.mm = unit_mm;
-        other.projections.mapv_inplace(|a| (f64::from(a) * attenuation) as f32);
-        let volume = run(&other);
-        assert_eq!(volume.grid.spacing, base.geometry.volume.spacing.map(|x| x * lengths));
-        // Line integrals × a over lengths × l make a/l in 1/mm, and u times as much in 1/unit.
-        let found = psnr(&volume, lengths / (attenuation * unit_mm));
-        assert!(
-            (found - expected).abs() < 1e-3,
-            "lengths x {lengths}, unit of {unit_mm} mm, attenuation x {attenuation}: {found} dB, not {expected} dB"
-        );
-    }
-    // Negative control: a scale that does not come from the scan.
-    let mut fixed = settings();
-    fixed["scene"] = json!({"attenuation": {"fixed": 0.02}});
+    let found = |attenuation: Value, scan: &Scan, scale: f64| {
+        let mut s = settings();
+        s["scene"] = json!({ "attenuation": attenuation });
+        decibels(&volume(&solve(&s, scan).unwrap().0).data, scale)
+    };
     let mut other = base.clone();
-    let expected = psnr(&volume(&solve(&fixed, &base, &Weights::default()).unwrap().0), 1.0);
-    other.projections.mapv_inplace(|a| a * 2.0);
-    let found = psnr(&volume(&solve(&fixed, &other, &Weights::default()).unwrap().0), 0.5);
-    assert!((found - expected).abs() > 1e-3, "{found} dB and {expected} dB");
+    other.projections.mapv_inplace(|a| 2.0 * a);
+    let [apart, fixed] = [json!({"relative": 0.5}), json!({"fixed": 0.02})]
+        .map(|attenuation| (found(attenuation.clone(), &base, 1.0) - found(attenuation, &other, 0.5)).abs());
+    assert!(apart < 1e-3 && fixed > 1e-3, "{apart} dB apart, of a fixed attenuation {fixed} dB");
 }
 
 // ---- weights from another scan ----
 
-fn pretrained(s: &Value) -> (Model, Vec<f64>) {
-    let spec = spec(s).unwrap();
+/// A field of `s` that learned two volumes in 60 steps, and its losses.
+pub fn pretrained(s: &Value, backend: &dyn Backend) -> (Model, Vec<f64>) {
     let volumes = [truth(), truth().mapped(|x| 3.0 * x)];
-    let job = PretrainJob {
-        volumes: &volumes,
-        backend: &Cpu::new(),
-        seed: 21,
-        limits: Limits { steps: Some(60), ..Limits::default() },
-    };
+    let limits = Limits { steps: Some(60), ..Limits::default() };
     let mut heard = Heard::default();
-    let model = plan(&spec, &Cpu::new(), &Weights::default()).unwrap().pretrain(&job, &mut heard).unwrap();
-    (model, heard.0.iter().map(|r| r.loss.unwrap()).collect())
+    let job = PretrainJob { volumes: &volumes, backend, seed: 21, limits };
+    let model = planned(s, backend).unwrap().pretrain(&job, &mut heard).unwrap();
+    (model, heard.records.iter().map(|r| r.loss.unwrap()).collect())
 }
 
 fn parts(model: &Model) -> (Vec<u32>, Vec<u32>) {
@@ -366,7 +302,7 @@ fn parts(model: &Model) -> (Vec<u32>, Vec<u32>) {
 fn weights_behind_the_encoder_go_to_another_scan() {
     let mut s = settings();
     s["pretraining"]["points"] = json!(512);
-    let (trained, losses) = pretrained(&s);
+    let (trained, losses) = pretrained(&s, &Cpu::new());
     assert!(losses.last().unwrap() < &(0.9 * losses[0]), "{losses:?}");
     let weights = Weights::from_arena(trained.pipeline.layout(), &trained.arena.params, |_| true);
 
@@ -377,7 +313,7 @@ fn weights_behind_the_encoder_go_to_another_scan() {
         if steps == 0 {
             s["optimizer"]["lr"] = json!(1e-60);
         }
-        let (solution, records) = solve(&s, &scan(), &weights)?;
+        let (solution, records) = solve_from(&weights, &s, &scan())?;
         Ok((solution, records.iter().map(|r| r.loss.unwrap()).collect()))
     };
     let fresh = model(run(&s, 0).unwrap().0);
@@ -416,8 +352,8 @@ fn masked_channels_leave_the_work() {
     // Fine levels hardly train in a pass and stay as random as they started.
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
     s["callbacks"] = json!([{"type": "rollback"}, mask]);
-    let whole = crate::common::pipeline(&spec(&s).unwrap());
-    let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let whole = pipeline(&s);
+    let (solution, records) = solve(&s, &scan()).unwrap();
     let model = model(solution);
     let p = &model.pipeline;
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
@@ -456,7 +392,7 @@ fn channels_finer_than_the_data_leave_the_work() {
     // A mask that has its own say afterwards.
     s["callbacks"] = json!([{"type": "fft-mask", "keep": [0, 1, 2, 3, 4, 5, 6, 9]}]);
     s["scene"] = json!({"levels": "needed"});
-    let (solution, records) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve(&s, &scan()).unwrap();
     assert_eq!(records.iter().flat_map(|r| &r.events).count(), 1);
     let field = solution.result.field().unwrap();
     let masks = field.placement().masks;
@@ -466,18 +402,14 @@ fn channels_finer_than_the_data_leave_the_work() {
     assert!(names.contains(&"encoder.3.table") && !names.contains(&"encoder.4.table"), "{names:?}");
 
     // It comes back from its weights.
-    let weights = Weights::from_arena(field.model.pipeline.layout(), &field.model.arena.params, |_| true);
-    let again = restored(&s, &field.placement(), &mut |model| {
-        weights.load("test", model.pipeline.layout(), &mut model.arena.params, |_| true).map(drop)
-    })
-    .unwrap();
+    let again = restored(&s, field);
     let values = Volume::collect(&mut again.voxels(&Cpu::new(), again.scene.grid).unwrap()).unwrap();
     assert_eq!(bits(values.data.as_slice().unwrap()), bits(volume(&solution).data.as_slice().unwrap()));
 
     // A grid that is coarser than the data keeps all.
     s["encoder"]["levels"] = json!(3);
     s["callbacks"] = json!([]);
-    let (solution, _) = solve(&s, &scan(), &Weights::default()).unwrap();
+    let (solution, _) = solve(&s, &scan()).unwrap();
     assert!(solution.result.field().unwrap().placement().masks.is_empty());
 }
 
@@ -487,12 +419,12 @@ fn a_step_in_voxels_is_one_in_millimetres() {
     let run = |projector: Value| {
         let mut s = s.clone();
         s["projector"] = projector;
-        bits(&model(solve(&s, &scan(), &Weights::default()).unwrap().0).arena.params)
+        bits(&model(solve(&s, &scan()).unwrap().0).arena.params)
     };
     let voxels = run(json!({"type": "ray-march", "step_voxels": 1.5}));
     assert_eq!(voxels, run(json!({"type": "ray-march", "step_mm": 15.0})));
     assert_ne!(voxels, run(json!({"type": "ray-march", "step_mm": 10.0})));
     s["projector"] = json!({"type": "ray-march", "step_voxels": 1.5, "step_mm": 2.0});
-    let e = solve(&s, &scan(), &Weights::default()).err().unwrap().to_string();
+    let e = solve(&s, &scan()).err().unwrap().to_string();
     assert!(e.contains("projector.step_voxels"), "{e}");
 }

@@ -1,15 +1,13 @@
 //! Places: projection against double precision, all other work against the host, what moves, and classical methods against
 //! the CPU.
 
-use crate::common::{Stop, plan, scan, solve_on, spec, truth};
+use crate::common::{Heard, In, apart, decibels, planned, protocol, psnr, scan, solve_on, truth, voxels};
 use crate::ranks::rms;
 use conefield_backend_cpu::Cpu;
-use conefield_core::arena::Weights;
-use conefield_core::backend::{Backend, Executable, Explain};
+use conefield_core::backend::Backend;
 use conefield_core::data_term::DataTermSpec;
 use conefield_core::geometry::Geometry;
-use conefield_core::method::{Job, Observer, Record};
-use conefield_core::pipeline::Pipeline;
+use conefield_core::method::Job;
 use conefield_core::place::{Array, Host, Map, Place, ProximalStep, Reduction, StatePart, Streamed, Weighing};
 use conefield_core::random::{mix, unit};
 use conefield_core::regularizer::{Bounds, Dual, Kernels, Penalty, RegularizerSpec};
@@ -17,7 +15,7 @@ use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::space::Space;
 use conefield_core::voxel::{VoxelOperator, VoxelProjector, VoxelProjectorSpec};
 use conefield_core::wgsl::Fragment;
-use conefield_projectors::simulate::{Protocol, simulate};
+use conefield_projectors::simulate::simulate;
 use conefield_solvers::iterative::tv::descend;
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, s};
 use serde_json::{Value, json};
@@ -53,12 +51,6 @@ fn numbers(shape: impl Into<[usize; 3]>, seed: u64) -> Array3<f64> {
     })
 }
 
-/// Largest difference as a share of the largest number.
-fn off(found: &Array3<f32>, exact: &Array3<f64>) -> f64 {
-    let top = exact.iter().fold(1e-30f64, |m, v| m.max(v.abs()));
-    found.iter().zip(exact).map(|(a, b)| (f64::from(*a) - b).abs() / top).fold(0.0, f64::max)
-}
-
 /// Positions along a ray are rounded to 2⁻²⁴ of the source's distance in voxels, and weights of neighbouring voxels with
 /// them: some 1e-5 of a voxel. An exact length may begin at the other side of a wall, with next to no length.
 const LIMIT: f64 = 5e-5;
@@ -90,7 +82,7 @@ fn errors(place: &dyn Place, p: &dyn VoxelProjector, g: &Geometry) -> conefield_
     let dot =
         |a: &Array3<f32>, b: &Array3<f32>| -> f64 { a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum() };
     let (lhs, rhs) = (dot(&found, &y32), dot(&x32, &back.mapv(|v| v - 1.0)));
-    Ok([off(&found, &ax), off(&back, &aty), (lhs - rhs).abs() / lhs])
+    Ok([apart(&found, &ax), apart(&back, &aty), (lhs - rhs).abs() / lhs])
 }
 
 /// The host, and the device with several limits.
@@ -118,8 +110,8 @@ fn projectors_agree_with_double_precision_and_are_adjoint() {
 }
 
 /// A projector whose WGSL is another's, changed.
-struct Changed(Box<dyn VoxelProjector>, fn(&str) -> Option<String>);
-impl VoxelProjector for Changed {
+struct ChangedWalk(Box<dyn VoxelProjector>, fn(&str) -> Option<String>);
+impl VoxelProjector for ChangedWalk {
     fn operator(&self) -> &dyn VoxelOperator<f32> {
         self.0.operator()
     }
@@ -138,7 +130,7 @@ impl VoxelProjector for Changed {
 fn a_perturbed_walk_is_found_and_what_cannot_run_is_refused() {
     let Some((_, backend)) = crate::device::backends("negative controls").into_iter().next() else { return };
     let place = backend.place();
-    let changed = |change| Changed(projector(json!({"type": "joseph"})), change);
+    let changed = |change| ChangedWalk(projector(json!({"type": "joseph"})), change);
     let wrong = changed(|s| Some(s.replace("fa * fb * step", "fa * fb * 1.01 * step")));
     let [forward, adjoint, mismatch] = errors(place.as_ref(), &wrong, &geometry()).unwrap();
     assert!(forward > LIMIT && adjoint > LIMIT && mismatch < 1e-5, "{forward} {adjoint} {mismatch}");
@@ -184,7 +176,7 @@ fn maps_masks_and_reductions_are_those_of_the_host() {
         };
         let ((want, sums), (found, numbers)) = (on(&Host).unwrap(), on(place.as_ref()).unwrap());
         for (k, (want, found)) in want.iter().zip(&found).enumerate() {
-            let off = off(found, &want.mapv(f64::from));
+            let off = apart(found, want);
             assert!(off < 1e-6, "{name}, {k}: {off}");
         }
         assert!(sums[1] > 100.0 && sums[3] > 1000.0);
@@ -273,7 +265,7 @@ fn data_terms_are_those_of_the_host() {
                 let ((want, sums, values), (found, others, weighed)) =
                     (on(&Host).unwrap(), on(place.as_ref()).unwrap());
                 let case = format!("{name}, {}, {with_term} {masked} {weighted} {resident}", term.describe());
-                let off = [(&found, &want), (&weighed, &values)].map(|(a, b)| off(a, &b.mapv(f64::from)));
+                let off = [(&found, &want), (&weighed, &values)].map(|(a, b)| apart(a, b));
                 assert!(off[0] < 1e-5 && off[1] < 1e-5, "{case}: {off:?}");
                 for (want, found) in sums.iter().zip(others) {
                     assert!(*want > 0.1 && (found / want - 1.0).abs() < 1e-5, "{case}: {found} and {want}");
@@ -337,7 +329,7 @@ fn updates_differ(
     let host: Arc<dyn Place> = Arc::new(Host);
     let (want, found) = (run(&host, on(&host)?)?, run(place, change(on(place)?))?);
     assert_eq!(want.len(), found.len());
-    Ok(want.iter().zip(&found).map(|(want, found)| off(found, &want.mapv(f64::from))).fold(0.0, f64::max))
+    Ok(want.iter().zip(&found).map(|(want, found)| apart(found, want)).fold(0.0, f64::max))
 }
 
 #[test]
@@ -354,22 +346,16 @@ fn updates_in_a_place_are_those_of_the_host() {
             for which in (0..8).map(|k| [1, 2, 4].map(|bit| k & bit != 0)) {
                 let [pulled, masked, bounded] = which;
                 for tau in [0.0, 0.2] {
-                    let off = updates_differ(&place, prior, which, tau, |p| p).unwrap();
-                    println!(
-                        "{}, pull {pulled}, mask {masked}, bounds {bounded}, weight {tau}, {name}: {off:.1e}",
-                        prior["type"]
-                    );
-                    assert!(
-                        off < LIMIT,
-                        "{prior}, pull {pulled}, mask {masked}, bounds {bounded}, weight {tau}, {name}: {off}"
-                    );
+                    let what = format!("{prior}, pull {pulled}, mask {masked}, bounds {bounded}, weight {tau}, {name}");
+                    let agrees = |change| {
+                        let off = updates_differ(&place, prior, which, tau, change).unwrap();
+                        println!("{what}: {off:.1e}");
+                        assert!(off < LIMIT, "{what}: {off}");
+                    };
+                    agrees(|p| p);
                     // On the host in between, as a penalty without WGSL; the arrays of others are on the device.
                     if place.device().is_none() || prior["type"] == "none" {
-                        let off = updates_differ(&place, prior, which, tau, |p| Box::new(OnHost(p))).unwrap();
-                        assert!(
-                            off < LIMIT,
-                            "{prior}, pull {pulled}, mask {masked}, bounds {bounded}, weight {tau}, {name}: {off}"
-                        );
+                        agrees(|p| Box::new(Changed(p, |_| None)));
                     }
                 }
             }
@@ -377,9 +363,9 @@ fn updates_in_a_place_are_those_of_the_host() {
     }
 }
 
-/// A penalty without kernels.
-struct OnHost(Box<dyn Penalty>);
-impl Penalty for OnHost {
+/// A penalty whose WGSL is changed, or left out.
+struct Changed(Box<dyn Penalty>, fn(&str) -> Option<String>);
+impl Penalty for Changed {
     fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
         self.0.value(x)
     }
@@ -395,28 +381,14 @@ impl Penalty for OnHost {
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         self.0.state()
     }
-}
-
-/// A penalty whose WGSL is changed.
-struct Rewritten(Box<dyn Penalty>, fn(&str) -> String);
-impl Penalty for Rewritten {
-    fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
-        self.0.value(x)
-    }
-    fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
-        self.0.prox(v, tau, u);
-    }
-    fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
-        self.0.state()
-    }
     fn kernels(&mut self) -> Option<Kernels<'_>> {
-        let change = self.1;
-        self.0.kernels().map(|kernels| match kernels {
+        match self.0.kernels()? {
             Kernels::Dual(dual) => {
-                Kernels::Dual(Dual { fragment: Fragment { source: change(&dual.fragment.source) }, ..dual })
+                let source = self.1(&dual.fragment.source)?;
+                Some(Kernels::Dual(Dual { fragment: Fragment { source }, ..dual }))
             }
-            Kernels::Clip(bounds) => Kernels::Clip(bounds),
-        })
+            Kernels::Clip(bounds) => self.1("").map(|_| Kernels::Clip(bounds)),
+        }
     }
 }
 
@@ -425,11 +397,11 @@ fn a_perturbed_prior_is_found_and_one_without_wgsl_travels() {
     let Some((_, backend)) = crate::device::backends("negative controls").into_iter().next() else { return };
     let (place, prior) = (backend.place(), json!({"type": "total-variation"}));
     let differ = |change| updates_differ(&place, &prior, [false; 3], 0.2, change);
-    let wrong = differ(|p| Box::new(Rewritten(p, |s| s.replace("p + d", "p + 1.01 * d"))));
+    let wrong = differ(|p| Box::new(Changed(p, |s| Some(s.replace("p + d", "p + 1.01 * d")))));
     assert!(wrong.unwrap() > LIMIT);
-    let wrong = differ(|p| Box::new(Rewritten(p, |s| s.replace("return length(d)", "return 1.01 * length(d)"))));
+    let wrong = differ(|p| Box::new(Changed(p, |s| Some(s.replace("return length(d)", "return 1.01 * length(d)")))));
     assert!(wrong.unwrap() > LIMIT);
-    let e = differ(|p| Box::new(Rewritten(p, |s| s.replace("let q", "let r")))).unwrap_err().to_string();
+    let e = differ(|p| Box::new(Changed(p, |s| Some(s.replace("let q", "let r"))))).unwrap_err().to_string();
     assert!(e.contains("penalty") && e.contains("line"), "{e}");
 }
 
@@ -441,29 +413,20 @@ fn slopes_of_total_variation_are_those_of_the_host() {
         descend(place, &mut x, g, 0.5, 0.1, &mut work).unwrap();
         place.take(x).unwrap()
     };
-    let want = descended(&Host).mapv(f64::from);
-    assert!(off(&volume(shape, 4), &want) > 0.01);
+    let want = descended(&Host);
+    assert!(apart(&volume(shape, 4), &want) > 0.01);
     for (name, place) in places("slopes") {
-        let off = off(&descended(place.as_ref()), &want);
+        let off = apart(&descended(place.as_ref()), &want);
         assert!(off < 1e-5, "{name}: {off}");
     }
 }
 
-/// Keeps what a run notes.
-struct Notes(Vec<String>);
-impl Observer for Notes {
-    fn progress(&mut self, _: u64, _: f64, _: f64) {}
-    fn record(&mut self, _: &Record) {}
-    fn note(&mut self, line: &str) {
-        self.0.push(line.into());
-    }
-}
-
-fn notes(method: &Value, backend: &dyn Backend) -> Vec<String> {
-    let (scan, mut notes) = (scan(), Notes(vec![]));
-    let mut plan = plan(&spec(method).unwrap(), backend, &Weights::default()).unwrap();
-    plan.run(&Job { seed: 7, ..Job::new(&scan, backend) }, &mut notes).unwrap();
-    notes.0
+/// What a run notes, and its volume.
+fn noted(method: &Value, scan: &Scan, backend: &dyn Backend) -> (Vec<String>, Array3<f32>) {
+    let mut heard = Heard::default();
+    let job = Job { seed: 7, ..Job::new(scan, backend) };
+    let solution = planned(method, backend).unwrap().run(&job, &mut heard).unwrap();
+    (heard.notes, solution.result.volume(backend).unwrap().data)
 }
 
 #[test]
@@ -473,42 +436,27 @@ fn volumes_stay_on_the_device_also_across_a_checkpoint() {
         "prior": {"type": "directional-total-variation"}, "scene": {"support": "carve"},
     });
     for (name, backend) in crate::device::backends("checkpoints of volumes") {
-        let said = notes(&method, backend);
+        let scan = scan();
+        let (said, whole) = noted(&method, &scan, backend);
         assert!(said.iter().any(|n| n.contains(", on ")), "{name}: {said:?}");
         assert!(!said.iter().any(|n| n.contains("runs on the CPU")), "{name}: {said:?}");
-        let scan = scan();
-        let mut plan = plan(&spec(&method).unwrap(), backend, &Weights::default()).unwrap();
+        let mut plan = planned(&method, backend).unwrap();
         let job = Job { seed: 7, ..Job::new(&scan, backend) };
-        let whole = plan.run(&job, &mut Notes(vec![])).unwrap().result.volume(backend).unwrap().data;
-        let mut stop = Stop::at(3);
-        let _ = plan.run(&job, &mut stop);
-        let kept = stop.kept.expect("a checkpoint");
+        let mut stopped = Heard::until(3);
+        let _ = plan.run(&job, &mut stopped);
+        let kept = stopped.kept.expect("a checkpoint");
         assert_eq!(kept.standing.step, 3);
         let resumed = Job { resume: Some(&kept), ..job };
-        let resumed = plan.run(&resumed, &mut Notes(vec![])).unwrap().result.volume(backend).unwrap().data;
-        let error = off(&resumed, &whole.mapv(f64::from));
+        let resumed = plan.run(&resumed, &mut Heard::default()).unwrap().result.volume(backend).unwrap().data;
+        let error = apart(&resumed, &whole);
         println!("{name}: {error:.1e}");
         assert!(error < 1e-4, "{name}: {error}");
         // A run that forgets its momentum ends elsewhere.
-        let (fresh, _) = solve_on(backend, &json!({"type": "chain", "methods": [
-            {"type": "fista", "basis": method["basis"], "stop": {"passes": 3}, "subsets": 4, "prior": method["prior"], "scene": method["scene"]},
-            {"type": "fista", "basis": method["basis"], "stop": {"passes": 3}, "subsets": 4, "prior": method["prior"], "scene": method["scene"]},
-        ]}), &scan, &Weights::default()).unwrap();
-        let fresh = fresh.result.volume(backend).unwrap().data;
-        assert!(off(&fresh, &whole.mapv(f64::from)) > 1e-3, "{name}");
+        let mut half = method.clone();
+        half["stop"]["passes"] = json!(3);
+        let fresh = voxels(backend, &json!({"type": "chain", "methods": [half, half]}), &scan).unwrap();
+        assert!(apart(&fresh, &whole) > 1e-3, "{name}");
     }
-}
-
-fn psnr(spec: &Value, backend: &dyn Backend) -> f64 {
-    let (solution, _) = solve_on(backend, spec, &scan(), &Weights::default()).unwrap();
-    let (found, truth) = (solution.result.volume(backend).unwrap(), truth());
-    let square = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).powi(2);
-    let mse = found.data.iter().zip(&truth.data).map(square).sum::<f64>() / truth.data.len() as f64;
-    decibels(mse)
-}
-
-fn decibels(mse: f64) -> f64 {
-    10.0 * (0.02f64.powi(2) / mse).log10()
 }
 
 #[test]
@@ -529,15 +477,15 @@ fn classical_methods_end_where_the_cpu_does() {
             "basis": {"type": "cubic", "spacing": 1.5}, "scene": {"support": "carve"}}),
     ];
     // On the CPU, wherever this runs: a method that makes next to nothing would agree with anything.
-    let empty = decibels(truth().data.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / truth().data.len() as f64);
-    let on_cpu: Vec<f64> = methods.iter().map(|m| psnr(m, &Cpu::new())).collect();
+    let empty = decibels(&Array3::zeros(truth().data.dim()), 1.0);
+    let on_cpu: Vec<f64> = methods.iter().map(|m| psnr(m, &Cpu::new()).0).collect();
     for (method, cpu) in methods.iter().zip(&on_cpu) {
         println!("{}: {cpu:.4} dB, an empty volume {empty:.4} dB", method["type"]);
         assert!(*cpu > empty + 3.0, "{method}: {cpu} dB, an empty volume {empty} dB");
     }
     for (name, backend) in crate::device::backends("classical methods") {
         for (method, cpu) in methods.iter().zip(&on_cpu) {
-            let found = psnr(method, backend);
+            let (found, _) = psnr(method, backend);
             println!("{}, {name}: {found:.4} dB, CPU {cpu:.4} dB", method["type"]);
             assert!((cpu - found).abs() < 0.01, "{method}, {name}: {found} dB, CPU {cpu} dB");
         }
@@ -550,18 +498,14 @@ pub fn larger() -> Scan {
         let d = [x as f32 - 19.5, y as f32 - 21.5, z as f32 - 23.5];
         f32::from(u8::from(d.iter().map(|v| v * v).sum::<f32>() < 300.0)) * 0.01
     });
-    let protocol: Protocol = serde_json::from_value(json!({
-        "dso": 500.0, "dsd": 750.0, "detector": [56, 64], "extent": {"side": [280.0, 280.0]},
-        "angles": {"even": {"views": 24}},
-    }))
-    .unwrap();
+    let protocol = protocol(json!({"detector": [56, 64], "angles": {"even": {"views": 24}}}));
     simulate(&Volume::centered(data, [4.0; 3]), &protocol).unwrap()
 }
 
 /// Bytes that a run moves to the device and from it.
 fn moved(method: &Value, scan: &Scan, backend: &dyn Backend) -> [f64; 2] {
     let before = backend.moved();
-    solve_on(backend, method, scan, &Weights::default()).unwrap();
+    solve_on(backend, method, scan).unwrap();
     let after = backend.moved();
     [after.to_device - before.to_device, after.from_device - before.from_device].map(|bytes| bytes as f64)
 }
@@ -613,18 +557,16 @@ fn a_pass_moves_scalars_and_a_run_its_views_and_its_volume() {
         }
         // The test sees what travels.
         let start = json!({"type": "sart", "subsets": 4, "stop": {"passes": 2, "patience": 1}});
-        let held_out = scan.clone();
         let before = backend.moved();
-        let mut plan = plan(&spec(&start).unwrap(), &backend, &Weights::default()).unwrap();
-        let job = Job { held_out: Some(&held_out), ..Job::new(&scan, &backend) };
-        plan.run(&job, &mut Notes(vec![])).unwrap();
+        let job = Job { held_out: Some(&scan), ..Job::new(&scan, &backend) };
+        planned(&start, &backend).unwrap().run(&job, &mut Heard::default()).unwrap();
         let down = (backend.moved().from_device - before.from_device) as f64;
         assert!(down > volume + 1.9 * views, "{name}: records of held-out views bring them down: {down}");
     }
 }
 
-/// A place that holds no array of more than `1` bytes.
-struct Little(u64);
+/// A place that holds no array of more bytes.
+pub struct Little(pub u64);
 
 impl Place for Little {
     fn device(&self) -> Option<String> {
@@ -645,21 +587,6 @@ impl Place for Little {
     }
 }
 
-/// A CPU with such a place.
-struct LittleCpu(u64);
-
-impl Backend for LittleCpu {
-    fn name(&self) -> &'static str {
-        "little"
-    }
-    fn compile(&self, pipeline: &Pipeline) -> conefield_core::Result<(Box<dyn Executable>, Explain)> {
-        Cpu::new().compile(pipeline)
-    }
-    fn place(&self) -> Arc<dyn Place> {
-        Arc::new(Little(self.0))
-    }
-}
-
 /// FDK makes its slabs as small as a place needs them, and gives the same bits; a place without room for the smallest
 /// one is told.
 #[test]
@@ -667,18 +594,15 @@ fn a_volume_larger_than_its_place_is_computed_in_slabs() {
     // Few views, whose images take less than the volume.
     let aside: Vec<usize> = (0..24).filter(|v| v % 3 > 0).collect();
     let (scan, _) = larger().split(&aside).unwrap();
-    let run = |backend: &dyn Backend| {
-        let (solution, _) = solve_on(backend, &json!({"type": "fdk"}), &scan, &Weights::default())?;
-        Ok::<_, conefield_core::Error>(solution.result.volume(backend)?.data)
-    };
+    let run = |backend: &dyn Backend| voxels(backend, &json!({"type": "fdk"}), &scan);
     let whole = run(&Cpu::new()).unwrap();
     let views = 4 * scan.projections.len() as u64;
     let volume = 4 * whole.len() as u64;
     assert!(whole.iter().any(|x| *x > 0.0) && views < volume, "{views} {volume}");
     for bytes in [views, volume - 1] {
-        assert!(run(&LittleCpu(bytes)).unwrap() == whole, "{bytes} bytes");
+        assert!(run(&In(Arc::new(Little(bytes)))).unwrap() == whole, "{bytes} bytes");
     }
-    let e = run(&LittleCpu(volume / 40)).unwrap_err().to_string();
+    let e = run(&In(Arc::new(Little(volume / 40)))).unwrap_err().to_string();
     assert!(e.contains("the place"), "{e}");
 }
 
@@ -718,22 +642,16 @@ fn a_device_without_room_for_the_arrays_ends_where_the_cpu_does() {
         json!({"type": "fista", "subsets": 4, "prior": {"type": "directional-total-variation"}, "stop": passes,
             "basis": {"type": "cubic", "spacing": 1.5}, "scene": {"support": "carve"}}),
     ];
-    let run = |method: &Value, backend: &dyn Backend| {
-        let (solution, _) = solve_on(backend, method, &scan, &Weights::default()).unwrap();
-        solution.result.volume(backend).unwrap().data
-    };
     // Half the volume, images, and twice half the volume for transfers.
     let Some(little) = crate::device::little(volume * 5 / 3) else { return };
-    let said = notes(&json!({"type": "sart", "stop": passes}), &little);
+    let (said, _) = noted(&json!({"type": "sart", "stop": passes}), &crate::common::scan(), &little);
     assert!(!said.iter().any(|n| n.contains("no room")), "small arrays fit: {said:?}");
     for method in &methods {
-        let mut notes = Notes(vec![]);
-        let mut plan = plan(&spec(method).unwrap(), &little, &Weights::default()).unwrap();
-        let found = plan.run(&Job::new(&scan, &little), &mut notes).unwrap().result.volume(&little).unwrap().data;
-        assert!(notes.0.iter().any(|n| n.contains("no room for 0.0 GiB")), "{method}: {:?}", notes.0);
+        let (said, found) = noted(method, &scan, &little);
+        assert!(said.iter().any(|n| n.contains("no room for 0.0 GiB")), "{method}: {said:?}");
         // Slabs add up in another order, and devices in no fixed one. Single voxels magnify that, where slopes of total
         // variation are next to 0; `asd-pocs` more than others, so that it is not among these methods.
-        let error = rms(&found, &run(method, &Cpu::new()));
+        let error = rms(&found, &voxels(&Cpu::new(), method, &scan).unwrap());
         println!("{}: {error:.1e}", method["type"]);
         assert!(error < 1e-5, "{method}: {error}");
     }

@@ -1,38 +1,22 @@
 //! Several processes share the arrays of a method: threads stand for them here.
 
-use crate::common::{Heard, Stop, plan, scan, solve_on, spec};
+use crate::common::{Heard, In, apart, planned, scan, voxels};
 use crate::device::{backends, little};
-use crate::places::larger;
+use crate::places::{Little, larger};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::Wgpu;
-use conefield_core::arena::Weights;
-use conefield_core::backend::{Backend, Executable, Explain};
+use conefield_core::backend::Backend;
 use conefield_core::checkpoint::{Checkpoint, Resume};
 use conefield_core::method::{Job, Observer, Record};
-use conefield_core::pipeline::Pipeline;
-use conefield_core::place::{Array, Host, Moved, Place, Ranks, Threads};
+use conefield_core::place::{Host, Moved, Place, Ranks, Threads};
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result};
-use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis};
+use ndarray::{Array3, Axis};
 use serde_json::{Value, json};
 use std::sync::Arc;
 
 /// The backend of a rank.
-struct Shared(Arc<Ranks>);
-
-impl Backend for Shared {
-    fn name(&self) -> &'static str {
-        "shared"
-    }
-
-    fn compile(&self, _: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {
-        Err(Error::unsupported("method", "a field"))
-    }
-
-    fn place(&self) -> Arc<dyn Place> {
-        self.0.clone()
-    }
-}
+type Shared = In<Ranks>;
 
 /// The results of `work` in each of `count` ranks on the host.
 fn each<T: Send>(count: usize, work: impl Fn(&Shared) -> T + Sync) -> Vec<T> {
@@ -42,20 +26,13 @@ fn each<T: Send>(count: usize, work: impl Fn(&Shared) -> T + Sync) -> Vec<T> {
 /// The results of `work` in each rank, whose arrays live in `places`.
 fn on<T: Send>(places: &[Arc<dyn Place>], work: impl Fn(&Shared) -> T + Sync) -> Vec<T> {
     let threads = Threads::new(places.len());
-    let all = threads.peers().zip(places).map(|(peers, place)| Shared(Arc::new(Ranks::new(peers, place.clone()))));
+    let all = threads.peers().zip(places).map(|(peers, place)| In(Arc::new(Ranks::new(peers, place.clone()))));
     let all: Vec<_> = all.collect();
     threads.run(|| Ok(work(&all[0])), |rank| Ok(work(&all[rank]))).unwrap()
 }
 
 fn volume(method: &Value, scan: &Scan, backend: &dyn Backend) -> Array3<f32> {
-    let (solution, _) = solve_on(backend, method, scan, &Weights::default()).unwrap();
-    solution.result.volume(backend).unwrap().data
-}
-
-/// Largest difference as a share of the largest number.
-fn off(found: &Array3<f32>, want: &Array3<f32>) -> f32 {
-    let top = want.iter().fold(0.0f32, |m, v| m.max(v.abs()));
-    found.iter().zip(want).map(|(a, b)| (a - b).abs() / top).fold(0.0, f32::max)
+    voxels(backend, method, scan).unwrap()
 }
 
 /// A chain on samples, as `smooth-tv` is one.
@@ -101,7 +78,7 @@ fn every_number_of_ranks_ends_where_one_does() {
         let want = volume(method, &scan, &Cpu::new());
         for count in [1, 2, 3, 7] {
             let found = each(count, |backend| volume(method, &scan, backend));
-            let error = off(&found[0], &want);
+            let error = apart(&found[0], &want);
             println!("{}, {count} ranks: {error:.1e}", method["type"]);
             assert!(error < 1e-5, "{method}, {count} ranks: {error}");
             assert!(found.iter().all(|x| *x == found[0]), "{method}: {count} ranks end at different volumes");
@@ -109,15 +86,15 @@ fn every_number_of_ranks_ends_where_one_does() {
         // The limit is far below what a lost plane changes.
         let mut lost = want.clone();
         lost.index_axis_mut(Axis(0), 7).fill(0.0);
-        assert!(off(&lost, &want) > 1e-2, "{method}");
+        assert!(apart(&lost, &want) > 1e-2, "{method}");
     }
 }
 
 /// Root mean square of the differences as a share of the largest number.
-pub fn rms(found: &Array3<f32>, want: &Array3<f32>) -> f32 {
+pub fn rms(found: &Array3<f32>, want: &Array3<f32>) -> f64 {
     let top = want.iter().fold(0.0f32, |m, v| m.max(v.abs()));
-    let squares: f32 = found.iter().zip(want).map(|(a, b)| ((a - b) / top).powi(2)).sum();
-    (squares / want.len() as f32).sqrt()
+    let squares: f64 = found.iter().zip(want).map(|(a, b)| f64::from((a - b) / top).powi(2)).sum();
+    (squares / want.len() as f64).sqrt()
 }
 
 /// Devices add atomically, in no fixed order: their volumes differ by rounding. Where slopes are next to 0, edges magnify
@@ -132,7 +109,7 @@ fn several_devices_end_where_one_does() {
             let want = volume(method, &scan, *one);
             let places: Vec<_> = some.iter().map(|(_, device)| device.place()).collect();
             let found = on(&places, |backend| volume(method, &scan, backend));
-            let error = [off(&found[0], &want), rms(&found[0], &want)];
+            let error = [apart(&found[0], &want), rms(&found[0], &want)];
             println!("{}, {} devices: {error:?}", method["type"], places.len());
             assert!(error[0] < 1e-4 && error[1] < 1e-5, "{method}, {} devices: {error:?}", places.len());
         }
@@ -196,9 +173,9 @@ fn a_limited_arc_is_the_same_for_ranks() {
     scan.projections.slice_axis_inplace(Axis(0), (..3).into());
     let method = |arc: f64| json!({"type": "fista", "stop": {"passes": 4}, "prior": {"type": "directional-total-variation", "arc": arc}});
     let want = volume(&method(0.3), &scan, &Cpu::new());
-    assert!(off(&volume(&method(1.0), &scan, &Cpu::new()), &want) > 1e-2, "the arc has an effect");
+    assert!(apart(&volume(&method(1.0), &scan, &Cpu::new()), &want) > 1e-2, "the arc has an effect");
     let found = each(3, |backend| volume(&method(0.3), &scan, backend));
-    assert!(off(&found[0], &want) < 1e-5);
+    assert!(apart(&found[0], &want) < 1e-5);
 }
 
 /// More ranks than planes of the volume or images of a subset.
@@ -210,7 +187,7 @@ fn a_rank_without_a_plane_takes_part() {
         let method = json!({"type": "fista", "prior": prior, "stop": {"passes": 3}});
         let want = volume(&method, &scan, &Cpu::new());
         let found = each(5, |backend| volume(&method, &scan, backend));
-        assert!(off(&found[4], &want) < 1e-5, "{prior}");
+        assert!(apart(&found[4], &want) < 1e-5, "{prior}");
     }
 }
 
@@ -220,22 +197,22 @@ fn another_number_of_ranks_goes_on_from_a_checkpoint() {
     let scan = scan();
     let want = volume(&method, &scan, &Cpu::new());
     let kept = each(3, |backend| {
-        let mut stop = Stop::at(3);
-        let mut plan = plan(&spec(&method).unwrap(), backend, &Weights::default()).unwrap();
-        let ended = plan.run(&Job { seed: 7, ..Job::new(&scan, backend) }, &mut stop);
+        let mut heard = Heard::until(3);
+        let job = Job { seed: 7, ..Job::new(&scan, backend) };
+        let ended = planned(&method, backend).unwrap().run(&job, &mut heard);
         assert!(matches!(ended, Err(Error::Interrupted { step: 3 })));
-        stop.kept.unwrap()
+        heard.kept.unwrap()
     });
     let resumed = |backend: &dyn Backend, resume: &Resume| {
-        let mut plan = plan(&spec(&method).unwrap(), backend, &Weights::default()).unwrap();
         let job = Job { seed: 7, resume: Some(resume), ..Job::new(&scan, backend) };
-        plan.run(&job, &mut Heard::default()).unwrap().result.volume(backend).unwrap().data
+        let solution = planned(&method, backend).unwrap().run(&job, &mut Heard::default()).unwrap();
+        solution.result.volume(backend).unwrap().data
     };
     // The leading rank's checkpoint is whole.
-    assert!(off(&resumed(&Cpu::new(), &kept[0]), &want) < 1e-5);
+    assert!(apart(&resumed(&Cpu::new(), &kept[0]), &want) < 1e-5);
     for count in [2, 3] {
         let found = each(count, |backend| resumed(backend, &kept[0]));
-        assert!(off(&found[0], &want) < 1e-5, "{count}");
+        assert!(apart(&found[0], &want) < 1e-5, "{count}");
     }
 }
 
@@ -245,23 +222,24 @@ fn ranks_stop_together() {
     let method = json!({"type": "sart", "stop": {"passes": 9}});
     let scan = scan();
     each(3, |backend| {
-        let mut stop = Stop::at(if backend.0.slab(3, 0).unwrap().own.contains(&1) { 2 } else { 100 });
-        let mut plan = plan(&spec(&method).unwrap(), backend, &Weights::default()).unwrap();
-        let ended = plan.run(&Job::new(&scan, backend), &mut stop);
+        let mut heard = Heard::until(if backend.0.slab(3, 0).unwrap().own.contains(&1) { 2 } else { 100 });
+        let ended = planned(&method, backend).unwrap().run(&Job::new(&scan, backend), &mut heard);
         assert!(matches!(ended, Err(Error::Interrupted { step: 2 })));
     });
 }
 
 /// An observer whose disk is full.
 struct Full {
-    stop: Stop,
+    /// The step after which the run stops.
+    at: u64,
+    step: u64,
     due: bool,
     warned: usize,
 }
 
 impl Observer for Full {
-    fn progress(&mut self, step: u64, share: f64, left: f64) {
-        self.stop.progress(step, share, left);
+    fn progress(&mut self, step: u64, _: f64, _: f64) {
+        self.step = step;
     }
     fn record(&mut self, _: &Record) {}
     fn note(&mut self, _: &str) {}
@@ -270,7 +248,7 @@ impl Observer for Full {
         self.warned += 1;
     }
     fn cancelled(&self) -> bool {
-        self.stop.cancelled()
+        self.step >= self.at
     }
     fn checkpoint_due(&self) -> bool {
         self.due
@@ -280,28 +258,11 @@ impl Observer for Full {
     }
 }
 
-/// A place with room for a few planes only.
-struct Small(usize);
-
-impl Place for Small {
-    fn device(&self) -> Option<String> {
-        None
-    }
-    fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
-        if shape[0] > self.0 { Err(Error::unsupported("memory", "none is left")) } else { Host.zeros(shape) }
-    }
-    fn load(&self, from: ArrayView3<'_, f32>, to: &mut Array, first: usize) -> Result<()> {
-        Host.load(from, to, first)
-    }
-    fn store(&self, from: &Array, first: usize, to: ArrayViewMut3<'_, f32>) -> Result<()> {
-        Host.store(from, first, to)
-    }
-}
-
 /// `fdk` tries smaller slabs where an array finds no room: all ranks must take the same ones.
 #[test]
 fn an_array_that_one_rank_has_no_room_for_is_refused_by_all() {
-    let places: Vec<Arc<dyn Place>> = vec![Arc::new(Host), Arc::new(Small(3)), Arc::new(Host)];
+    // Three planes of 2 × 2 numbers find room.
+    let places: Vec<Arc<dyn Place>> = vec![Arc::new(Host), Arc::new(Little(3 * 16)), Arc::new(Host)];
     for (planes, fits) in [(9, true), (12, false), (9, true)] {
         let made = on(&places, |backend| backend.place().zeros([planes, 2, 2]).is_ok());
         assert_eq!(made, [fits; 3], "{planes} planes");
@@ -316,9 +277,8 @@ fn a_checkpoint_without_room_is_an_error_where_the_run_ends() {
     let scan = scan();
     for method in [link, chain] {
         let run = |backend: &dyn Backend, at: u64, due: bool| {
-            let mut full = Full { stop: Stop::at(at), due, warned: 0 };
-            let mut plan = plan(&spec(&method).unwrap(), backend, &Weights::default()).unwrap();
-            let ended = plan.run(&Job::new(&scan, backend), &mut full).map(drop);
+            let mut full = Full { at, step: 0, due, warned: 0 };
+            let ended = planned(&method, backend).unwrap().run(&Job::new(&scan, backend), &mut full).map(drop);
             (ended, full.warned)
         };
         let (ended, warned) = run(&Cpu::new(), 100, true);
@@ -359,7 +319,7 @@ fn a_pass_sends_all_pixels_twice() {
 fn a_projector_of_samples_is_refused() {
     let method = json!({"type": "sart", "projector": {"type": "trilinear"}, "stop": {"passes": 1}});
     let scan = scan();
-    for said in each(2, |backend| solve_on(backend, &method, &scan, &Weights::default()).err().unwrap().to_string()) {
+    for said in each(2, |backend| voxels(backend, &method, &scan).unwrap_err().to_string()) {
         assert!(said.contains("projector") && said.contains("sums of those of slabs"), "{said}");
     }
 }

@@ -1,7 +1,7 @@
 //! Bounds of attenuation by region.
 
-use crate::common::{scan, solve, spec, truth};
-use conefield_core::arena::Weights;
+use crate::common::{scan, truth, voxels};
+use conefield_backend_cpu::Cpu;
 use conefield_core::scan::Scan;
 use ndarray::Array3;
 use serde_json::{Value, json};
@@ -15,8 +15,7 @@ fn within(mut method: Value, regions: &Value) -> Value {
 }
 
 fn volume(method: &Value, scan: &Scan) -> Array3<f32> {
-    let (solution, _) = solve(method, scan, &Weights::default()).unwrap();
-    solution.result.volume(&conefield_backend_cpu::Cpu::new()).unwrap().data
+    voxels(&Cpu::new(), method, scan).unwrap()
 }
 
 /// Sum of squares of the difference to the object.
@@ -120,10 +119,7 @@ fn regions_that_make_no_sense_are_refused() {
         (json!({"within": {"file": "mask.nii.gz"}}), "mask.nii.gz"),
     ] {
         let method = within(json!({"type": "sart", "stop": {"passes": 1}}), &json!([region]));
-        let error = match spec(&method) {
-            Err(e) => e,
-            Ok(_) => solve(&method, &scan, &Weights::default()).err().unwrap(),
-        };
+        let error = voxels(&Cpu::new(), &method, &scan).unwrap_err();
         assert!(error.to_string().contains(said), "{region}: {error}");
     }
 }

@@ -1,20 +1,23 @@
 //! The wgpu backend against the CPU's: whole steps, runs, masks, weights, checkpoints, refusals.
 
-use crate::common::{Heard, Stop, model, plan, psnr, scan, solve, solve_on, spec, truth};
+use crate::common::{Heard, apart, model, moved, pipeline, planned, point, psnr, rays, scan, solve, solve_on};
+use crate::pipeline::pretrained;
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
 use conefield_backend_cpu::step::Slots;
+use conefield_backend_wgpu::Wgpu;
+use conefield_conformance::{Options, check_projector_wgsl, check_wgsl};
 use conefield_core::Result;
-use conefield_core::arena::Weights;
 use conefield_core::backend::{Adam, Backend, BlockWork, TrainRay, Work};
 use conefield_core::loss::Loss;
-use conefield_core::method::{Job, Limits, PretrainJob, Record};
+use conefield_core::method::{Job, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::prior::Prior;
-use conefield_core::random::{mix, unit};
-use conefield_core::runner::Runner;
-use conefield_core::scene::Scene;
-use conefield_core::stage::{Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Scope, Stage};
+use conefield_core::random::mix;
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
+use conefield_core::stage::{
+    Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Samples, Scope, Stage, UnitRay,
+};
 use conefield_core::wgsl::Fragment;
 use conefield_solvers::losses::{Huber, L1, L2};
 use conefield_solvers::priors::TotalVariation;
@@ -31,19 +34,12 @@ fn settings() -> Value {
     })
 }
 
-fn place(i: u64) -> [f32; 3] {
-    std::array::from_fn(|k| 0.05 + 0.9 * unit(mix(i, k as u64)))
-}
-
 // ---- whole steps ----
 
 /// Largest difference, block by block as a share of the block's largest gradient.
 fn worst(pipeline: &Pipeline, found: &[f32], exact: &[f64]) -> f64 {
-    let of = |b: &conefield_core::arena::Block| {
-        let top = exact[b.range.clone()].iter().fold(1e-30f64, |m, g| m.max(g.abs()));
-        b.range.clone().map(|i| (f64::from(found[i]) - exact[i]).abs() / top).fold(0.0, f64::max)
-    };
-    pipeline.layout().blocks.iter().map(of).fold(0.0, f64::max)
+    let blocks = pipeline.layout().blocks.iter();
+    blocks.map(|b| apart(&found[b.range.clone()], &exact[b.range.clone()])).fold(0.0, f64::max)
 }
 
 /// Gradients and losses of a step with rays, points and blocks: double precision, the CPU, and every device. Sums of a
@@ -52,31 +48,17 @@ fn worst(pipeline: &Pipeline, found: &[f32], exact: &[f64]) -> f64 {
 fn steps_agree(settings: &Value) {
     let limit = 2e-5;
     let devices = crate::device::backends("whole steps");
-    let pipeline = crate::common::pipeline(&spec(settings).unwrap());
-    let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
-    let rays: Vec<TrainRay> = (0..40)
-        .map(|i| {
-            let ray = scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16);
-            TrainRay { ray, target: if i % 2 == 0 { 0.5 } else { 3.0 } }
-        })
-        .collect();
-    let points: Vec<_> = (0..150).map(|i| (place(i), if i % 2 == 0 { 0.7 } else { 4.0 })).collect();
-    let corners: Vec<_> = (200..208).map(|i| place(i).map(|x: f32| 0.7 * x)).collect();
+    let pipeline = pipeline(settings);
+    let rays = rays(40, |i| if i % 2 == 0 { 0.5 } else { 3.0 });
+    let points: Vec<_> = (0..150).map(|i| (point(i), if i % 2 == 0 { 0.7 } else { 4.0 })).collect();
+    let corners: Vec<_> = (200..208).map(|i| point(i).map(|x| 0.7 * x)).collect();
     let fine = TotalVariation { weight: 0.3, edge: 5, smoothing: 1e-2, ..TotalVariation::default() };
     let coarse = TotalVariation { weight: 0.2, edge: 4, smoothing: 3e-2, ..TotalVariation::default() };
     let priors = [
         BlockWork { prior: &fine, corners: &corners[..5], spacing: [0.06, 0.05, 0.07] },
         BlockWork { prior: &coarse, corners: &corners[5..], spacing: [0.1; 3] },
     ];
-    let filled = || {
-        let mut model = Model::random(crate::common::pipeline(&spec(settings).unwrap()), 3);
-        for (i, p) in model.arena.params.iter_mut().enumerate() {
-            *p += 0.4 * (unit(mix(5, i as u64)) - 0.5);
-        }
-        model
-    };
-    let params: Vec<f64> = filled().arena.params.iter().map(|&p| f64::from(p)).collect();
+    let params: Vec<f64> = moved(&pipeline).arena.params.iter().map(|&p| f64::from(p)).collect();
     let losses: [&dyn Loss; 3] = [&L1 {}, &L2 {}, &Huber { delta: 0.5 }];
     for (k, loss) in losses.into_iter().enumerate() {
         let text = loss.describe();
@@ -86,7 +68,7 @@ fn steps_agree(settings: &Value) {
         let projector = pipeline.projector.as_ref();
         let want = Slots::new(&kernels).step(&kernels, projector, &params, &mut exact, &work);
         let on = |backend: &dyn Backend| {
-            let mut model = filled();
+            let mut model = moved(&pipeline);
             let mut exe = backend.compile(&model.pipeline).unwrap().0;
             let stats = exe.step(&mut model, &work).unwrap();
             exe.fetch(&mut model).unwrap();
@@ -154,14 +136,10 @@ fn a_step_is_that_of_the_cpu_without_parameters_in_the_encoder() {
 /// Updates, values at points, features and line integrals after some steps.
 #[test]
 fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
-    let scan = scan();
-    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
-    let rays: Vec<TrainRay> = (0..64)
-        .map(|i| TrainRay { ray: scene.pixel_ray(&scan.geometry, i % 8, (i * 5) % 16, (i * 7) % 16), target: 0.7 })
-        .collect();
-    let points: Vec<[f32; 3]> = (0..5000).map(place).collect();
+    let rays = rays(64, |_| 0.7);
+    let points: Vec<[f32; 3]> = (0..5000).map(point).collect();
     let run = |backend: &dyn Backend| {
-        let mut model = Model::random(crate::common::pipeline(&spec(&settings()).unwrap()), 3);
+        let mut model = Model::random(pipeline(&settings()), 3);
         let mut exe = backend.compile(&model.pipeline).unwrap().0;
         for step in 1..=10 {
             let work = Work { step, seed: 9, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
@@ -182,8 +160,7 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
         for (what, (found, want)) in
             ["values", "features", "lines", "parameters"].iter().zip(run(backend).iter().zip(&want))
         {
-            let top = want.iter().fold(0.0f32, |m, v| m.max(v.abs()));
-            let e = found.iter().zip(want).map(|(a, b)| (a - b).abs()).fold(0.0f32, f32::max) / top;
+            let e = apart(found, want);
             println!("{name}: {what} {e:.1e}");
             // Adam divides by the root of the second moment, which makes of rounding in a tiny gradient a step.
             assert!(e < 2e-3, "{name}: {what} off by {e:e}");
@@ -194,7 +171,7 @@ fn what_is_asked_of_a_trained_model_is_that_of_the_cpu() {
 // ---- runs ----
 
 #[test]
-fn a_run_with_held_out_views_and_a_prior_ends_where_the_cpu_does() {
+fn a_run_with_a_prior_ends_where_the_cpu_does() {
     let mut s = settings();
     s["priors"] = json!([{"type": "total-variation", "weight": 0.01, "blocks": 4, "edge": 4}]);
     let (want, records) = psnr(&s, &Cpu::new());
@@ -216,12 +193,12 @@ fn masked_channels_leave_the_kernels() {
     s["encoder"]["base_resolution"] = json!(2);
     let mask = json!({"type": "fft-mask", "epoch": 1, "rule": "relative", "threshold": 0.72});
     s["callbacks"] = json!([{"type": "rollback"}, mask]);
-    let (solution, records) = solve_on(backend, &s, &scan(), &Weights::default()).unwrap();
+    let (solution, records) = solve_on(backend, &s, &scan()).unwrap();
     let events: Vec<&String> = records.iter().flat_map(|r| &r.events).collect();
     assert_eq!(events.len(), 1, "{events:?}");
     let kept = model(solution).pipeline.encoder.info().output;
     assert!((1..12).contains(&kept), "{kept}");
-    let on_cpu = model(solve(&s, &scan(), &Weights::default()).unwrap().0).pipeline.encoder.info().output;
+    let on_cpu = model(solve(&s, &scan()).unwrap().0).pipeline.encoder.info().output;
     assert_eq!(kept, on_cpu);
     assert!(records.last().unwrap().loss.unwrap() < records[1].loss.unwrap());
 }
@@ -230,20 +207,10 @@ fn masked_channels_leave_the_kernels() {
 fn pretraining_on_several_volumes_is_that_of_the_cpu() {
     let mut s = settings();
     s["pretraining"]["points"] = json!(512);
-    let spec = spec(&s).unwrap();
-    let volumes = [truth(), truth().mapped(|x| 3.0 * x)];
-    let run = |backend: &dyn Backend| {
-        let limits = Limits { steps: Some(60), ..Limits::default() };
-        let job = PretrainJob { volumes: &volumes, backend, seed: 21, limits };
-        let mut heard = Heard::default();
-        let model = plan(&spec, backend, &Weights::default()).unwrap().pretrain(&job, &mut heard).unwrap();
-        let losses: Vec<f64> = heard.0.iter().map(|r| r.loss.unwrap()).collect();
-        (losses, model.arena.params.to_vec())
-    };
-    let (want, _) = run(&Cpu::new());
+    let (_, want) = pretrained(&s, &Cpu::new());
     for (name, backend) in crate::device::backends("pretraining").into_iter().take(1) {
-        let (found, params) = run(backend);
-        assert!(params.iter().all(|p| p.is_finite()));
+        let (model, found) = pretrained(&s, backend);
+        assert!(model.arena.params.iter().all(|p| p.is_finite()));
         for (a, b) in found.iter().zip(&want) {
             assert!((a - b).abs() < 0.02 * b, "{name}: {found:?} {want:?}");
         }
@@ -253,23 +220,24 @@ fn pretraining_on_several_volumes_is_that_of_the_cpu() {
 #[test]
 fn a_run_begun_on_one_backend_goes_on_on_the_other() {
     let Some((_, device)) = crate::device::backends("checkpoints").into_iter().next() else { return };
-    let (scan, spec) = (scan(), spec(&settings()).unwrap());
+    let scan = scan();
     let whole = psnr(&settings(), &Cpu::new()).1.last().unwrap().loss.unwrap();
     let cpu = Cpu::new();
     let pairs: [[&dyn Backend; 2]; 3] = [[&cpu, device], [device, &cpu], [device, device]];
     for [first, second] in pairs {
-        let mut stop = Stop::at(20);
-        let planned = |backend| plan(&spec, backend, &Weights::default()).unwrap();
-        let stopped = planned(first).run(&Job { seed: 7, ..Job::new(&scan, first) }, &mut stop);
-        assert!(stopped.is_err());
-        let resume = stop.kept.unwrap();
+        let mut heard = Heard::until(20);
+        let run = |backend, resume, heard: &mut Heard| {
+            planned(&settings(), backend).unwrap().run(&Job { seed: 7, resume, ..Job::new(&scan, backend) }, heard)
+        };
+        assert!(run(first, None, &mut heard).is_err());
+        let resume = heard.kept.unwrap();
         assert_eq!(resume.standing.step, 20);
         let mut heard = Heard::default();
-        let job = Job { seed: 7, resume: Some(&resume), ..Job::new(&scan, second) };
-        planned(second).run(&job, &mut heard).unwrap();
-        let loss = heard.0.last().unwrap().loss.unwrap();
+        run(second, Some(&resume), &mut heard).unwrap();
+        let last = heard.records.last().unwrap();
+        let loss = last.loss.unwrap();
         assert!((loss - whole).abs() < 0.03 * whole, "{} then {}: {loss}, {whole}", first.name(), second.name());
-        assert_eq!(heard.0.last().unwrap().step, 40);
+        assert_eq!(last.step, 40);
     }
 }
 
@@ -326,7 +294,7 @@ impl Loss for OnTheCpu {
 }
 
 fn changed(change: fn(String) -> Option<String>, scope: Scope) -> Pipeline {
-    let mut pipeline = crate::common::pipeline(&spec(&settings()).unwrap());
+    let mut pipeline = pipeline(&settings());
     pipeline.field = Arc::new(Changed { inner: pipeline.field, change, scope });
     pipeline
 }
@@ -362,7 +330,7 @@ fn what_cannot_run_on_a_device_is_refused_in_words() {
     assert!(exe.admits(&L2 {}, &blocks).is_ok());
     let e = exe.admits(&OnTheCpu, &blocks).err().unwrap().to_string();
     assert!(["loss (cubes)", "no WGSL", "--backend cpu"].iter().all(|w| e.contains(w)), "{e}");
-    let e = conefield_backend_wgpu::Wgpu::open(Some(99)).err().unwrap().to_string();
+    let e = Wgpu::open(Some(99)).err().unwrap().to_string();
     assert!(e.contains("99") && e.contains("conefield backends"), "{e}");
 }
 
@@ -372,12 +340,12 @@ fn what_cannot_run_on_a_device_is_refused_in_words() {
 #[test]
 fn a_perturbed_constant_fails_the_parity_check() {
     let Some(shared) = crate::device::shared("negative controls") else { return };
-    let options = conefield_conformance::Options::features();
+    let options = Options::features();
     let check = |change: fn(String) -> Option<String>| {
         let settings = json!({"type": "mlp", "width": 5, "depth": 2, "skips": []});
-        let spec: Box<dyn conefield_core::settings::FieldSpec> = serde_json::from_value(settings).unwrap();
+        let spec: Box<dyn FieldSpec> = serde_json::from_value(settings).unwrap();
         let stage = Changed { inner: Arc::from(spec.build(3).unwrap()), change, scope: Scope::Row };
-        conefield_conformance::check_wgsl(&stage, &options, &|s, p, x, dy, rows| shared.pass(s, p, x, dy, rows))
+        check_wgsl(&stage, &options, &*shared)
     };
     assert!(check(Some).passed());
     let perturbed: [fn(String) -> Option<String>; 4] = [
@@ -396,7 +364,10 @@ fn a_perturbed_constant_fails_the_parity_check() {
 #[test]
 fn stages_of_random_shapes_agree() {
     let Some(shared) = crate::device::shared("random shapes") else { return };
-    let pass = |s: &dyn Stage, p: &[f32], x: &[f32], dy: &[f32], rows: usize| shared.pass(s, p, x, dy, rows);
+    let agrees = |what: &str, stage: &dyn Stage, options: &Options| {
+        let report = check_wgsl(stage, options, &*shared);
+        assert!(report.passed(), "{what}: {report}");
+    };
     let mut n = 0u64;
     let mut below = |k: u64| {
         n += 1;
@@ -408,29 +379,21 @@ fn stages_of_random_shapes_agree() {
             "levels": 1 + below(4), "features": 1 << below(3), "base_resolution": 2 + below(5),
             "growth": 1.0 + below(10) as f64 / 10.0,
         });
-        let spec: Box<dyn conefield_core::settings::EncoderSpec> = serde_json::from_value(grid.clone()).unwrap();
+        let spec: Box<dyn EncoderSpec> = serde_json::from_value(grid.clone()).unwrap();
         let whole: Box<dyn Encoder> = spec.build().unwrap();
         let keep: Vec<usize> = (0..whole.info().output).filter(|_| below(3) > 0).collect();
         let stage = if keep.is_empty() { whole } else { whole.keep_outputs(&keep).unwrap().stage };
-        let options = conefield_conformance::Options {
-            rows: 1 + below(20) as usize,
-            single: 5e-5,
-            ..conefield_conformance::Options::encoder()
-        };
-        let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);
-        assert!(report.passed(), "{grid}: {report}");
+        let options = Options { rows: 1 + below(20) as usize, single: 5e-5, ..Options::encoder() };
+        agrees(&grid.to_string(), stage.as_ref(), &options);
     }
     for _ in 0..3 {
         let width = 2 + below(36) as usize;
-        let spec: Box<dyn conefield_core::settings::NormalizerSpec> =
-            serde_json::from_value(json!({"type": "layer-norm"})).unwrap();
+        let spec: Box<dyn NormalizerSpec> = serde_json::from_value(json!({"type": "layer-norm"})).unwrap();
         let norm: Box<dyn Normalizer> = spec.build(width).unwrap();
         let keep: Vec<usize> = (0..width).filter(|c| *c == 0 || below(3) > 0).collect();
         let stage = norm.keep_inputs(&keep).unwrap().stage;
-        let options =
-            conefield_conformance::Options { params: Some(1.0), ..conefield_conformance::Options::features() };
-        let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);
-        assert!(report.passed(), "layer-norm of {width}, {keep:?}: {report}");
+        let options = Options { params: Some(1.0), ..Options::features() };
+        agrees(&format!("layer-norm of {width}, {keep:?}"), stage.as_ref(), &options);
     }
     for _ in 0..3 {
         let depth = 1 + below(3);
@@ -438,11 +401,10 @@ fn stages_of_random_shapes_agree() {
         let activation = ["relu", "leaky-relu", "gelu", "squareplus", "softplus", "sigmoid"][below(6) as usize];
         let mlp =
             json!({"type": "mlp", "width": 1 + below(11), "depth": depth, "skips": skips, "activation": activation});
-        let spec: Box<dyn conefield_core::settings::FieldSpec> = serde_json::from_value(mlp.clone()).unwrap();
+        let spec: Box<dyn FieldSpec> = serde_json::from_value(mlp.clone()).unwrap();
         let stage = spec.build(1 + below(9) as usize).unwrap();
-        let options = conefield_conformance::Options { single: 5e-5, ..conefield_conformance::Options::features() };
-        let report = conefield_conformance::check_wgsl(stage.as_ref(), &options, &pass);
-        assert!(report.passed(), "{mlp}: {report}");
+        let options = Options { single: 5e-5, ..Options::features() };
+        agrees(&mlp.to_string(), stage.as_ref(), &options);
     }
 }
 
@@ -451,15 +413,10 @@ fn samples_are_random_in_the_same_way() {
     let Some(shared) = crate::device::shared("samples") else { return };
     struct Off(Box<dyn Projector>);
     impl Projector for Off {
-        fn max_samples(&self, ray: &conefield_core::stage::UnitRay) -> usize {
+        fn max_samples(&self, ray: &UnitRay) -> usize {
             self.0.max_samples(ray)
         }
-        fn sample(
-            &self,
-            ray: &conefield_core::stage::UnitRay,
-            seed: Option<u64>,
-            out: &mut conefield_core::stage::Samples,
-        ) {
+        fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples) {
             self.0.sample(ray, seed, out);
         }
         fn describe(&self) -> String {
@@ -469,9 +426,8 @@ fn samples_are_random_in_the_same_way() {
             Some(Fragment { source: self.0.wgsl()?.source.replace("0.5", "0.49") })
         }
     }
-    let spec: Box<dyn conefield_core::settings::ProjectorSpec> =
-        serde_json::from_value(json!({"type": "ray-march", "samples": 77})).unwrap();
-    let run = |p: &dyn Projector| conefield_conformance::check_projector_wgsl(p, &|p, rays| shared.samples(p, rays));
+    let spec: Box<dyn ProjectorSpec> = serde_json::from_value(json!({"type": "ray-march", "samples": 77})).unwrap();
+    let run = |p: &dyn Projector| check_projector_wgsl(p, &*shared);
     assert!(run(spec.build().unwrap().as_ref()).passed());
     assert!(!run(&Off(spec.build().unwrap())).passed());
 }

@@ -4,13 +4,12 @@
 
 use super::{Foreign, call, make, said};
 use crate::library::{self, Handle, Type};
-use crate::trial::{UNTOUCHED, timed};
+use crate::trial::{Marked, timed};
 use conefield_core::arena::Block;
 use conefield_core::prelude::*;
 use conefield_core::settings::KnownVolume;
 use conefield_plugin_abi::*;
 use serde_json::Value;
-use std::ptr;
 use std::sync::Arc;
 
 /// An initializer from a library.
@@ -55,7 +54,7 @@ fn named(
     call: &str,
     ask: impl FnOnce(&mut ConefieldStr) -> Option<ConefieldStatus>,
 ) -> Result<Option<String>> {
-    let mut path = ConefieldStr { data: ptr::null(), length: 0 };
+    let mut path = ConefieldStr::of("");
     match ask(&mut path) {
         None | Some(CONEFIELD_UNSUPPORTED) => Ok(None),
         // SAFETY: the plugin guarantees that this many bytes are valid while the stage lives.
@@ -106,10 +105,10 @@ impl Initializer for InitializerStage {
         // A copy, so that errors do no harm.
         let n = arena.params.len();
         let mut params = arena.params.to_vec();
-        params.resize(n + GUARD, f32::from_bits(UNTOUCHED));
+        params.resize(n + GUARD, f32::MARK);
         let mut filled = vec![0u8; blocks.len()];
         call!(self.own, apply(blocks.as_ptr(), blocks.len(), params.as_mut_ptr(), n, filled.as_mut_ptr()))?;
-        if params[n..].iter().any(|v| v.to_bits() != UNTOUCHED) {
+        if params[n..].iter().any(|v| !v.is_mark()) {
             return Err(self.own.wrong("apply", "it writes past the parameters"));
         }
         let mut report = InitReport::default();

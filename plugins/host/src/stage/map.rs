@@ -4,7 +4,7 @@
 
 use super::{Foreign, ask, call, said};
 use crate::library::Handle;
-use crate::trial::{self, GUARD, UNTOUCHED_64};
+use crate::trial::{self, GUARD, Marked};
 use conefield_core::prelude::*;
 use conefield_core::registry::Kind;
 use conefield_plugin_abi::*;
@@ -55,7 +55,8 @@ impl MapStage {
         Ok(Self { own, info, said, passes, resolutions, parameters, partition })
     }
 
-    fn reduce(&self, side: u32, keep: &[usize]) -> Result<(Self, Vec<Range<usize>>, Vec<usize>)> {
+    /// The stage without channels on one side; `boxed` makes it one of its kind.
+    fn reduce<S: ?Sized>(&self, side: u32, keep: &[usize], boxed: fn(Self) -> Box<S>) -> Result<Reduced<S>> {
         let info = &self.info;
         let Some(reduce) = self.own.functions.reduce else {
             return Err(Error::unsupported(self.own.ty().words(), "it cannot leave out channels"));
@@ -94,7 +95,8 @@ impl MapStage {
             let expected = format!("what is kept to fit it, {} and {} channels", keep.len(), channels.len());
             return Err(Error::invalid(self.own.ty().words(), "reduce", found, expected));
         }
-        Ok((smaller, params, channels.to_vec()))
+        let channels = channels.to_vec();
+        Ok(Reduced { stage: boxed(smaller), params, channels })
     }
 }
 
@@ -165,11 +167,7 @@ fn parameters(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Para
     let mut names = BTreeSet::new();
     let mut start = 0usize;
     for index in 0..i.blocks {
-        let mut p = ConefieldParameter {
-            name: ConefieldStr { data: ptr::null(), length: 0 },
-            shape: ptr::null(),
-            dimensions: 0,
-        };
+        let mut p = ConefieldParameter { name: ConefieldStr::of(""), shape: ptr::null(), dimensions: 0 };
         // SAFETY: the stage is alive, `p` is writable.
         let status =
             own.functions.parameter.map_or(CONEFIELD_FAILED, |f| unsafe { f(own.handle.stage, index, &mut p) });
@@ -225,19 +223,18 @@ fn partition(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Range
 /// Resolution of each of `count` channels in cells, if the encoder reports it.
 fn resolutions(own: &Foreign<ConefieldMap>, count: usize) -> Result<Option<Vec<f64>>> {
     let Some(f) = own.functions.resolutions.filter(|_| own.ty().kind == Kind::Encoder) else { return Ok(None) };
-    let mut cells = vec![f64::from_bits(UNTOUCHED_64); count + GUARD];
+    let mut cells = vec![f64::MARK; count + GUARD];
     // SAFETY: the stage is alive, `cells` has room for more than `count`.
     if !own.asked("resolutions", |stage, error| unsafe { f(stage, cells.as_mut_ptr(), count, error) })? {
         return Ok(None);
     }
     let wrong = |what: String| Err(own.wrong("resolutions", &what));
-    let untouched = |v: &f64| v.to_bits() == UNTOUCHED_64;
-    if !cells[count..].iter().all(untouched) {
+    if !cells[count..].iter().all(|v| v.is_mark()) {
         return wrong(format!("it writes past the {count} channels that there are"));
     }
     cells.truncate(count);
     match cells.iter().position(|v| !(v.is_finite() && *v > 0.0)) {
-        Some(c) if untouched(&cells[c]) => wrong(format!("channel {c} of {count} is left unwritten")),
+        Some(c) if cells[c].is_mark() => wrong(format!("channel {c} of {count} is left unwritten")),
         Some(c) => wrong(format!("channel {c} of {count} resolves {} cells", cells[c])),
         None => Ok(Some(cells)),
     }
@@ -275,10 +272,7 @@ macro_rules! kernel {
             fn forward(&self, params: &[$real], x: Tile<'_, $real>, y: TileMut<'_, $real>, tape: TileMut<'_, $real>) {
                 let (rows, params) = (x.rows, params.as_ptr());
                 let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                if let Err(e) = call!(self.own, $forward(params, x, out, tape)) {
-                    self.own.fault.set(e);
-                    y.data.fill(<$real>::NAN);
-                }
+                self.own.filled(call!(self.own, $forward(params, x, out, tape)), y.data);
             }
 
             fn backward(
@@ -288,18 +282,18 @@ macro_rules! kernel {
                 tape: TileMut<'_, $real>,
                 dy: Tile<'_, $real>,
                 grads: Grads<'_, $real>,
-                mut dx: Option<TileMut<'_, $real>>,
+                dx: Option<TileMut<'_, $real>>,
             ) {
                 let (rows, params) = (x.rows, params.as_ptr());
-                let nowhere = $tile_mut { data: ptr::null_mut(), channels: 0, rows, stride: rows };
                 let (x, tape, dy) = (x.data.across(rows), tape.data.across(rows), dy.data.across(rows));
-                let to = dx.as_mut().map_or(nowhere, |dx| dx.data.across(rows));
+                let dx = dx.map(|dx| dx.data).unwrap_or_default();
+                let mut to: $tile_mut = dx.across(rows);
+                if dx.is_empty() {
+                    to.data = ptr::null_mut();
+                }
                 let (start, length) = (grads.range.start, grads.values.len());
                 let grads = $grads { data: grads.values.as_mut_ptr(), start, length };
-                if let Err(e) = call!(self.own, $backward(params, x, tape, dy, grads, to)) {
-                    self.own.fault.set(e);
-                    dx.iter_mut().for_each(|dx| dx.data.fill(<$real>::NAN));
-                }
+                self.own.filled(call!(self.own, $backward(params, x, tape, dy, grads, to)), dx);
             }
 
             $(
@@ -320,10 +314,7 @@ macro_rules! kernel {
                     }
                     let (rows, params) = (x.rows, params.as_ptr());
                     let (x, out, tape) = (x.data.across(rows), y.data.across(rows), tape.data.across(rows));
-                    if let Err(e) = call!(self.own, $forward_pass(pass, params, x, out, tape)) {
-                        self.own.fault.set(e);
-                        y.data.fill(<$real>::NAN);
-                    }
+                    self.own.filled(call!(self.own, $forward_pass(pass, params, x, out, tape)), y.data);
                 }
             )?
         }
@@ -365,8 +356,7 @@ impl Stage for MapStage {
 
 impl Encoder for MapStage {
     fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
-        let (stage, params, channels) = self.reduce(CONEFIELD_OUTPUTS, keep)?;
-        Ok(Reduced { stage: Box::new(stage), params, channels })
+        self.reduce(CONEFIELD_OUTPUTS, keep, |stage| Box::new(stage))
     }
 
     fn coarse_to_fine(&self) -> bool {
@@ -380,14 +370,12 @@ impl Encoder for MapStage {
 
 impl Field for MapStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Field>> {
-        let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
-        Ok(Reduced { stage: Box::new(stage), params, channels })
+        self.reduce(CONEFIELD_INPUTS, keep, |stage| Box::new(stage))
     }
 }
 
 impl Normalizer for MapStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
-        let (stage, params, channels) = self.reduce(CONEFIELD_INPUTS, keep)?;
-        Ok(Reduced { stage: Box::new(stage), params, channels })
+        self.reduce(CONEFIELD_INPUTS, keep, |stage| Box::new(stage))
     }
 }

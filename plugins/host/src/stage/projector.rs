@@ -4,7 +4,7 @@
 
 use super::{Foreign, call, make, raw_ray, said};
 use crate::library::Handle;
-use crate::trial;
+use crate::trial::{self, Marked};
 use conefield_core::prelude::*;
 use conefield_core::stage::Lengths;
 use conefield_plugin_abi::*;
@@ -37,9 +37,9 @@ impl ProjectorStage {
         if capacity == 0 {
             return Ok(());
         }
-        let (start, mark) = (out.points.len(), f32::from_bits(trial::UNTOUCHED));
-        out.points.resize(start + capacity + guard, [mark; 3]);
-        out.weights.resize(start + capacity + guard, mark);
+        let start = out.points.len();
+        out.points.resize(start + capacity + guard, [f32::MARK; 3]);
+        out.weights.resize(start + capacity + guard, f32::MARK);
         let done = self.fill(ray, seed, capacity, &mut out.points[start..], &mut out.weights[start..]);
         let n = *done.as_ref().unwrap_or(&0);
         out.points.truncate(start + n);
@@ -74,8 +74,7 @@ impl ProjectorStage {
         if count > capacity {
             return failed(&format!("{count} samples, more than its maximum of {capacity}"));
         }
-        let untouched = |v: f32| v.to_bits() == trial::UNTOUCHED;
-        if points[capacity..].iter().flatten().chain(&weights[capacity..]).any(|&v| !untouched(v)) {
+        if points[capacity..].iter().flatten().chain(&weights[capacity..]).any(|v| !v.is_mark()) {
             return failed(&format!("it writes past the {capacity} samples that there is room for"));
         }
         let bad = |i: &usize| !points[*i].iter().chain([&weights[*i]]).all(|v| v.is_finite());

@@ -96,14 +96,10 @@ impl PenaltyOn {
     /// Entry `index` of its state; `None` after the last.
     fn entry(&self, index: usize) -> Result<Option<ConefieldState>> {
         let Some(state) = self.own.functions.state else { return Ok(None) };
-        let name = ConefieldStr { data: ptr::null(), length: 0 };
-        let mut entry = ConefieldState { name, data: ptr::null_mut(), length: 0 };
+        let mut entry = ConefieldState { name: ConefieldStr::of(""), data: ptr::null_mut(), length: 0 };
         // SAFETY: the penalty is alive, `entry` is writable.
-        match unsafe { state(self.own.handle.stage, index, &mut entry) } {
-            CONEFIELD_OK => Ok(Some(entry)),
-            CONEFIELD_UNSUPPORTED => Ok(None),
-            status => Err(self.own.ty().failed("state", status, "")),
-        }
+        let known = self.own.asked("state", |penalty, _| unsafe { state(penalty, index, &mut entry) })?;
+        Ok(known.then_some(entry))
     }
 
     fn read_state(&self) -> Result<Vec<(String, usize)>> {
@@ -147,10 +143,8 @@ impl Penalty for PenaltyOn {
     }
 
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]) {
-        if let Err(e) = self.try_prox(v, tau, u) {
-            self.own.fault.set(e);
-            u.fill(f32::NAN);
-        }
+        let done = self.try_prox(v, tau, u);
+        self.own.filled(done, u);
     }
 
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {

@@ -1,72 +1,73 @@
 //! Bases and their expansions on a grid.
 
 use super::{array, array_mut, grid, guard, hand_over_on, shims, table};
-use crate::built::Built;
+use crate::built::OnGrid;
 use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
 
 table! { ConefieldBasis: on info expand adjoint expand_f64 adjoint_f64 }
 
+/// What a basis makes for one grid.
+type On = OnGrid<dyn Expansion>;
+
 shims! {
-    fn on(basis: basis, voxels: *const ConefieldGrid, expansion: *mut *mut c_void; error) {
+    fn on(basis: dyn Basis, voxels: *const ConefieldGrid, expansion: *mut *mut c_void; error) {
         let grid = grid(voxels);
         *expansion = hand_over_on(grid.shape, basis.on(&grid)?);
     }
 
-    fn info(expansion: expansion, out: *mut ConefieldExpansion) {
-        let VoxelGrid { shape, spacing, center } = expansion.coefficients();
+    fn info(on: On, out: *mut ConefieldExpansion) {
+        let VoxelGrid { shape, spacing, center } = on.part.coefficients();
         *out = ConefieldExpansion {
             coefficients: ConefieldGrid { shape, spacing, center },
-            scratch: expansion.scratch(),
-            samples: expansion.are_samples().into(),
-            double_precision: expansion.reference().is_some().into(),
+            scratch: on.part.scratch(),
+            samples: on.part.are_samples().into(),
+            double_precision: on.part.reference().is_some().into(),
         };
     }
 
-    fn expand(built: any, coefficients: *const f32, voxels: *mut f32; error) {
-        run_expand(built, built.expansion()?.operator(), coefficients, voxels)?;
+    fn expand(on: On, coefficients: *const f32, voxels: *mut f32; error) {
+        run_expand(on, on.part.operator(), coefficients, voxels)?;
     }
 
-    fn adjoint(built: any, voxels: *const f32, coefficients: *mut f32; error) {
-        run_adjoint(built, built.expansion()?.operator(), voxels, coefficients)?;
+    fn adjoint(on: On, voxels: *const f32, coefficients: *mut f32; error) {
+        run_adjoint(on, on.part.operator(), voxels, coefficients)?;
     }
 
-    fn expand_f64(built: any, coefficients: *const f64, voxels: *mut f64; error) {
-        run_expand(built, double(built.expansion()?)?, coefficients, voxels)?;
+    fn expand_f64(on: On, coefficients: *const f64, voxels: *mut f64; error) {
+        run_expand(on, double(on)?, coefficients, voxels)?;
     }
 
-    fn adjoint_f64(built: any, voxels: *const f64, coefficients: *mut f64; error) {
-        run_adjoint(built, double(built.expansion()?)?, voxels, coefficients)?;
+    fn adjoint_f64(on: On, voxels: *const f64, coefficients: *mut f64; error) {
+        run_adjoint(on, double(on)?, voxels, coefficients)?;
     }
 }
 
-fn double(expansion: &dyn Expansion) -> Result<&dyn BasisOperator<f64>> {
-    expansion.reference().ok_or_else(|| Error::unsupported("this basis", "it does not work in double precision"))
+fn double(on: &On) -> Result<&dyn BasisOperator<f64>> {
+    on.part.reference().ok_or_else(|| Error::unsupported("this basis", "it does not work in double precision"))
 }
 
 unsafe fn run_expand<R: Real>(
-    built: &Built,
+    on: &On,
     operator: &dyn BasisOperator<R>,
     coefficients: *const R,
     voxels: *mut R,
 ) -> Result<()> {
-    let expansion = built.expansion()?;
     // SAFETY: see `shims/mod.rs`.
-    let (from, to) = unsafe { (array(expansion.coefficients().shape, coefficients)?, array_mut(built.shape, voxels)?) };
+    let (from, to) = unsafe { (array(on.part.coefficients().shape, coefficients)?, array_mut(on.shape, voxels)?) };
     operator.expand(from, to);
-    expansion.fault()
+    on.part.fault()
 }
 
 unsafe fn run_adjoint<R: Real>(
-    built: &Built,
+    on: &On,
     operator: &dyn BasisOperator<R>,
     voxels: *const R,
     coefficients: *mut R,
 ) -> Result<()> {
-    let expansion = built.expansion()?;
     // SAFETY: see `shims/mod.rs`.
-    let (from, to) = unsafe { (array(built.shape, voxels)?, array_mut(expansion.coefficients().shape, coefficients)?) };
+    let (from, to) = unsafe { (array(on.shape, voxels)?, array_mut(on.part.coefficients().shape, coefficients)?) };
     operator.adjoint(from, to);
-    expansion.fault()
+    on.part.fault()
 }

@@ -1,13 +1,15 @@
 //! Data terms and their misfits for a scan.
 
 use super::{array, guard, hand_over, header, many, many_mut, shims, table};
+use crate::built::Built;
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
 
 table! { ConefieldDataTerm: bytes of noise differentiate curve spread }
 
 shims! {
-    fn bytes(term: data_term, shape: *const usize, held: *mut u64, brief: *mut u64) -> (), or (), {
+    fn bytes(term: dyn DataTerm, shape: *const usize, held: *mut u64, brief: *mut u64) -> (), or (), {
         // After a panic the host refuses the run.
         (*held, *brief) = (u64::MAX, u64::MAX);
         let header = header([0; 3], *shape.cast());
@@ -15,26 +17,28 @@ shims! {
     }
 
     fn of(
-        term: data_term, measured: *const f32, shape: *const usize, misfit: *mut *mut c_void; error
+        term: dyn DataTerm, measured: *const f32, shape: *const usize, misfit: *mut *mut c_void; error
     ) {
-        *misfit = hand_over(term.of(array(*shape.cast(), measured)?)?);
+        let made = term.of(array(*shape.cast(), measured)?)?;
+        let describe = made.describe();
+        *misfit = hand_over(Built::of(made, describe));
     }
 
-    fn noise(misfit: misfit) -> f64, or f64::NAN, { misfit.noise() }
+    fn noise(misfit: dyn Misfit) -> f64, or f64::NAN, { misfit.noise() }
 
     fn differentiate(
-        misfit: misfit, view: usize, measured: *const f32, count: usize, residuals: *mut f32, sum: *mut f64; error
+        misfit: dyn Misfit, view: usize, measured: *const f32, count: usize, residuals: *mut f32, sum: *mut f64; error
     ) {
         *sum = misfit.differentiate(view, many(measured, count), many_mut(residuals, count));
         misfit.fault()?;
     }
 
-    fn curve(misfit: misfit, view: usize, measured: *const f32, count: usize, values: *mut f32; error) {
+    fn curve(misfit: dyn Misfit, view: usize, measured: *const f32, count: usize, values: *mut f32; error) {
         misfit.curve(view, many(measured, count), many_mut(values, count));
         misfit.fault()?;
     }
 
-    fn spread(misfit: misfit, view: usize, measured: *const f32, count: usize, values: *mut f32; error) {
+    fn spread(misfit: dyn Misfit, view: usize, measured: *const f32, count: usize, values: *mut f32; error) {
         misfit.spread(view, many(measured, count), many_mut(values, count));
         misfit.fault()?;
     }

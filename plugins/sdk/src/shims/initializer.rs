@@ -1,7 +1,7 @@
 //! Initializers.
 
 use super::{guard, hand_over, many, many_mut, shims, table, text};
-use crate::built::AnyStage;
+use crate::built::{Filling, Waiting};
 use conefield_core::arena::Block;
 use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
@@ -21,36 +21,30 @@ unsafe fn layout(blocks: *const ConefieldBlock, count: usize) -> Result<Layout> 
 
 shims! {
     fn apply(
-        initializer: initializer, blocks: *const ConefieldBlock, block_count: usize, params: *mut f32, length: usize,
+        filling: Filling, blocks: *const ConefieldBlock, block_count: usize, params: *mut f32, length: usize,
         filled: *mut u8; error
     ) {
         let layout = layout(blocks, block_count)?;
         let (params, filled) = (many_mut(params, length), many_mut(filled, block_count));
         let mut arena = Arena::new(length);
         arena.params.copy_from_slice(params);
-        let report = initializer.apply(&layout, &mut arena)?;
+        let report = filling.initializer.apply(&layout, &mut arena)?;
         params.copy_from_slice(&arena.params);
         for (filled, b) in filled.iter_mut().zip(&layout.blocks) {
             *filled = report.loaded.contains(&b.name).into();
         }
     }
 
-    fn check(initializer: initializer, blocks: *const ConefieldBlock, block_count: usize; error) {
-        initializer.check(&layout(blocks, block_count)?)?;
+    fn check(filling: Filling, blocks: *const ConefieldBlock, block_count: usize; error) {
+        filling.initializer.check(&layout(blocks, block_count)?)?;
     }
 
-    fn weights(built: any, path: *mut ConefieldStr) {
-        match &built.stage {
-            // The stage owns the text.
-            AnyStage::Waiting(w) => *path = ConefieldStr::of(&w.path),
-            _ => return Err(Error::unsupported("this stage", "it names no weights file")),
-        }
+    fn weights(waiting: Waiting, path: *mut ConefieldStr) {
+        // The stage owns the text.
+        *path = ConefieldStr::of(&waiting.path);
     }
 
-    fn with_weights(built: any, tensors: *const ConefieldTensor, count: usize, out: *mut *mut c_void; error) {
-        let AnyStage::Waiting(waiting) = &built.stage else {
-            return Err(Error::unsupported("this stage", "it names no weights file"));
-        };
+    fn with_weights(waiting: Waiting, tensors: *const ConefieldTensor, count: usize, out: *mut *mut c_void; error) {
         let mut weights = Weights::default();
         for t in many(tensors, count) {
             let (shape, values) = (many(t.shape, t.dimensions), many(t.values, t.length));
@@ -59,8 +53,8 @@ shims! {
         *out = hand_over(waiting.with(&weights)?);
     }
 
-    fn volume(built: any, path: *mut ConefieldStr, steps: *mut u64) {
-        let known = built.volume.as_ref().ok_or_else(|| Error::unsupported("this stage", "it names no volume"))?;
+    fn volume(filling: Filling, path: *mut ConefieldStr, steps: *mut u64) {
+        let known = filling.volume.as_ref().ok_or_else(|| Error::unsupported("this stage", "it names no volume"))?;
         (*path, *steps) = (ConefieldStr::of(&known.path), known.steps);
     }
 }

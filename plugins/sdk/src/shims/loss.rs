@@ -1,14 +1,15 @@
 //! Losses.
 
-use super::{guard, hand_over, many, many_mut, shims, table, wgsl};
-use conefield_core::loss::NoiseModel;
+use super::{guard, hand_over, many, many_mut, shims, table, write_wgsl};
+use crate::built::Built;
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
 
 table! { ConefieldLoss: at needs_scan fitted wgsl }
 
 shims! {
-    fn at(loss: loss, predicted: *const f64, measured: *const f64, count: usize, out: *mut f64, slope: *mut f64; error) {
+    fn at(loss: dyn Loss, predicted: *const f64, measured: *const f64, count: usize, out: *mut f64, slope: *mut f64; error) {
         let from = many(predicted, count).iter().zip(many(measured, count));
         let to = many_mut(out, count).iter_mut().zip(many_mut(slope, count));
         for ((&predicted, &measured), (out, slope)) in from.zip(to) {
@@ -17,14 +18,19 @@ shims! {
         loss.fault()?;
     }
 
-    fn needs_scan(loss: loss) -> u32, or 0, { loss.needs_scan().into() }
+    fn needs_scan(loss: dyn Loss) -> u32, or 0, { loss.needs_scan().into() }
 
-    fn fitted(loss: loss, noise: *const ConefieldNoise, out: *mut *mut c_void; error) {
+    fn fitted(loss: dyn Loss, noise: *const ConefieldNoise, out: *mut *mut c_void; error) {
         let ConefieldNoise { sigma, growth, measured, count } = *noise;
         let fitted = loss.fitted(&NoiseModel { sigma, growth, measured: many(measured, count) });
         loss.fault()?;
         if let Some(fitted) = fitted {
-            *out = hand_over(fitted);
+            let describe = fitted.describe();
+            *out = hand_over(Built::of(fitted, describe));
         }
+    }
+
+    fn wgsl(loss: dyn Loss; source) {
+        write_wgsl(source, loss.wgsl())?;
     }
 }

@@ -1,56 +1,58 @@
 //! Encoders, normalizers and fields.
 
-use super::{guard, many, many_mut, shims, table, wgsl};
-use crate::built::MapInfo;
+use super::{guard, hand_over, many, many_mut, shims, table, write_wgsl};
+use crate::built::Map;
 use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::borrow::Cow;
 use std::ffi::c_void;
-use std::ptr;
 
 table! { ConefieldMap: info parameter init forward backward forward_f64 backward_f64 partition reduce wgsl passes forward_pass resolutions }
 
 shims! {
-    fn info(map: map, out: *mut ConefieldInfo) {
-        *out = map.1.info;
+    fn info(map: Map, out: *mut ConefieldInfo) {
+        *out = map.info;
     }
 
-    fn parameter(map: map, index: usize, out: *mut ConefieldParameter) {
-        let p = map.1.blocks.get(index).ok_or_else(|| Error::unsupported("parameters", "the index is too large"))?;
+    fn parameter(map: Map, index: usize, out: *mut ConefieldParameter) {
+        let p = map.blocks.get(index).ok_or_else(|| Error::unsupported("parameters", "the index is too large"))?;
         let name = ConefieldStr::of(&p.name);
         *out = ConefieldParameter { name, shape: p.shape.as_ptr(), dimensions: p.shape.len() };
     }
 
-    fn partition(map: map, index: usize, out: *mut ConefieldRange) {
-        let r = map.1.partition.get(index).ok_or_else(|| Error::unsupported("ranges", "the index is too large"))?;
+    fn partition(map: Map, index: usize, out: *mut ConefieldRange) {
+        let r = map.partition.get(index).ok_or_else(|| Error::unsupported("ranges", "the index is too large"))?;
         *out = ConefieldRange { start: r.start, end: r.end };
     }
 
-    fn init(map: map, seed: u64, params: *mut f32, length: usize; error) {
-        map.0.init(seed, many_mut(params, length));
+    fn init(map: Map, seed: u64, params: *mut f32, length: usize; error) {
+        map.stage().init(seed, many_mut(params, length));
     }
 
-    fn passes(map: map) -> usize, or 0, { map.0.kernel().passes() }
+    fn passes(map: Map) -> usize, or 0, { map.stage().kernel().passes() }
 
-    fn resolutions(encoder: encoder, cells: *mut f64, count: usize; error) {
-        let found = encoder.resolutions().ok_or_else(|| Error::unsupported("resolutions", "they are not known"))?;
+    fn resolutions(map: Map, cells: *mut f64, count: usize; error) {
+        let found = map.encoder()?.resolutions().ok_or_else(|| Error::unsupported("resolutions", "they are not known"))?;
         let expected = format!("one for each of {count} channels");
         ensure(found.len() == count, "encoder", "resolutions", found.len(), expected)?;
         many_mut(cells, count).copy_from_slice(&found);
     }
 
-    fn reduce(stage: any, side: u32, keep: *const usize, keep_count: usize, out: *mut ConefieldReduced; error) {
-        let smaller = Box::new(stage.reduced(side, many(keep, keep_count))?);
+    fn reduce(map: Map, side: u32, keep: *const usize, keep_count: usize, out: *mut ConefieldReduced; error) {
+        let smaller = map.reduced(side, many(keep, keep_count))?;
+        // Both lists stay where they are when the stage moves.
         let (params, channels) = &smaller.kept;
-        let mut reduced = ConefieldReduced {
-            stage: ptr::null_mut(),
+        *out = ConefieldReduced {
             params: params.as_ptr(),
             params_count: params.len(),
             channels: channels.as_ptr(),
             channels_count: channels.len(),
+            stage: hand_over(smaller.built()),
         };
-        reduced.stage = Box::into_raw(smaller).cast();
-        *out = reduced;
+    }
+
+    fn wgsl(map: Map; source) {
+        write_wgsl(source, map.stage().wgsl())?;
     }
 }
 
@@ -108,12 +110,9 @@ macro_rules! strided {
 
 strided! { ConefieldTile f32 ConefieldTileMut f32 ConefieldTile64 f64 ConefieldTileMut64 f64 }
 
-/// A map of rows with its properties.
-type Map<'a> = (&'a dyn Stage, &'a MapInfo);
-
 /// `forward` of a kernel, or one of its passes.
 unsafe fn run_forward<R: Real>(
-    (stage, known): Map<'_>,
+    map: &Map,
     kernel: &dyn Kernel<R>,
     pass: Option<usize>,
     params: *const R,
@@ -122,7 +121,7 @@ unsafe fn run_forward<R: Real>(
     let rows = x.rows;
     // SAFETY: see `shims/mod.rs`.
     unsafe {
-        let (params, x) = (many(params, known.info.params), x.read());
+        let (params, x) = (many(params, map.info.params), x.read());
         y.write(|y| {
             tape.write(|tape| {
                 let (x, y, tape) = (Tile::new(&x, rows), TileMut::new(y, rows), TileMut::new(tape, rows));
@@ -133,11 +132,11 @@ unsafe fn run_forward<R: Real>(
             });
         });
     }
-    stage.fault()
+    map.stage().fault()
 }
 
 unsafe fn run_backward<R: Real>(
-    (stage, known): Map<'_>,
+    map: &Map,
     kernel: &dyn Kernel<R>,
     params: *const R,
     [x, tape, dy, dx]: [Strided<R>; 4],
@@ -147,7 +146,7 @@ unsafe fn run_backward<R: Real>(
     let wanted = !dx.data.is_null();
     // SAFETY: see `shims/mod.rs`.
     unsafe {
-        let (params, x, dy) = (many(params, known.info.params), x.read(), dy.read());
+        let (params, x, dy) = (many(params, map.info.params), x.read(), dy.read());
         tape.write(|tape| {
             let (x, tape, dy) = (Tile::new(&x, rows), TileMut::new(tape, rows), Tile::new(&dy, rows));
             if wanted {
@@ -157,7 +156,7 @@ unsafe fn run_backward<R: Real>(
             }
         });
     }
-    stage.fault()
+    map.stage().fault()
 }
 
 /// The kernel of a stage.
@@ -174,15 +173,15 @@ fn double(stage: &dyn Stage) -> Result<&dyn Kernel<f64>> {
 macro_rules! kernel {
     ($real:ty, $tile:ident $tile_mut:ident $grads:ident, $forward:ident $backward:ident, $kernel:expr) => {
         shims! {
-            fn $forward(map: map, params: *const $real, x: $tile, y: $tile_mut, tape: $tile_mut; error) {
-                run_forward(map, $kernel(map.0)?, None, params, [x.into(), y.into(), tape.into()])?;
+            fn $forward(map: Map, params: *const $real, x: $tile, y: $tile_mut, tape: $tile_mut; error) {
+                run_forward(map, $kernel(map.stage())?, None, params, [x.into(), y.into(), tape.into()])?;
             }
 
             fn $backward(
-                map: map, params: *const $real, x: $tile, tape: $tile_mut, dy: $tile, to: $grads, dx: $tile_mut; error
+                map: Map, params: *const $real, x: $tile, tape: $tile_mut, dy: $tile, to: $grads, dx: $tile_mut; error
             ) {
                 let grads = Grads { values: many_mut(to.data, to.length), range: to.start..to.start + to.length };
-                run_backward(map, $kernel(map.0)?, params, [x.into(), tape.into(), dy.into(), dx.into()], grads)?;
+                run_backward(map, $kernel(map.stage())?, params, [x.into(), tape.into(), dy.into(), dx.into()], grads)?;
             }
         }
     };
@@ -193,8 +192,8 @@ kernel! { f64, ConefieldTile64 ConefieldTileMut64 ConefieldGrads64, forward_f64 
 
 shims! {
     fn forward_pass(
-        map: map, pass: usize, params: *const f32, x: ConefieldTile, y: ConefieldTileMut, tape: ConefieldTileMut; error
+        map: Map, pass: usize, params: *const f32, x: ConefieldTile, y: ConefieldTileMut, tape: ConefieldTileMut; error
     ) {
-        run_forward(map, map.0.kernel(), Some(pass), params, [x.into(), y.into(), tape.into()])?;
+        run_forward(map, map.stage().kernel(), Some(pass), params, [x.into(), y.into(), tape.into()])?;
     }
 }

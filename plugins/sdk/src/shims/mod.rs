@@ -15,7 +15,7 @@ pub mod prior;
 pub mod projector;
 pub mod regularizer;
 
-use crate::built::{AnyStage, Built};
+use crate::built::{Built, OnGrid};
 use conefield_core::prelude::*;
 use conefield_core::registry::StageType;
 use conefield_core::scan::ScanHeader;
@@ -32,12 +32,12 @@ macro_rules! table {
 }
 use table;
 
-/// Defines functions of tables. Each one gets the stage behind its first pointer, as the kind named after it, and runs
+/// Defines functions of tables. Each one gets the stage behind its first pointer, as the type named after it, and runs
 /// inside [`guard`]. A `mut` stage is not used by other calls meanwhile. A function with an error text as last argument
 /// reports a reason; one with a result of its own defines its value on failure.
 macro_rules! shims {
     () => {};
-    (fn $name:ident($stage:ident: $kind:ident $(, $arg:ident: $ty:ty)* $(; $error:ident)?) $body:block $($rest:tt)*) => {
+    (fn $name:ident($stage:ident: $kind:ty $(, $arg:ident: $ty:ty)* $(; $error:ident)?) $body:block $($rest:tt)*) => {
         unsafe extern "C" fn $name(
             stage: *const c_void
             $(, $arg: $ty)*
@@ -46,14 +46,14 @@ macro_rules! shims {
             let error = [$($error,)? std::ptr::null_mut()][0];
             // SAFETY: see `shims/mod.rs`.
             guard(error, || unsafe {
-                let $stage = crate::shims::built(stage).$kind()?;
+                let $stage = crate::shims::built(stage).get::<$kind>()?;
                 $body;
                 Ok(())
             })
         }
         shims! { $($rest)* }
     };
-    (fn $name:ident(mut $stage:ident: $kind:ident $(, $arg:ident: $ty:ty)* $(; $error:ident)?) $body:block $($rest:tt)*) => {
+    (fn $name:ident(mut $stage:ident: $kind:ty $(, $arg:ident: $ty:ty)* $(; $error:ident)?) $body:block $($rest:tt)*) => {
         unsafe extern "C" fn $name(
             stage: *mut c_void
             $(, $arg: $ty)*
@@ -62,19 +62,19 @@ macro_rules! shims {
             let error = [$($error,)? std::ptr::null_mut()][0];
             // SAFETY: see `shims/mod.rs`; nothing else uses the stage meanwhile.
             guard(error, || unsafe {
-                let $stage = (*stage.cast::<crate::built::Built>()).$kind()?;
+                let $stage = (*stage.cast::<crate::built::Built>()).get_mut::<$kind>()?;
                 $body;
                 Ok(())
             })
         }
         shims! { $($rest)* }
     };
-    (fn $name:ident($stage:ident: $kind:ident $(, $arg:ident: $ty:ty)*) -> $out:ty, or $failed:expr, $body:block $($rest:tt)*) => {
+    (fn $name:ident($stage:ident: $kind:ty $(, $arg:ident: $ty:ty)*) -> $out:ty, or $failed:expr, $body:block $($rest:tt)*) => {
         unsafe extern "C" fn $name(stage: *const c_void $(, $arg: $ty)*) -> $out {
             let mut out = $failed;
             // SAFETY: see `shims/mod.rs`.
             guard(std::ptr::null_mut(), || unsafe {
-                let $stage = crate::shims::built(stage).$kind()?;
+                let $stage = crate::shims::built(stage).get::<$kind>()?;
                 out = $body;
                 Ok(())
             });
@@ -172,15 +172,20 @@ unsafe fn built<'a>(stage: *const c_void) -> &'a Built {
 }
 
 /// Passes ownership of a stage to the host.
-fn hand_over(stage: impl Into<AnyStage>) -> *mut c_void {
-    hand_over_on([0; 3], stage)
+fn hand_over(built: Built) -> *mut c_void {
+    Box::into_raw(Box::new(built)).cast()
 }
 
-/// Passes ownership of what a stage made for a grid of this shape.
-fn hand_over_on(shape: [usize; 3], stage: impl Into<AnyStage>) -> *mut c_void {
-    let mut built = Box::new(Built::of(stage));
-    built.shape = shape;
-    Box::into_raw(built).cast()
+/// The same of what a stage made for a grid of this shape.
+fn hand_over_on<T: ?Sized + 'static>(shape: [usize; 3], part: Box<T>) -> *mut c_void {
+    hand_over(Built::of(Box::new(OnGrid { shape, part }), String::new()))
+}
+
+/// Writes the WGSL of a stage, if there is some.
+fn write_wgsl(out: *mut ConefieldText, fragment: Option<Fragment>) -> Result<()> {
+    let fragment = fragment.ok_or_else(|| Error::unsupported("this stage", "it has no WGSL"))?;
+    write(out, &fragment.source);
+    Ok(())
 }
 
 pub unsafe extern "C" fn create(
@@ -194,9 +199,8 @@ pub unsafe extern "C" fn create(
         // SAFETY: see the top of this file; `context` is set by the table and points to a static.
         let (t, settings) = unsafe { (&*context.cast::<StageType>(), text(settings)?) };
         let settings = serde_json::from_str(settings).map_err(|e| Error::invalid("spec", "", e, "JSON"))?;
-        let built = Box::new(Built::new(t, settings, width)?);
         // SAFETY: see the top of this file.
-        unsafe { *stage = Box::into_raw(built).cast() };
+        unsafe { *stage = hand_over(Built::new(t, settings, width)?) };
         Ok(())
     })
 }
@@ -212,22 +216,9 @@ pub unsafe extern "C" fn destroy(stage: *mut c_void) {
 pub unsafe extern "C" fn describe(stage: *const c_void, out: *mut ConefieldText) -> ConefieldStatus {
     guard(out, || {
         // SAFETY: see the top of this file.
-        write(out, &unsafe { built(stage) }.stage.describe());
+        write(out, &unsafe { built(stage) }.describe);
         Ok(())
     })
-}
-
-shims! {
-    fn wgsl(built: any; source) {
-        let fragment = match &built.stage {
-            AnyStage::Projector(p) => p.wgsl(),
-            AnyStage::Loss(l) => l.wgsl(),
-            AnyStage::Prior(p) => p.wgsl(),
-            _ => built.map()?.0.wgsl(),
-        };
-        let fragment = fragment.ok_or_else(|| Error::unsupported("this stage", "it has no WGSL"))?;
-        write(source, &fragment.source);
-    }
 }
 
 #[cfg(test)]

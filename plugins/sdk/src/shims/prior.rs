@@ -1,22 +1,26 @@
 //! Priors.
 
-use super::{guard, many, many_mut, shims, table, wgsl};
-use conefield_core::prior::Blocks;
+use super::{guard, many, many_mut, shims, table, write_wgsl};
+use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::ffi::c_void;
 
 table! { ConefieldPrior: blocks block wgsl }
 
 shims! {
-    fn blocks(prior: prior, out: *mut ConefieldBlocks) {
+    fn blocks(prior: dyn Prior, out: *mut ConefieldBlocks) {
         let Blocks { edge, count, spacing, weight } = prior.blocks();
         *out = ConefieldBlocks { edge, count, spacing, weight };
     }
 
     fn block(
-        prior: prior, values: *const f64, count: usize, scale: f64, gradient: *mut f64, penalty: *mut f64; error
+        prior: dyn Prior, values: *const f64, count: usize, scale: f64, gradient: *mut f64, penalty: *mut f64; error
     ) {
         *penalty = prior.block(many(values, count), scale, many_mut(gradient, count));
         prior.fault()?;
+    }
+
+    fn wgsl(prior: dyn Prior; source) {
+        write_wgsl(source, prior.wgsl())?;
     }
 }

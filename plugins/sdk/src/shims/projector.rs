@@ -1,6 +1,7 @@
 //! Projectors.
 
-use super::{guard, hand_over, many, many_mut, shims, table, wgsl};
+use super::{guard, hand_over, many, many_mut, shims, table, write_wgsl};
+use crate::built::Built;
 use conefield_core::prelude::*;
 use conefield_core::stage::Lengths;
 use conefield_plugin_abi::*;
@@ -21,10 +22,10 @@ thread_local! {
 }
 
 shims! {
-    fn max_samples(projector: projector, at: *const ConefieldRay) -> usize, or usize::MAX, { projector.max_samples(&ray(&*at)) }
+    fn max_samples(projector: dyn Projector, at: *const ConefieldRay) -> usize, or usize::MAX, { projector.max_samples(&ray(&*at)) }
 
     fn sample(
-        projector: projector, at: *const ConefieldRay, seed: *const u64, points: *mut f32, weights: *mut f32,
+        projector: dyn Projector, at: *const ConefieldRay, seed: *const u64, points: *mut f32, weights: *mut f32,
         capacity: usize, count: *mut usize; error
     ) {
         SAMPLES.with_borrow_mut(|samples| {
@@ -44,19 +45,24 @@ shims! {
         })?;
     }
 
-    fn integrate(projector: projector, weights: *const f32, mu: *const f64, count: usize) -> f64, or f64::NAN, {
+    fn integrate(projector: dyn Projector, weights: *const f32, mu: *const f64, count: usize) -> f64, or f64::NAN, {
         projector.integrate(many(weights, count), many(mu, count))
     }
 
-    fn adjoint(projector: projector, weights: *const f32, dline: f64, dmu: *mut f64, count: usize) -> (), or (), {
+    fn adjoint(projector: dyn Projector, weights: *const f32, dline: f64, dmu: *mut f64, count: usize) -> (), or (), {
         projector.adjoint(many(weights, count), dline, many_mut(dmu, count));
     }
 
-    fn fitted(projector: projector, lengths: *const ConefieldLengths, out: *mut *mut c_void; error) {
+    fn fitted(projector: dyn Projector, lengths: *const ConefieldLengths, out: *mut *mut c_void; error) {
         let ConefieldLengths { voxel_mm, cell_mm } = *lengths;
         let lengths = Lengths { voxel_mm, cell_mm: (cell_mm > 0.0).then_some(cell_mm) };
         if let Some(fitted) = projector.fitted(lengths)? {
-            *out = hand_over(fitted);
+            let describe = fitted.describe();
+            *out = hand_over(Built::of(fitted, describe));
         }
+    }
+
+    fn wgsl(projector: dyn Projector; source) {
+        write_wgsl(source, projector.wgsl())?;
     }
 }
