@@ -41,7 +41,7 @@ impl Layout {
 }
 
 /// Everything that training changes.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Clone, Default)]
 pub struct Arena {
     /// Parameters.
     pub params: Pages,

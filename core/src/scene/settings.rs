@@ -278,14 +278,11 @@ impl RegionSettings {
     }
 
     /// Makes an error about `scene.support` one about the region.
-    pub fn concern(i: usize, e: Error) -> Error {
-        match e {
-            Error::Invalid { place, field, found, expected } => {
-                let field = field.replacen("scene.support", &format!("{}.within", Self::key(i)), 1);
-                Error::Invalid { place, field, found, expected }
-            }
-            other => other,
+    pub fn concern(i: usize, mut e: Error) -> Error {
+        if let Error::Invalid { field, .. } = &mut e {
+            *field = field.replacen("scene.support", &format!("{}.within", Self::key(i)), 1);
         }
+        e
     }
 
     fn validate(&self, i: usize) -> Result<()> {

@@ -153,20 +153,17 @@ impl Loaded {
     }
 
     /// The same error, with the line of the spec it refers to.
-    pub fn locate(&self, error: Error) -> Error {
-        let Error::Invalid { place, field, found, expected } = error else { return error };
-        if place != "spec" {
-            return Error::Invalid { place, field, found, expected };
+    pub fn locate(&self, mut error: Error) -> Error {
+        if let Error::Invalid { place, field, .. } = &mut error
+            && place == "spec"
+        {
+            // `normalizers[0].epoch` and `normalizers.0.epoch` are the same.
+            let dotted = field.replace('[', ".").replace(']', "");
+            let path: Vec<&str> = dotted.split('.').filter(|s| !s.is_empty()).collect();
+            (*place, *field) = (self.written.nearest(&path).at.to_string(), path.join("."));
         }
-        let path = steps(&field);
-        let at = &self.written.nearest(&path.iter().map(String::as_str).collect::<Vec<_>>()).at;
-        Error::Invalid { place: at.to_string(), field: path.join("."), found, expected }
+        error
     }
-}
-
-/// Treats `normalizers[0].epoch` and `normalizers.0.epoch` alike.
-fn steps(path: &str) -> Vec<String> {
-    path.replace('[', ".").replace(']', "").split('.').filter(|s| !s.is_empty()).map(str::to_owned).collect()
 }
 
 /// `one of a, b` of the shipped names, with the nearest one first if there is one.
@@ -677,6 +674,8 @@ mod tests {
         // Over another type, by `--set`, and within a stage.
         let base = "extends = 'plain'\n";
         assert_eq!(read(base, &["encoder=test-grid"]).unwrap().tree["encoder"]["levels"], 4);
+        let l = read("type = 'test-field'\nencoder = 'test-grid'\n", &["encoder.levels=8"]).unwrap();
+        assert_eq!((&l.tree["encoder"]["type"], &l.tree["encoder"]["levels"]), (&"test-grid".into(), &8.into()));
         read(base, &["encoder={type='test-stack', below='test-grid'}"]).unwrap();
         for (line, want) in [
             (
@@ -780,23 +779,12 @@ mod tests {
     }
 
     #[test]
-    fn a_type_alone_is_a_spec_and_a_stage() {
+    fn a_type_alone_is_a_spec() {
         let l = load("test-clock", &["seconds=3".into()], SHIPPED).unwrap();
         assert_eq!(
             (&l.tree["type"], &l.tree["name"], &l.tree["seconds"]),
             (&"test-clock".into(), &"test-clock".into(), &3.0.into())
         );
-        let l = read("type = 'test-field'\nencoder = 'test-grid'\n", &["encoder.levels=8"]).unwrap();
-        assert_eq!((&l.tree["encoder"]["type"], &l.tree["encoder"]["levels"]), (&"test-grid".into(), &8.into()));
-        let l = read("extends = 'plain'\nencoder = 'test-grid'\n", &[]).unwrap();
-        assert_eq!(l.tree["encoder"]["levels"], 4, "the default, not what the lower layer says");
-        let e = refusal("type = 'test-field'\nencoder = 'tets-grid'\n", &[]);
-        assert!(
-            e.starts_with("a.toml:2:11: encoder: found no encoder type \"tets-grid\", expected \"test-grid\""),
-            "{e}"
-        );
-        let e = refusal("type = 'test-field'\nencoder = 'test-stack'\n", &[]);
-        assert!(e.contains("encoder.below: found nothing"), "{e}");
     }
 
     #[test]
