@@ -364,9 +364,8 @@ impl Arrays {
         let Factors { step, momentum, pull, tau } = factors;
         let towards = towards.as_ref().map(|towards| (towards, pull));
         let inside = model.inside(problem);
-        problem
-            .place
-            .update(ProximalStep { gradient, ahead, x, step, momentum, towards, inside, tau }, penalty.as_mut())
+        let step = ProximalStep { gradient, ahead, x, step, momentum, towards, inside };
+        problem.place.update(step, tau, penalty.as_mut())
     }
 
     /// Clears coefficients outside the object's support and restarts from the rest.
@@ -577,7 +576,9 @@ impl Iteration for FistaIterate {
         let place = problem.place;
         copy(place, &self.arrays.x, &mut self.arrays.before)?;
         // A changed penalty must not count as progress or regress.
-        if let Some(value) = place.adapt(self.arrays.penalty.as_mut(), &self.arrays.x)? {
+        if self.arrays.penalty.adapts()
+            && let Some(value) = place.adapt(self.arrays.penalty.as_mut(), &self.arrays.x)?
+        {
             self.objective = self.misfit + self.lambda * value;
         }
         let (mut residual, mut misfit) = (0.0, 0.0);

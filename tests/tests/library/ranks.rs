@@ -284,9 +284,6 @@ impl Observer for Full {
 struct Small(usize);
 
 impl Place for Small {
-    fn device(&self) -> Option<String> {
-        None
-    }
     fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
         if shape[0] > self.0 { Err(Error::unsupported("memory", "none is left")) } else { Host.zeros(shape) }
     }
