@@ -135,14 +135,8 @@ impl Adapter {
     }
 
     /// Preference among adapters; the highest number wins.
-    pub fn rank(&self) -> u32 {
-        match self.kind.as_str() {
-            "discrete GPU" => 4,
-            "integrated GPU" => 3,
-            "virtual GPU" => 2,
-            "other" => 1,
-            _ => 0,
-        }
+    pub fn rank(&self) -> Option<usize> {
+        ["other", "virtual GPU", "integrated GPU", "discrete GPU"].iter().position(|kind| *kind == self.kind)
     }
 }
 

@@ -134,7 +134,7 @@ impl Room {
             let given = bind.iter().find(|(n, _)| *n == name).map(|(_, buffer)| *buffer);
             given.or_else(|| self.buffers.get(name))
         };
-        let bound = kernel.bind_as(gpu, find)?;
+        let bound = kernel.bind(gpu, find)?;
         let submitted = Instant::now();
         let mut last = None;
         for (value, groups) in parts {

@@ -143,7 +143,7 @@ pub fn kernels(asked: &Asked) -> Result<()> {
     let (counts, side): (&[usize], usize) =
         if asked.software { (&[64], 32) } else { (&[256, 1024, 4096, 16_384, 65_536], 256) };
     let backend = open(asked, Limits::default())?;
-    let ceiling = backend.shared().ceiling()?;
+    let ceiling = backend.ceiling()?;
     // Multiply-adds: forward, forward once more on the way back, and two products backward. Table accesses: 8 corners of 10 levels,
     // read and then updated.
     let (macs, reads) = (4.0 * pipeline(SAMPLES)?.macs() as f64, 2.0 * 8.0 * 10.0);
