@@ -187,8 +187,9 @@ impl Wgpu {
         Ok(())
     }
 
-    /// Makes room for `rows` rows.
+    /// Makes room for `rows` rows, and for one where all rays miss the scene: kernels then still bind the buffers.
     fn reserve_rows(&mut self, rows: u32) -> Result<()> {
+        let rows = rows.max(1);
         if rows <= self.room {
             return Ok(());
         }
