@@ -4,7 +4,7 @@
 //! detector columns (u) run along `(-sin a, cos a, 0)` and detector rows (v) run towards −z. A view is stored as
 //! vectors, so that irregular orbits need no special case.
 
-use crate::error::{Error, Result, ensure};
+use crate::error::{Result, ensure};
 use serde::{Deserialize, Serialize};
 use std::fmt::Debug;
 use std::ops::Range;
@@ -306,14 +306,9 @@ impl Geometry {
             ensure(independent, place, &field, "parallel or zero pixel axes", "two independent detector axes")?;
             let before = v.normal().1 > 0.0;
             ensure(before, place, &field, "a source in the plane of the detector", "a source before the detector")?;
-            if (0..3).all(|k| v.source[k] > lo[k] && v.source[k] < hi[k]) {
-                return Err(Error::invalid(
-                    place,
-                    field,
-                    format!("a source at {:?} mm inside the volume", v.source),
-                    "a source outside the volume (check units and distances)",
-                ));
-            }
+            let outside = (0..3).any(|k| v.source[k] <= lo[k] || v.source[k] >= hi[k]);
+            let found = format!("a source at {:?} mm inside the volume", v.source);
+            ensure(outside, place, &field, found, "a source outside the volume (check units and distances)")?;
         }
         Ok(())
     }

@@ -128,22 +128,18 @@ impl Chain {
 
     fn link(&mut self, name: &str, stage: &dyn Stage, range: Range<usize>, wants_dx: bool) -> Result<()> {
         let (info, name) = (stage.info(), titled(name, &stage.describe()));
+        let refused = |why: String| Error::unsupported(format!("{name} on the wgpu backend"), why);
         if info.scope == Scope::Ray {
-            return Err(Error::unsupported(
-                format!("{name} on the wgpu backend"),
-                "the stage looks along rays and kernels see one row at a time; it runs with --backend cpu",
-            ));
+            let why = "the stage looks along rays and kernels see one row at a time; it runs with --backend cpu";
+            return Err(refused(why.into()));
         }
         if u32::try_from(self.params).is_err() {
-            return Err(Error::unsupported(
-                "the wgpu backend",
-                format!("{} parameters; at most 2^32 can be addressed", self.params),
-            ));
+            let why = format!("{} parameters; at most 2^32 can be addressed", self.params);
+            return Err(Error::unsupported("the wgpu backend", why));
         }
         let fragment = fragment_of(&name, stage.wgsl())?;
         let (keeps, sums) = (fragment.keeps(), fragment.sums());
-        check(&sums, keeps, info.params)
-            .map_err(|why| Error::unsupported(format!("{name} on the wgpu backend"), format!("its WGSL {why}")))?;
+        check(&sums, keeps, info.params).map_err(|why| refused(format!("its WGSL {why}")))?;
         for sum in sums {
             let partial = self.summed();
             let sum = Sum { at: range.start + sum.at, left: self.tape + sum.left, right: self.tape + sum.right, ..sum };

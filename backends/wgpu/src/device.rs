@@ -217,12 +217,8 @@ impl Gpu {
         if limits.compare_exchange {
             adapter.atomics = Atomics::CompareExchange;
         }
-        if let Some(bytes) = limits.binding_bytes {
-            adapter.binding_bytes = adapter.binding_bytes.min(bytes);
-        }
-        if let Some(bytes) = limits.uniform_bytes {
-            adapter.uniform_bytes = adapter.uniform_bytes.min(bytes);
-        }
+        adapter.binding_bytes = adapter.binding_bytes.min(limits.binding_bytes.unwrap_or(u64::MAX));
+        adapter.uniform_bytes = adapter.uniform_bytes.min(limits.uniform_bytes.unwrap_or(u64::MAX));
         let source = &all[adapter.index];
         let wanted = wgpu::Features::SHADER_FLOAT32_ATOMIC | wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::SUBGROUP;
         let description = wgpu::DeviceDescriptor {

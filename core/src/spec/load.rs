@@ -618,22 +618,12 @@ mod tests {
     fn mistakes_are_reported_with_line_path_and_nearest_name() {
         let base = "extends = 'plain'\n[encoder]\n";
         for (line, want) in [
-            ("level = 3", "a.toml:3:1: encoder.level: found an unknown key, expected \"levels\""),
-            (
-                "levels = 'x'",
-                "a.toml:3:10: encoder.levels: found the text \"x\", expected a whole number of at least 0",
-            ),
-            ("levels = -1", "a.toml:3:10: encoder.levels: found -1, expected a whole number of at least 0"),
             ("levels = 2.5", "encoder.levels: found 2.5, expected a whole number"),
             ("way = 'rund'", "a.toml:3:7: encoder.way: found \"rund\", expected \"round\""),
             ("way = 3", "a.toml:3:7: encoder.way: found 3, expected straight or round"),
             ("range = [1]", "a.toml:3:9: encoder.range: found a list of 1, expected a list of 2"),
             ("range = [1, 'a']", "a.toml:3:13: encoder.range.1: found the text \"a\", expected a number"),
             ("top = 'a'", "a.toml:3:7: encoder.top: found the text \"a\", expected a whole number"),
-            (
-                "type = 'tets-grid'",
-                "a.toml:3:8: encoder.type: found no encoder type \"tets-grid\", expected \"test-grid\"",
-            ),
             (
                 "type = 'test-stack'",
                 "a.toml:2:1: encoder.below: found nothing, expected a table with an encoder type, or its name: one of",
@@ -644,21 +634,8 @@ mod tests {
             assert!(e.contains(want), "{line}\n{e}\n{want}");
         }
         // Plugins bring stages, but no methods.
-        let e = refusal(&format!("{base}type = 'mine'\n"), &[]);
-        assert!(e.contains("test-grid") && e.ends_with("from a plugin, load it with --plugin PATH"), "{e}");
         let e = refusal("type = 'mine'\n", &[]);
         assert!(e.contains("no method type \"mine\"") && !e.contains("plugin"), "{e}");
-        let e = refusal("extends = 'plain'\n\nencodr = 3\n", &[]);
-        assert!(e.starts_with("a.toml:3:1: encodr: found an unknown key, expected \"encoder\""), "{e}");
-        let e = refusal("name = 'x'\n", &[]);
-        assert!(e.contains("type: found nothing") && e.contains("test-field"), "{e}");
-        let e = refusal("extends = 'plian'\n", &[]);
-        assert!(
-            e.starts_with("a.toml:1:11: extends")
-                && e.contains("expected a file or the name")
-                && e.contains("\"plain\""),
-            "{e}"
-        );
         let e = refusal("{\n\"type\": \"test-clock\",\n \"step\": 3}", &[]);
         assert!(e.starts_with("a.toml:3:2: step: found an unknown key, expected \"steps\""), "{e}");
     }
@@ -695,9 +672,7 @@ mod tests {
     #[test]
     fn sets_are_checked_like_files() {
         for (set, want) in [
-            ("encoder.level=8", "--set encoder.level=8: encoder.level: found an unknown key"),
             ("encoder.levels=8x", "found the text \"8x\", expected a whole number"),
-            ("encoder.levels", "--set encoder.levels: path: found"),
             ("=3", "expected path=value"),
             ("encoder..levels=3", "expected path=value"),
             ("encoder.levels.deep=3", "a key below encoder.levels, which is 3"),
@@ -712,8 +687,6 @@ mod tests {
                 Err(e) => assert!(e.to_string().contains(want), "{set}: {e}"),
             }
         }
-        let e = refusal("extends = 'plain'", &["normalizers.2.type=x"]);
-        assert!(e.contains("expected 0, to add one"), "{e}");
     }
 
     #[test]
@@ -766,16 +739,6 @@ mod tests {
         let e = load(&dir.join("a.toml").display().to_string(), &[], SHIPPED).err().unwrap().to_string();
         std::fs::remove_dir_all(&dir).unwrap();
         assert!(e.contains("b.toml:1:11: extends") && e.contains("expected no circle"), "{e}");
-    }
-
-    #[test]
-    fn an_unknown_name_lists_what_there_is() {
-        let e = load("plan", &[], SHIPPED).err().unwrap().to_string();
-        assert!(
-            e.contains("neither a shipped spec nor a file")
-                && e.contains("\"plain\" (of plain, curved, timed, test-chain"),
-            "{e}"
-        );
     }
 
     #[test]
