@@ -342,7 +342,8 @@ impl Set {
             Some(e) => e.value.kind,
             None => Is::String(value.to_owned()),
         };
-        let value = at_everywhere(Node { at: at.clone(), kind }, &at);
+        let mut value = Node { at: at.clone(), kind };
+        relocate(&mut value, &at);
         Ok(Self { path: path.split('.').map(str::to_owned).collect(), value, at })
     }
 
@@ -373,9 +374,6 @@ impl Set {
                         items.push(Node::empty_table(at.clone()));
                     }
                     node = &mut items[index];
-                    if i + 1 < path.len() {
-                        node.spell_out();
-                    }
                 }
                 Is::Table(entries) => {
                     // A changed type discards the old settings.
@@ -395,19 +393,15 @@ impl Set {
                     let entry = &mut entries[index];
                     entry.at = at.clone();
                     node = &mut entry.value;
-                    if i + 1 < path.len() {
-                        node.spell_out();
-                    }
                 }
                 _ => {
                     let above = path[..i].join(".");
-                    return Err(Error::invalid(
-                        at.to_string(),
-                        so_far,
-                        format!("a key below {above}, which is {shown}"),
-                        format!("{above}=value"),
-                    ));
+                    let found = format!("a key below {above}, which is {shown}");
+                    return Err(Error::invalid(at.to_string(), so_far, found, format!("{above}=value")));
                 }
+            }
+            if i + 1 < path.len() {
+                node.spell_out();
             }
         }
         match value.kind {
@@ -418,24 +412,17 @@ impl Set {
     }
 }
 
-/// The node with all locations replaced by `at`.
-fn at_everywhere(mut node: Node, at: &At) -> Node {
+/// Replaces all locations of a value by `at`.
+fn relocate(node: &mut Node, at: &At) {
     node.at = at.clone();
     match &mut node.kind {
-        Is::Array(items) => {
-            for item in items {
-                *item = at_everywhere(std::mem::replace(item, Node::empty_table(at.clone())), at);
-            }
-        }
-        Is::Table(entries) => {
-            for e in entries {
-                e.at = at.clone();
-                e.value = at_everywhere(std::mem::replace(&mut e.value, Node::empty_table(at.clone())), at);
-            }
-        }
+        Is::Array(items) => items.iter_mut().for_each(|item| relocate(item, at)),
+        Is::Table(entries) => entries.iter_mut().for_each(|e| {
+            e.at = at.clone();
+            relocate(&mut e.value, at);
+        }),
         _ => {}
     }
-    node
 }
 
 #[cfg(test)]
