@@ -133,11 +133,15 @@ impl Buffers {
         Ok(true)
     }
 
+    /// The same buffer, new or not.
+    pub fn of(&mut self, gpu: &Gpu, name: &str, bytes: u64, usage: wgpu::BufferUsages) -> Result<wgpu::Buffer> {
+        self.reserve(gpu, name, bytes, usage)?;
+        Ok(self.0[name].clone())
+    }
+
     /// The buffer `staging`, of at least `bytes`, through which results come back to the host.
     pub fn staging(&mut self, gpu: &Gpu, bytes: u64) -> Result<wgpu::Buffer> {
-        use wgpu::BufferUsages as U;
-        self.reserve(gpu, "staging", bytes, U::MAP_READ | U::COPY_DST)?;
-        self.get("staging").cloned().ok_or_else(|| gpu.error("no buffer staging"))
+        self.of(gpu, "staging", bytes, wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST)
     }
 }
 

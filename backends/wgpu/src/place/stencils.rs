@@ -118,10 +118,10 @@ impl<'a> Volume<'a> {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         let sides = [("before", k.checked_sub(1)), ("after", Some(k + 1))];
         for (name, neighbour) in sides {
-            room.buffers.reserve(gpu, name, bytes, ARRAY)?;
-            let (Some(to), Some(from)) = (room.buffers.get(name), neighbour.and_then(|n| all.get(n))) else { continue };
+            let to = room.buffers.of(gpu, name, bytes, ARRAY)?;
+            let Some(from) = neighbour.and_then(|n| all.get(n)) else { continue };
             let at = if name == "before" { (from.planes.len() - 1) as u64 * bytes } else { 0 };
-            encoder.copy_buffer_to_buffer(&from.buffer, at, to, 0, bytes);
+            encoder.copy_buffer_to_buffer(&from.buffer, at, &to, 0, bytes);
         }
         gpu.submit(encoder);
         Ok(())
