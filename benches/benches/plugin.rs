@@ -48,7 +48,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             times[1].push(b);
         }
     }
-    let same = built_in.model.arena.params == plugin.model.arena.params;
+    let same = *built_in.model.arena.params == *plugin.model.arena.params;
     let samples = (RAYS * SAMPLES) as f64 / 1e6;
     for (name, times) in ["built in", "plugin"].iter().zip(&mut times) {
         let [low, median, high] = spread(times);

@@ -30,7 +30,8 @@ pub fn set_budget(bytes: Option<u64>) {
     if let Some(bytes) = bytes {
         let _ = BUDGET.set(bytes);
     }
-    allowance::set_memory(bytes.unwrap_or(u64::MAX).min(available()), scratch::allocated);
+    let most = bytes.map_or_else(|| available(ranks::on_machine()), |bytes| bytes.min(available(1)));
+    allowance::set_memory(most, scratch::allocated);
 }
 
 /// Allows arrays that do not fit into memory to live on the disk of `folder`. The first call counts. For programs whose
@@ -122,15 +123,15 @@ impl Memory {
     }
 }
 
-/// The limit of `--memory`, else the available memory, in bytes. What this process holds already, such as the scan, is
-/// part of what a run needs: it counts as available.
+/// The limit of `--memory`, else this process's share of the available memory, in bytes. What this process holds already,
+/// such as the scan, is part of what a run needs: it counts as available.
 pub fn limit() -> u64 {
-    BUDGET.get().copied().unwrap_or_else(|| available().saturating_add(scratch::allocated()))
+    BUDGET.get().copied().unwrap_or_else(|| available(ranks::on_machine()).saturating_add(scratch::allocated()))
 }
 
-/// Bytes available to this process: the machine's available memory, less if a control group limits it; no limit if the
-/// system does not report it.
-fn available() -> u64 {
+/// Bytes available to each of so many processes: the machine's available memory, less if a control group limits it; no
+/// limit if the system does not report it.
+fn available(processes: u64) -> u64 {
     let memory = RefreshKind::nothing().with_memory(MemoryRefreshKind::nothing().with_ram());
     let Ok(mut system) = System::new_with_specifics(memory) else { return u64::MAX };
     let machine = Some(system.available_memory()).filter(|n| *n > 0).unwrap_or(u64::MAX);
@@ -139,7 +140,8 @@ fn available() -> u64 {
         system.process(pid)?.cgroup_limits()
     });
     // The group's free memory excludes reclaimable caches.
-    limits.map_or(machine, |l| machine.min(l.total_memory.saturating_sub(l.rss))).min(addresses())
+    let shared = limits.map_or(machine, |l| machine.min(l.total_memory.saturating_sub(l.rss)));
+    (shared / processes).min(addresses())
 }
 
 /// The rest of a limited address space. One eighth is reserved for threads and for overhead of the allocator.
@@ -348,7 +350,7 @@ mod tests {
 
     #[test]
     fn the_machine_has_memory() {
-        assert!(available() > 1 << 20);
+        assert!(available(1) > 1 << 20);
         if cfg!(target_os = "linux") {
             assert!(peak().is_some_and(|p| p > 1 << 20));
         }

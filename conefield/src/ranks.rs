@@ -12,8 +12,10 @@ pub use mpi::{Joined, start};
 use crate::devices::Member;
 use conefield_core::Result;
 use conefield_core::backend::Backend;
+use conefield_core::checksum::of_text;
 use conefield_core::place::{Peers, Ranks};
 use std::sync::{Arc, OnceLock};
+use sysinfo::System;
 
 /// The connection to the other processes.
 static PEERS: OnceLock<Arc<dyn Peers>> = OnceLock::new();
@@ -21,9 +23,27 @@ static PEERS: OnceLock<Arc<dyn Peers>> = OnceLock::new();
 /// The place that this process shares with others.
 static PLACE: OnceLock<Arc<Ranks>> = OnceLock::new();
 
+/// Number of processes on this machine.
+static ON_MACHINE: OnceLock<u64> = OnceLock::new();
+
 /// From now on, runs of this process are those of all processes that `peers` connects.
 pub fn join(peers: Arc<dyn Peers>) {
+    let _ = ON_MACHINE.set(namesakes(peers.as_ref(), &System::host_name().unwrap_or_default()));
     let _ = PEERS.set(peers);
+}
+
+/// Number of processes of a run on this machine, which share its memory.
+pub(crate) fn on_machine() -> u64 {
+    ON_MACHINE.get().copied().unwrap_or(1)
+}
+
+/// Number of processes whose machine has this name.
+fn namesakes(peers: &dyn Peers, name: &str) -> u64 {
+    // Each byte of a checksum as a number.
+    let own: Vec<f32> = of_text(name).bytes().map(f32::from).collect();
+    let mut all = vec![vec![0.0; own.len()]; peers.count()];
+    peers.exchange(&vec![own.clone(); peers.count()], &mut all);
+    all.iter().filter(|other| **other == own).count() as u64
 }
 
 /// Number of processes of a run.
@@ -50,4 +70,18 @@ pub(crate) fn backend(open: impl FnOnce(usize) -> Result<Box<dyn Backend>>) -> O
         Box::new(Member { device, place: place.clone() }) as Box<dyn Backend>
     };
     Some(open(peers.rank()).map(shared))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_core::place::Threads;
+
+    #[test]
+    fn processes_on_machines_of_one_name_are_counted() {
+        let threads = Threads::new(3);
+        let peers: Vec<_> = threads.peers().collect();
+        let count = |rank: usize| Ok(namesakes(peers[rank].as_ref(), ["one", "one", "two"][rank]));
+        assert_eq!(threads.run(|| count(0), count).unwrap(), [2, 2, 1]);
+    }
 }

@@ -1,6 +1,6 @@
 //! The arena: parameters, gradients and optimizer state of a whole pipeline, under their names.
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ensure};
 use crate::pages::Pages;
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -41,7 +41,7 @@ impl Layout {
 }
 
 /// Everything that training changes.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Clone, Default)]
 pub struct Arena {
     /// Parameters.
     pub params: Pages,
@@ -128,14 +128,8 @@ impl Weights {
             let Some((shape, data)) = self.tensors.get(&b.name) else {
                 return Err(Error::invalid(place, &b.name, "nothing", format!("a tensor of shape {:?}", b.shape)));
             };
-            if *shape != b.shape {
-                return Err(Error::invalid(
-                    place,
-                    &b.name,
-                    format!("shape {shape:?}"),
-                    format!("shape {:?} as this pipeline has it", b.shape),
-                ));
-            }
+            let expected = format!("shape {:?} as this pipeline has it", b.shape);
+            ensure(*shape == b.shape, place, &b.name, format!("shape {shape:?}"), expected)?;
             if let Some(x) = data.iter().find(|x| !x.is_finite()) {
                 return Err(Error::invalid(place, &b.name, x, "finite weights"));
             }

@@ -50,13 +50,7 @@ fn affine_blocks<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, bias: Option<&[
         let w = WeightMatrix { data: rows, ..w };
         let (bias, y) = (bias.map(|b| &b[o..]), &mut y[o * n..]);
         let mut i = 0;
-        o += if high >= 8 {
-            8
-        } else if high >= 4 {
-            4
-        } else {
-            1
-        };
+        o += height(high);
         while i < n {
             let wide = i + 2 * len <= n;
             let full = i + len <= n;
@@ -71,6 +65,16 @@ fn affine_blocks<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, bias: Option<&[
             }
             i += if wide { 2 * len } else { len };
         }
+    }
+}
+
+/// Channels of a block where so many are left.
+#[inline(always)]
+fn height(left: usize) -> usize {
+    match left {
+        8.. => 8,
+        4.. => 4,
+        _ => 1,
     }
 }
 
@@ -152,13 +156,7 @@ fn input_blocks<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, dy: &[R], dx: &m
         let w = WeightMatrix { column: w.column + c, ..w };
         let dx = &mut dx[c * n..];
         let mut i = 0;
-        c += if broad >= 8 {
-            8
-        } else if broad >= 4 {
-            4
-        } else {
-            1
-        };
+        c += height(broad);
         while i < n {
             let wide = i + 2 * len <= n;
             let full = i + len <= n;

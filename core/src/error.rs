@@ -95,13 +95,15 @@ impl Error {
     /// The same error with `key` prepended to the field of a spec. The owner of a stage calls this, as a stage does not
     /// know its own path.
     pub fn within(self, key: &str) -> Self {
-        match self {
-            Self::Invalid { place, field, found, expected } if place == "spec" => {
-                let field = if field.is_empty() { key.to_owned() } else { format!("{key}.{field}") };
-                Self::Invalid { place, field, found, expected }
-            }
-            other => other,
+        if matches!(&self, Self::Invalid { place, .. } if place == "spec") { self.below(key) } else { self }
+    }
+
+    /// The error of a value at `step` of a table or list, wherever that is.
+    pub(crate) fn below(mut self, step: &str) -> Self {
+        if let Self::Invalid { field, .. } = &mut self {
+            *field = if field.is_empty() { step.to_owned() } else { format!("{step}.{field}") };
         }
+        self
     }
 
     /// A system error at `path`.

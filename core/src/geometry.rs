@@ -4,8 +4,9 @@
 //! detector columns (u) run along `(-sin a, cos a, 0)` and detector rows (v) run towards −z. A view is stored as
 //! vectors, so that irregular orbits need no special case.
 
-use crate::error::{Error, Result, ensure};
+use crate::error::{Result, ensure};
 use serde::{Deserialize, Serialize};
+use std::fmt::Debug;
 use std::ops::Range;
 
 /// A point or vector in the world, in millimetres.
@@ -174,29 +175,20 @@ impl VoxelGrid {
 
     /// Refuses empty grids, sizes beyond memory, and spacings that are not positive and finite.
     pub fn validate(&self, place: &str) -> Result<()> {
-        ensure(!self.is_empty(), place, "volume.shape", format!("{:?}", self.shape), "at least one voxel per axis")?;
-        ensure(
-            self.len().is_some_and(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize)),
-            place,
-            "volume.shape",
-            format!("{:?}", self.shape),
-            "a number of voxels that can be addressed",
-        )?;
-        ensure(
-            self.spacing.iter().all(|s| s.is_finite() && *s > 0.0),
-            place,
-            "volume.spacing",
-            format!("{:?}", self.spacing),
-            "positive finite millimetres",
-        )?;
-        ensure(
-            self.center.iter().all(|s| s.is_finite()),
-            place,
-            "volume.center",
-            format!("{:?}", self.center),
-            "finite millimetres",
-        )
+        let check = |ok: bool, key: &str, found: &dyn Debug, expected: &str| {
+            ensure(ok, place, &format!("volume.{key}"), format!("{found:?}"), expected)
+        };
+        check(!self.is_empty(), "shape", &self.shape, "at least one voxel per axis")?;
+        check(addressable(self.len()), "shape", &self.shape, "a number of voxels that can be addressed")?;
+        let spaced = self.spacing.iter().all(|s| s.is_finite() && *s > 0.0);
+        check(spaced, "spacing", &self.spacing, "positive finite millimetres")?;
+        check(self.center.iter().all(|s| s.is_finite()), "center", &self.center, "finite millimetres")
     }
+}
+
+/// Whether memory can hold as many numbers in double precision.
+fn addressable(count: Option<usize>) -> bool {
+    count.and_then(|n| n.checked_mul(8)).is_some_and(|bytes| bytes <= isize::MAX as usize)
 }
 
 /// Views, detector and volume: maps every detector pixel to a ray through the volume.
@@ -300,53 +292,23 @@ impl Geometry {
     pub fn validate(&self, place: &str) -> Result<()> {
         self.volume.validate(place)?;
         ensure(!self.views.is_empty(), place, "views", 0, "at least one view")?;
-        ensure(
-            self.detector[0] > 0 && self.detector[1] > 0,
-            place,
-            "detector",
-            format!("{:?}", self.detector),
-            "at least one row and one column",
-        )?;
-        ensure(
-            self.measurements().is_some_and(|n| n.checked_mul(8).is_some_and(|b| b <= isize::MAX as usize)),
-            place,
-            "detector",
-            format!("{} views of {:?}", self.views.len(), self.detector),
-            "a number of pixels that can be addressed",
-        )?;
+        let detector = format!("{:?}", self.detector);
+        ensure(!self.detector.contains(&0), place, "detector", &detector, "at least one row and one column")?;
+        let found = format!("{} views of {detector}", self.views.len());
+        let measured = addressable(self.measurements());
+        ensure(measured, place, "detector", found, "a number of pixels that can be addressed")?;
         let [lo, hi] = self.volume.bounds();
         for (i, v) in self.views.iter().enumerate() {
             let field = format!("views[{i}]");
-            let all = [v.source, v.detector, v.u, v.v];
-            ensure(
-                all.iter().flatten().all(|x| x.is_finite()),
-                place,
-                &field,
-                "a number that is not finite",
-                "finite millimetres",
-            )?;
-            ensure(
-                norm(cross(v.u, v.v)) > 0.0,
-                place,
-                &field,
-                "parallel or zero pixel axes",
-                "two independent detector axes",
-            )?;
-            ensure(
-                v.normal().1 > 0.0,
-                place,
-                &field,
-                "a source in the plane of the detector",
-                "a source before the detector",
-            )?;
-            if (0..3).all(|k| v.source[k] > lo[k] && v.source[k] < hi[k]) {
-                return Err(Error::invalid(
-                    place,
-                    field,
-                    format!("a source at {:?} mm inside the volume", v.source),
-                    "a source outside the volume (check units and distances)",
-                ));
-            }
+            let finite = [v.source, v.detector, v.u, v.v].iter().flatten().all(|x| x.is_finite());
+            ensure(finite, place, &field, "a number that is not finite", "finite millimetres")?;
+            let independent = norm(cross(v.u, v.v)) > 0.0;
+            ensure(independent, place, &field, "parallel or zero pixel axes", "two independent detector axes")?;
+            let before = v.normal().1 > 0.0;
+            ensure(before, place, &field, "a source in the plane of the detector", "a source before the detector")?;
+            let outside = (0..3).any(|k| v.source[k] <= lo[k] || v.source[k] >= hi[k]);
+            let found = format!("a source at {:?} mm inside the volume", v.source);
+            ensure(outside, place, &field, found, "a source outside the volume (check units and distances)")?;
         }
         Ok(())
     }

@@ -28,13 +28,8 @@ fn through(model: &Model, which: Range<usize>, features: &[f32], rows: usize) ->
         .collect();
     let stages = &stages[which];
     let width = pipeline.encoder.info().output;
-    ensure(
-        features.len() == width * rows,
-        "features",
-        "length",
-        features.len(),
-        format!("{width} channels of {rows} rows"),
-    )?;
+    let (found, expected) = (features.len(), format!("{width} channels of {rows} rows"));
+    ensure(found == width * rows, "features", "length", found, expected)?;
     let wide = stages.last().map_or(width, |(stage, _)| stage.info().output);
     let mut out = vec![0.0; wide * rows];
     // Some stages that look along rays need points off any ray one at a time.

@@ -55,14 +55,10 @@ impl<'a> Job<'a> {
             seed: 0,
             limits: Limits::default(),
             start: None,
-            volumes: &no_volumes,
+            volumes: &|path| Err(Error::unsupported(path, "this job reads no volumes")),
             resume: None,
         }
     }
-}
-
-fn no_volumes(path: &str) -> Result<Volume> {
-    Err(Error::unsupported(path, "this job reads no volumes"))
 }
 
 /// Limits of a run; the first one reached stops it.

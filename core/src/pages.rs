@@ -6,7 +6,6 @@
 use crate::parallel;
 use bytemuck::Pod;
 use memmap2::MmapMut;
-use std::fmt;
 use std::ops::{Deref, DerefMut};
 
 /// Smaller slices use plain pages.
@@ -75,18 +74,6 @@ impl<T: Pod + Send + Sync> Clone for Pages<T> {
         let mut new = Self::zeros(self.len());
         copy(&mut new, self);
         new
-    }
-}
-
-impl<T: Pod + PartialEq> PartialEq for Pages<T> {
-    fn eq(&self, other: &Self) -> bool {
-        **self == **other
-    }
-}
-
-impl<T: Pod> fmt::Debug for Pages<T> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} numbers", self.len())
     }
 }
 

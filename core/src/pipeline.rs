@@ -6,8 +6,8 @@ use crate::opened::Opened;
 use crate::scene::Scene;
 use crate::simd::Real;
 use crate::stage::{
-    Encoder, Field, GradKind, Grads, Info, Kernel, Lengths, Normalizer, Parameter, Projector, Samples, Scope, Stage,
-    Tile, TileMut, UnitRay,
+    Encoder, Field, Grads, Info, Kernel, Lengths, Normalizer, Parameter, Projector, Samples, Scope, Stage, Tile,
+    TileMut, UnitRay,
 };
 use std::ops::Range;
 use std::sync::Arc;
@@ -48,13 +48,8 @@ impl Pipeline {
         projector: Box<dyn Projector>,
     ) -> Result<Self> {
         let mut width = check("encoder", encoder.as_ref(), 3)?;
-        ensure(
-            encoder.info().scope == Scope::Row,
-            "spec",
-            "encoder",
-            "one whose rows depend on each other",
-            "an encoder that treats each point alone",
-        )?;
+        let (found, expected) = ("one whose rows depend on each other", "an encoder that treats each point alone");
+        ensure(encoder.info().scope == Scope::Row, "spec", "encoder", found, expected)?;
         for (i, n) in normalizers.iter().enumerate() {
             width = check(&format!("normalizers.{i}"), n.as_ref(), width)?;
         }
@@ -278,8 +273,7 @@ impl<R: Real> Kernel<R> for Positions {
 
 impl Stage for Positions {
     fn info(&self) -> Info {
-        let (scope, grads) = (Scope::Row, GradKind::None);
-        Info { input: 3, output: 3, params: 0, tape: 0, scope, grads, macs: 0, identity: true }
+        Info { input: 3, output: 3, identity: true, ..Info::default() }
     }
 
     fn parameters(&self) -> Vec<Parameter> {

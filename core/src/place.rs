@@ -15,7 +15,7 @@ mod threads;
 mod views;
 
 pub use map::{ADD, CLIP, DIVIDE, EXTRAPOLATE, INVERT, MULTIPLY, Map, RELAX, Reduction, squares};
-pub use penalty::{Bounds, Dual, Guide, Kernels, Penalty, Update};
+pub use penalty::{Bounds, Dual, Guide, Kernels, Penalty, ProximalStep, Update, UpdateOf};
 pub use ranks::{Peers, Ranks, Slab};
 pub use streamed::{SPARE, Streamed, zeros_with_spare};
 pub use threads::Threads;
@@ -25,7 +25,7 @@ use crate::allowance;
 use crate::error::{Error, Result};
 use crate::geometry::Geometry;
 use crate::parallel;
-use crate::voxel::{VoxelOperator, VoxelProjector};
+use crate::voxel::VoxelProjector;
 use ndarray::{Array3, ArrayView3, ArrayViewMut3, Axis, CowArray, Ix3, s};
 use serde::Serialize;
 use std::any::Any;
@@ -199,24 +199,15 @@ pub struct Moved {
     pub from_device: u64,
 }
 
-/// The arrays of a proximal gradient step; see [`Update`].
-pub struct ProximalStep<'a> {
-    /// Negative gradient of the data term at `ahead`; unspecified afterwards.
-    pub gradient: &'a mut Array,
-    /// Point of the gradient; afterwards the point of the next one.
-    pub ahead: &'a mut Array,
-    /// The coefficients.
-    pub x: &'a mut Array,
-    /// The coefficients to pull towards, and the share of the way.
-    pub towards: Option<(&'a Array, f32)>,
-    /// Coefficients that may be non-zero, if not all.
-    pub inside: Option<&'a Mask>,
-    /// Step along `gradient`.
-    pub step: f32,
-    /// Extrapolation beyond the new coefficients.
-    pub momentum: f32,
-    /// Weight of the penalty's proximal map.
-    pub tau: f32,
+/// The rays of some views, and the projector that computes line integrals along them.
+#[derive(Clone, Copy)]
+pub struct ViewRays<'a> {
+    /// The projector.
+    pub projector: &'a dyn VoxelProjector,
+    /// Source and detector of all views, and the volume.
+    pub geometry: &'a Geometry,
+    /// The views.
+    pub views: &'a [usize],
 }
 
 /// The derivative of a smoothed total variation, `Σ_j √(1 + Σ_k (unit·weights_k·(x_{j+k} − x_j))²)`, by each voxel.
@@ -233,7 +224,9 @@ pub struct VariationSlope<'a> {
 /// Allocates arrays and combines them. All arrays of a call come from this place.
 pub trait Place: Send + Sync {
     /// The name of its device; `None` for the host.
-    fn device(&self) -> Option<String>;
+    fn device(&self) -> Option<String> {
+        None
+    }
 
     /// Zeros.
     ///
@@ -372,32 +365,17 @@ pub trait Place: Send + Sync {
 
     /// Overwrites the first images of `images` with the line integrals of `volume`; see
     /// [`crate::voxel::VoxelOperator::forward`].
-    fn forward(
-        &self,
-        projector: &dyn VoxelProjector,
-        geometry: &Geometry,
-        views: &[usize],
-        volume: &Array,
-        images: &mut Array,
-    ) -> Result<()> {
+    fn forward(&self, rays: ViewRays<'_>, volume: &Array, images: &mut Array) -> Result<()> {
         let volume = self.read(volume)?;
-        let operator = projector.operator();
-        self.change(images, &mut |images| {
-            project(operator, geometry, views, volume.view(), images.slice_mut(s![..views.len(), .., ..]));
-        })?;
+        let operator = rays.projector.operator();
+        self.change(images, &mut |images| project(rays, volume.view(), images))?;
         operator.fault()
     }
 
     /// Adds the adjoint of the line integrals for the first images of `images` to `volume`.
-    fn adjoint(
-        &self,
-        projector: &dyn VoxelProjector,
-        geometry: &Geometry,
-        views: &[usize],
-        images: &Array,
-        volume: &mut Array,
-    ) -> Result<()> {
+    fn adjoint(&self, rays: ViewRays<'_>, images: &Array, volume: &mut Array) -> Result<()> {
         let images = self.read(images)?;
+        let ViewRays { projector, geometry, views } = rays;
         let operator = projector.operator();
         self.change(volume, &mut |volume| {
             operator.adjoint(geometry, views, images.slice(s![..views.len(), .., ..]), volume.view_mut());
@@ -440,9 +418,9 @@ pub trait Place: Send + Sync {
         })
     }
 
-    /// A proximal gradient step with `penalty`.
-    fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
-        self.update_around(step, penalty)
+    /// A proximal gradient step with `penalty`, whose proximal map has the weight `tau`.
+    fn update(&self, step: ProximalStep<'_>, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+        self.update_around(step, tau, penalty)
     }
 
     /// Overwrites `v` with the proximal map of `penalty` at `v`; see [`Penalty::prox`].
@@ -451,8 +429,8 @@ pub trait Place: Send + Sync {
     }
 
     /// The same, around [`Place::prox`].
-    fn update_around(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
-        let ProximalStep { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
+    fn update_around(&self, step: ProximalStep<'_>, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+        let ProximalStep { gradient, ahead, x, towards, inside, step, momentum } = step;
         // The argument of the proximal map, in `gradient`.
         self.map(&ADD, [1.0, f64::from(step)], gradient, &[ahead])?;
         if let Some((towards, share)) = towards {
@@ -472,11 +450,8 @@ pub trait Place: Send + Sync {
         Ok(penalty.value(self.read(x)?.view()))
     }
 
-    /// Adapts `penalty` to `x`; see [`Penalty::adapt`].
+    /// Adapts an adaptive `penalty` to `x`; see [`Penalty::adapt`].
     fn adapt(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<Option<f64>> {
-        if !penalty.adapts() {
-            return Ok(None);
-        }
         Ok(penalty.adapt(self.read(x)?.view()))
     }
 
@@ -496,10 +471,6 @@ pub trait Place: Send + Sync {
 pub struct Host;
 
 impl Place for Host {
-    fn device(&self) -> Option<String> {
-        None
-    }
-
     fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
         Ok(Array::host(Array3::zeros(shape)))
     }
@@ -513,8 +484,8 @@ impl Place for Host {
     }
 
     /// A penalty can fuse the whole update into one pass over memory.
-    fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
-        let ProximalStep { gradient, ahead, x, towards, inside, step, momentum, tau } = step;
+    fn update(&self, step: ProximalStep<'_>, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+        let ProximalStep { gradient, ahead, x, towards, inside, step, momentum } = step;
         let [gradient, ahead, x] = [gradient, ahead, x].map(Array::slice_mut);
         let towards = towards.map(|(to, share)| (to.slice(), share));
         penalty.update(Update { gradient, ahead, x, step, momentum, towards, inside: inside.map(Mask::slice) }, tau);
@@ -575,15 +546,11 @@ fn additive(projector: &dyn VoxelProjector) -> Result<()> {
     Err(Error::invalid("spec", "projector", projector.describe(), expected))
 }
 
-/// Overwrites `images` with the line integrals of `volume`. A volume that memory does not hold is projected in slabs, so
+/// Overwrites the first of `images` with the line integrals of `volume`. A volume that memory does not hold is projected in slabs, so
 /// that each is read once for all views, not once for each view. Sums of slabs round differently.
-fn project(
-    operator: &dyn VoxelOperator<f32>,
-    geometry: &Geometry,
-    views: &[usize],
-    volume: ArrayView3<'_, f32>,
-    mut images: ArrayViewMut3<'_, f32>,
-) {
+fn project(rays: ViewRays<'_>, volume: ArrayView3<'_, f32>, images: &mut Array3<f32>) {
+    let ViewRays { geometry, views, .. } = rays;
+    let (operator, mut images) = (rays.projector.operator(), images.slice_mut(s![..views.len(), .., ..]));
     let (bytes, nx) = (4 * volume.len() as u64, volume.len_of(Axis(0)));
     // A room is a third of the memory or less.
     if bytes / 3 <= allowance::room() || !operator.is_additive() {

@@ -1,6 +1,6 @@
 //! Scans (projections with geometry) and volumes (voxels with grid).
 
-use crate::error::{Result, ensure};
+use crate::error::{Error, Result, ensure};
 use crate::finite::{first_not, stray};
 use crate::geometry::{Geometry, Vec3, View, VoxelGrid};
 use crate::parallel;
@@ -133,32 +133,20 @@ impl Scan {
         self.geometry.validate(place)?;
         let g = &self.geometry;
         let want = [g.views.len(), g.detector[0], g.detector[1]];
-        ensure(
-            self.projections.shape() == want,
-            place,
-            "projections.shape",
-            format!("{:?}", self.projections.shape()),
-            format!("{want:?} (views, rows, columns)"),
-        )?;
-        ensure(
-            self.unit.mm.is_finite() && self.unit.mm > 0.0,
-            place,
-            "unit.mm",
-            self.unit.mm,
-            "a positive finite number of millimetres",
-        )?;
+        let found = self.projections.shape();
+        let expected = format!("{want:?} (views, rows, columns)");
+        ensure(found == want, place, "projections.shape", format!("{found:?}"), expected)?;
+        let mm = self.unit.mm;
+        ensure(mm.is_finite() && mm > 0.0, place, "unit.mm", mm, "a positive finite number of millimetres")?;
+        let refuse = |at: (usize, usize, usize), found: String, expected: String| {
+            Err(Error::invalid(place, format!("projections[{}, {}, {}]", at.0, at.1, at.2), found, expected))
+        };
         if let Some((at, x)) = stray(&self.projections) {
-            return Err(crate::Error::invalid(
-                place,
-                format!("projections[{}, {}, {}]", at.0, at.1, at.2),
-                x,
-                "a finite line integral",
-            ));
+            return refuse(at, x.to_string(), "a finite line integral".into());
         }
         if let Some((at, x)) = first_not(&self.projections, |x| x.abs() <= MOST) {
-            let field = format!("projections[{}, {}, {}]", at.0, at.1, at.2);
             let expected = format!("a line integral of at most {MOST:e}, past which single precision overflows");
-            return Err(crate::Error::invalid(place, field, format!("{x:e}"), expected));
+            return refuse(at, format!("{x:e}"), expected);
         }
         Ok(())
     }
@@ -197,19 +185,18 @@ impl Scan {
                 *mean = block.sum() / (tall * wide) as f32;
             }
         });
-        let geometry = Geometry { detector, views, volume: g.volume };
-        Scan { geometry, projections, unit: self.unit.clone(), provenance: self.provenance.clone() }
+        self.with(Geometry { detector, views, volume: g.volume }, projections)
     }
 
     fn select(&self, views: &[usize]) -> Scan {
-        let mut geometry = self.geometry.clone();
-        geometry.views = views.iter().map(|&v| self.geometry.views[v]).collect();
-        Scan {
-            geometry,
-            projections: self.projections.select(ndarray::Axis(0), views),
-            unit: self.unit.clone(),
-            provenance: self.provenance.clone(),
-        }
+        let geometry =
+            Geometry { views: views.iter().map(|&v| self.geometry.views[v]).collect(), ..self.geometry.clone() };
+        self.with(geometry, self.projections.select(ndarray::Axis(0), views))
+    }
+
+    /// A scan of the same origin.
+    fn with(&self, geometry: Geometry, projections: Array3<f32>) -> Scan {
+        Scan { geometry, projections, unit: self.unit.clone(), provenance: self.provenance.clone() }
     }
 }
 

@@ -54,12 +54,16 @@ pub trait Real:
     /// `K` neighbours of every lane: `line[at]`, `line[at + 1]`, … The lanes of `at` are integers in non-decreasing
     /// order. If they span less than four vectors, and `line` is long enough from the first one, registers are shuffled
     /// instead of reading memory lane by lane.
-    fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
+    #[inline(always)]
+    fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+        one_by_one(s, line, at)
+    }
     /// `K` neighbours of every lane within the first `W` vectors of `line`, 2 to 4: `line[at]`, `line[at + 1]`, … The
     /// lanes of `at` are integers, and all neighbours are in range.
-    fn window<S: Simd, const K: usize, const W: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K];
-    /// Whether the number is neither infinite nor NaN.
-    fn finite(self) -> bool;
+    #[inline(always)]
+    fn window<S: Simd, const K: usize, const W: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
+        one_by_one(s, line, at)
+    }
     /// Exponential of every lane.
     fn exp_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self>;
     /// 2 to the power of every lane, which is at most 0; `f32`: relative error below 2e-7, and at least 2^-126.
@@ -79,7 +83,44 @@ pub trait Real:
     /// Natural logarithm of `1 + exp(x)` without overflow.
     fn softplus(self) -> Self;
     /// Runs `op` with the instructions for which its kernels are compiled.
-    fn dispatch<O: Op>(op: O) -> O::Out;
+    #[inline]
+    fn dispatch<O: Op>(op: O) -> O::Out {
+        at_baseline(op)
+    }
+}
+
+/// The functions of single numbers.
+macro_rules! functions {
+    ($number:ident) => {
+        #[inline(always)]
+        fn floor(self) -> Self {
+            $number::floor(self)
+        }
+        #[inline(always)]
+        fn int(self) -> i64 {
+            self as i64
+        }
+        #[inline(always)]
+        fn count(self) -> u32 {
+            self as u32
+        }
+        #[inline(always)]
+        fn exp(self) -> Self {
+            $number::exp(self)
+        }
+        #[inline(always)]
+        fn ln(self) -> Self {
+            $number::ln(self)
+        }
+        #[inline(always)]
+        fn sin_cos(self) -> (Self, Self) {
+            $number::sin_cos(self)
+        }
+        #[inline(always)]
+        fn softplus(self) -> Self {
+            self.max(0.0) + (-self.abs()).exp().ln_1p()
+        }
+    };
 }
 
 /// 2^r for |r| ≤ ½, highest power first (Remez, relative error 8e-8).
@@ -87,6 +128,7 @@ const POWER_OF_TWO: [f32; 6] =
     [1.327_647_2e-3, 9.675_541e-3, 5.550_713_3e-2, 2.402_211_9e-1, 6.931_469_7e-1, 1.000_000_1];
 
 impl Real for f32 {
+    functions!(f32);
     type Four<S: Simd> = fearless_simd::f32x4<S>;
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
@@ -97,18 +139,6 @@ impl Real for f32 {
     #[inline(always)]
     fn f64(self) -> f64 {
         f64::from(self)
-    }
-    #[inline(always)]
-    fn floor(self) -> Self {
-        f32::floor(self)
-    }
-    #[inline(always)]
-    fn int(self) -> i64 {
-        self as i64
-    }
-    #[inline(always)]
-    fn count(self) -> u32 {
-        self as u32
     }
     #[inline(always)]
     fn cells<S: Simd>(_: S, x: V<S, Self>, out: &mut [u32]) {
@@ -160,10 +190,6 @@ impl Real for f32 {
             }
         }
         all
-    }
-    #[inline(always)]
-    fn finite(self) -> bool {
-        self.is_finite()
     }
     #[inline(always)]
     fn exp_lanes<S: Simd>(s: S, x: V<S, Self>) -> V<S, Self> {
@@ -248,22 +274,6 @@ impl Real for f32 {
         }
         [cdf, pdf]
     }
-    #[inline(always)]
-    fn exp(self) -> Self {
-        f32::exp(self)
-    }
-    #[inline(always)]
-    fn ln(self) -> Self {
-        f32::ln(self)
-    }
-    #[inline(always)]
-    fn sin_cos(self) -> (Self, Self) {
-        f32::sin_cos(self)
-    }
-    #[inline(always)]
-    fn softplus(self) -> Self {
-        self.max(0.0) + (-self.abs()).exp().ln_1p()
-    }
     #[inline]
     fn dispatch<O: Op>(op: O) -> O::Out {
         #[cfg(target_arch = "x86_64")]
@@ -280,6 +290,7 @@ impl Real for f32 {
 }
 
 impl Real for f64 {
+    functions!(f64);
     type Four<S: Simd> = fearless_simd::f64x4<S>;
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
@@ -292,34 +303,10 @@ impl Real for f64 {
         self
     }
     #[inline(always)]
-    fn floor(self) -> Self {
-        f64::floor(self)
-    }
-    #[inline(always)]
-    fn int(self) -> i64 {
-        self as i64
-    }
-    #[inline(always)]
-    fn count(self) -> u32 {
-        self as u32
-    }
-    #[inline(always)]
     fn cells<S: Simd>(_: S, x: V<S, Self>, out: &mut [u32]) {
         for (o, x) in out.iter_mut().zip(x.as_slice()) {
             *o = *x as u32;
         }
-    }
-    #[inline(always)]
-    fn neighbours<S: Simd, const K: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
-        one_by_one(s, line, at)
-    }
-    #[inline(always)]
-    fn window<S: Simd, const K: usize, const W: usize>(s: S, line: &[Self], at: V<S, Self>) -> [V<S, Self>; K] {
-        one_by_one(s, line, at)
-    }
-    #[inline(always)]
-    fn finite(self) -> bool {
-        self.is_finite()
     }
     #[inline(always)]
     fn exp_lanes<S: Simd>(_: S, mut x: V<S, Self>) -> V<S, Self> {
@@ -346,26 +333,6 @@ impl Real for f64 {
             }
         }
         [cdf, pdf]
-    }
-    #[inline(always)]
-    fn exp(self) -> Self {
-        f64::exp(self)
-    }
-    #[inline(always)]
-    fn ln(self) -> Self {
-        f64::ln(self)
-    }
-    #[inline(always)]
-    fn sin_cos(self) -> (Self, Self) {
-        f64::sin_cos(self)
-    }
-    #[inline(always)]
-    fn softplus(self) -> Self {
-        self.max(0.0) + (-self.abs()).exp().ln_1p()
-    }
-    #[inline]
-    fn dispatch<O: Op>(op: O) -> O::Out {
-        at_baseline(op)
     }
 }
 

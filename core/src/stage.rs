@@ -203,36 +203,6 @@ pub trait Kernel<R: Real>: Send + Sync {
     }
 }
 
-impl<R: Real, K: Kernel<R> + ?Sized> Kernel<R> for &K {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        (**self).forward(params, x, y, tape);
-    }
-
-    fn passes(&self) -> usize {
-        (**self).passes()
-    }
-
-    fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        (**self).forward_pass(pass, params, x, y, tape);
-    }
-
-    fn points(&self) -> Option<&(dyn Kernel<R> + '_)> {
-        (**self).points()
-    }
-
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        (**self).backward(params, x, tape, dy, grads, dx);
-    }
-}
-
 /// A map from rows of `info.input` channels to rows of `info.output` channels.
 pub trait Stage: Send + Sync {
     /// Widths, counts and cost.

@@ -310,30 +310,33 @@ mod tests {
         Support::new(grid(), cells).unwrap()
     }
 
+    /// Compares where rays meet a region with the points that it holds, in small steps: `count` random rays from `origin`
+    /// of two numbers in ±80.
+    fn check_rays(s: &Support, seed: u64, count: u64, origin: fn([f64; 2]) -> Vec3) {
+        for i in 0..count {
+            let draw = |k: u64| f64::from(unit(mix(seed * 1000 + i, k))) * 2.0 - 1.0;
+            let origin = origin([80.0 * draw(1), 80.0 * draw(2)]);
+            let towards: Vec3 = std::array::from_fn(|k| 25.0 * draw(3 + k as u64) - origin[k]);
+            let length = towards.iter().map(|x| x * x).sum::<f64>().sqrt();
+            let ray = Ray { origin, direction: towards.map(|x| x / length) };
+            let [near, far] = ray.clip(grid().bounds()).unwrap_or_default();
+            let steps = (0..5000).map(|j| f64::from(j) * 0.05).filter(|t| *t > near && *t < far);
+            let hits: Vec<f64> = steps.filter(|&t| s.holds(ray.at(t))).collect();
+            match (s.clip(&ray), hits.first(), hits.last()) {
+                (Some([a, b]), Some(first), Some(last)) => {
+                    assert!((a - first).abs() < 0.06 && (b - last).abs() < 0.06, "{a} {first} {b} {last}");
+                }
+                // A corner cut between two steps.
+                (Some([a, b]), None, None) => assert!(b - a < 0.06, "{a} {b}"),
+                (found, first, _) => assert!(found.is_none() && first.is_none(), "{found:?} {first:?}"),
+            }
+        }
+    }
+
     #[test]
     fn rays_are_cut_to_where_cells_are() {
         for seed in 1..30 {
-            let s = random(seed);
-            for i in 0..40 {
-                let draw = |k: u64| f64::from(unit(mix(seed * 1000 + i, k))) * 2.0 - 1.0;
-                let origin = [80.0 * draw(1), 80.0 * draw(2), -90.0];
-                let towards: Vec3 = std::array::from_fn(|k| 25.0 * draw(3 + k as u64) - origin[k]);
-                let length = towards.iter().map(|x| x * x).sum::<f64>().sqrt();
-                let ray = Ray { origin, direction: towards.map(|x| x / length) };
-                // In small steps.
-                let hits: Vec<f64> = (0..4000)
-                    .map(|j| f64::from(j) * 0.06)
-                    .filter(|&t| ray.clip(grid().bounds()).is_some_and(|[a, b]| t > a && t < b) && s.holds(ray.at(t)))
-                    .collect();
-                match (s.clip(&ray), hits.first(), hits.last()) {
-                    (Some([a, b]), Some(first), Some(last)) => {
-                        assert!((a - first).abs() < 0.07 && (b - last).abs() < 0.07, "{a} {first} {b} {last}");
-                    }
-                    // A corner cut between two steps.
-                    (Some([a, b]), None, None) => assert!(b - a < 0.07, "{a} {b}"),
-                    (found, first, _) => assert!(found.is_none() && first.is_none(), "{found:?} {first:?}"),
-                }
-            }
+            check_rays(&random(seed), seed, 40, |[x, y]| [x, y, -90.0]);
         }
     }
 
@@ -368,21 +371,7 @@ mod tests {
             assert!((s.share(&grid()) - share).abs() < 1e-9, "{}", s.share(&grid()));
             let text = serde_json::to_string(s).unwrap();
             assert_eq!(serde_json::from_str::<Support>(&text).unwrap(), *s, "{text}");
-            for i in 0..60 {
-                let draw = |k: u64| f64::from(unit(mix(7000 + i, k))) * 2.0 - 1.0;
-                let origin = [80.0 * draw(1), 90.0, 60.0 * draw(2)];
-                let towards: Vec3 = std::array::from_fn(|k| 25.0 * draw(3 + k as u64) - origin[k]);
-                let length = towards.iter().map(|x| x * x).sum::<f64>().sqrt();
-                let ray = Ray { origin, direction: towards.map(|x| x / length) };
-                let hits: Vec<f64> = (0..5000).map(|j| f64::from(j) * 0.05).filter(|&t| s.holds(ray.at(t))).collect();
-                match (s.clip(&ray), hits.first(), hits.last()) {
-                    (Some([a, b]), Some(first), Some(last)) => {
-                        assert!((a - first).abs() < 0.06 && (b - last).abs() < 0.06, "{a} {first} {b} {last}");
-                    }
-                    (Some([a, b]), None, None) => assert!(b - a < 0.06, "{a} {b}"),
-                    (found, first, _) => assert!(found.is_none() && first.is_none(), "{found:?} {first:?}"),
-                }
-            }
+            check_rays(s, 7, 60, |[x, z]| [x, 90.0, 0.75 * z]);
         }
         assert!(Support::cylinder(Cylinder { center: [50.0, -40.0], radius: 15.0 }, &grid()).is_none());
         assert!(Support::cuboid([[40.0; 3], [50.0; 3]], &grid()).is_none());

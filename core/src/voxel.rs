@@ -7,7 +7,6 @@ use crate::scan::ScanHeader;
 use crate::simd::Real;
 use crate::wgsl::Fragment;
 use ndarray::{ArrayView3, ArrayViewMut3};
-use std::sync::Arc;
 
 /// Settings of a projector of voxel volumes.
 pub trait VoxelProjectorSpec: Registered + Send + Sync {
@@ -38,25 +37,6 @@ pub trait VoxelProjector: Send + Sync {
 
     /// A line for `explain`.
     fn describe(&self) -> String;
-}
-
-/// A shared projector.
-impl VoxelProjector for Arc<dyn VoxelProjector> {
-    fn operator(&self) -> &dyn VoxelOperator<f32> {
-        self.as_ref().operator()
-    }
-    fn reference(&self) -> &dyn VoxelOperator<f64> {
-        self.as_ref().reference()
-    }
-    fn wgsl(&self) -> Option<Fragment> {
-        self.as_ref().wgsl()
-    }
-    fn scratch(&self, header: &ScanHeader, views: usize) -> u64 {
-        self.as_ref().scratch(header, views)
-    }
-    fn describe(&self) -> String {
-        self.as_ref().describe()
-    }
 }
 
 /// The system matrix `A` of a geometry: `(Aμ)_i = Σ_j a_ij μ_j`, where `a_ij` is the weight in mm of voxel `j` for ray

@@ -83,18 +83,6 @@ mod tests {
     }
 
     #[test]
-    fn syntax_errors_name_the_line() {
-        let e = parse_toml("a.toml", "x = 1\ny = = 2\n", 1).unwrap_err().to_string();
-        assert!(e.starts_with("a.toml:2:"), "{e}");
-        let e = parse_json("a.json", "{\n \"x\": }", 1).unwrap_err().to_string();
-        assert!(e.starts_with("a.json:2:"), "{e}");
-        let e = parse_json("a.json", "{ \"x\": 1,\n \"x\": 2}", 1).unwrap_err().to_string();
-        assert!(e.starts_with("a.json:2:2: x: found the key a second time"), "{e}");
-        let e = parse_toml("a.toml", "x = nan", 1).unwrap_err().to_string();
-        assert!(e.contains("a finite number"), "{e}");
-    }
-
-    #[test]
     fn values_are_read_and_errors_name_place_and_path() {
         #[derive(Debug, PartialEq, serde::Deserialize)]
         #[serde(deny_unknown_fields)]

@@ -15,6 +15,7 @@ use conefield_core::error::{Error, Result};
 use conefield_core::geometry::{Geometry, View, VoxelGrid, norm};
 use conefield_core::method::{Job, Observer, Record};
 use conefield_core::outside::Outside;
+use conefield_core::place::ViewRays;
 use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::scene::{CoarseSurround, SurroundRule};
 use conefield_projectors::voxel::Joseph;
@@ -183,7 +184,8 @@ impl Around {
         let views: Vec<usize> = (0..geometry.views.len()).collect();
         let mut lines = place.zeros([TOGETHER.min(views.len()), rows, columns])?;
         for some in views.chunks(TOGETHER) {
-            place.forward(&Joseph {}, &whole, some, &cells, &mut lines)?;
+            let rays = ViewRays { projector: &Joseph {}, geometry: &whole, views: some };
+            place.forward(rays, &cells, &mut lines)?;
             some.iter().zip(place.read(&lines)?.outer_iter()).for_each(|(&view, image)| take(view, image));
         }
         Ok(())

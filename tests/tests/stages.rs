@@ -28,7 +28,7 @@ fn expect(report: Report) {
 /// Checks a stage with these settings, on a device too if there is one. Returns the descriptions of those checked.
 fn try_check(kind: Kind, settings: &Value, width: usize, options: &dyn Fn(Options) -> Options) -> Result<Vec<String>> {
     let shared = device::shared("the WGSL of stages");
-    let device = || shared.as_deref().map(|shared| shared as &dyn Runner).ok_or_else(|| "no adapter".into());
+    let device = || shared.map(|shared| shared as &dyn Runner).ok_or_else(|| "no adapter".into());
     let found = check_type(kind, settings, &With { widths: &[width], options, device: &device })?;
     Ok(found.into_iter().map(|(_, report)| checked(kind, report)).collect())
 }

@@ -8,6 +8,7 @@
 //! skipped.
 
 use crate::device::Atomics;
+use Access::{Read, Write};
 use conefield_core::device::{Access, Source, fragment_of};
 use conefield_core::error::{Error, Result};
 use conefield_core::loss::Loss;
@@ -15,7 +16,7 @@ use conefield_core::pipeline::Pipeline;
 use conefield_core::prior::Prior;
 use conefield_core::stage::{GradKind, Info, Projector, Scope, Stage, titled};
 use conefield_core::wgsl::{self, Fragment, RANDOM, RAY, Sum, TOTAL};
-use std::fmt::Write;
+use std::fmt::Write as _;
 use std::ops::Range;
 
 /// Rows per group.
@@ -95,22 +96,13 @@ pub struct Chain {
     blocks: Vec<String>,
     /// Parameters of the arena.
     params: usize,
-    target: Target,
+    pub target: Target,
 }
 
 impl Chain {
     /// The stages of a pipeline. Refuses stages that cannot run on a GPU.
     pub fn new(pipeline: &Pipeline, target: Target) -> Result<Self> {
-        let mut chain = Self {
-            links: vec![],
-            encoder: false,
-            dense: 0,
-            tape: 0,
-            sums: vec![],
-            blocks: vec![],
-            params: pipeline.layout().len(),
-            target,
-        };
+        let mut chain = Self::empty(pipeline.layout().len(), target);
         for (i, ((name, stage), range)) in pipeline.stages().into_iter().zip(pipeline.ranges()).enumerate() {
             if stage.info().identity {
                 continue;
@@ -119,43 +111,41 @@ impl Chain {
             let before = chain.links.iter().any(|l: &Link| l.info.params > 0);
             chain.link(&name, stage, range.clone(), before)?;
         }
-        chain.blocks = blocks_of(&chain.sums);
         Ok(chain)
     }
 
     /// One stage alone, with all its functions.
     pub fn single(stage: &dyn Stage, target: Target) -> Result<Self> {
         let params = stage.info().params;
-        let (links, sums, blocks) = (vec![], vec![], vec![]);
-        let mut chain = Self { links, encoder: false, dense: 0, tape: 0, sums, blocks, params, target };
+        let mut chain = Self::empty(params, target);
         chain.link("stage", stage, 0..params, true)?;
-        chain.blocks = blocks_of(&chain.sums);
         Ok(chain)
+    }
+
+    fn empty(params: usize, target: Target) -> Self {
+        Self { links: vec![], encoder: false, dense: 0, tape: 0, sums: vec![], blocks: vec![], params, target }
     }
 
     fn link(&mut self, name: &str, stage: &dyn Stage, range: Range<usize>, wants_dx: bool) -> Result<()> {
         let (info, name) = (stage.info(), titled(name, &stage.describe()));
+        let refused = |why: String| Error::unsupported(format!("{name} on the wgpu backend"), why);
         if info.scope == Scope::Ray {
-            return Err(Error::unsupported(
-                format!("{name} on the wgpu backend"),
-                "the stage looks along rays and kernels see one row at a time; it runs with --backend cpu",
-            ));
+            let why = "the stage looks along rays and kernels see one row at a time; it runs with --backend cpu";
+            return Err(refused(why.into()));
         }
         if u32::try_from(self.params).is_err() {
-            return Err(Error::unsupported(
-                "the wgpu backend",
-                format!("{} parameters; at most 2^32 can be addressed", self.params),
-            ));
+            let why = format!("{} parameters; at most 2^32 can be addressed", self.params);
+            return Err(Error::unsupported("the wgpu backend", why));
         }
         let fragment = fragment_of(&name, stage.wgsl())?;
         let (keeps, sums) = (fragment.keeps(), fragment.sums());
-        check(&sums, keeps, info.params)
-            .map_err(|why| Error::unsupported(format!("{name} on the wgpu backend"), format!("its WGSL {why}")))?;
+        check(&sums, keeps, info.params).map_err(|why| refused(format!("its WGSL {why}")))?;
         for sum in sums {
             let partial = self.summed();
             let sum = Sum { at: range.start + sum.at, left: self.tape + sum.left, right: self.tape + sum.right, ..sum };
             self.sums.push(RowSum { sum, partial });
         }
+        self.blocks = blocks_of(&self.sums);
         // Vectors of four are read in one piece.
         let dense = (info.grads == GradKind::Dense).then_some(self.dense.next_multiple_of(4));
         self.dense = dense.map_or(self.dense, |first| first + info.params);
@@ -176,11 +166,6 @@ impl Chain {
         self.sums.last().map_or(0, |s| s.partial + s.sum.params())
     }
 
-    /// The stages.
-    pub fn links(&self) -> &[Link] {
-        &self.links
-    }
-
     /// The ranges of the arena in the copy that every row reads, each with its position in the copy.
     pub fn dense_ranges(&self) -> impl Iterator<Item = (usize, Range<usize>)> {
         self.links.iter().filter_map(|l| Some((l.dense?, l.range.clone())))
@@ -194,6 +179,11 @@ impl Chain {
     /// Number of buffers per part of the arena.
     pub fn segments(&self) -> usize {
         self.params.div_ceil(self.target.segment).max(1)
+    }
+
+    /// The range of the arena in buffer `s` of each part.
+    pub fn segment(&self, s: usize) -> Range<usize> {
+        s * self.target.segment..((s + 1) * self.target.segment).min(self.params)
     }
 
     /// Number of feature channels that `forward` keeps for `backward`; 0 if the encoder has no parameters.
@@ -220,14 +210,14 @@ impl Chain {
     /// Binds the arena and, if one of `links` needs it, the copy of the parameters that every row reads.
     fn declare(&self, source: &mut Source, links: &[Link], gradients: bool) {
         for s in 0..self.segments() {
-            source.bind(&format!("params_{s}"), Access::Read, "array<vec2<f32>>");
+            source.bind(&format!("params_{s}"), Read, "array<vec2<f32>>");
         }
         if links.iter().any(|l| l.dense.is_some()) {
             let vectors = self.dense.div_ceil(4);
             // Kernels with a uniform buffer compile fast. But `backward` reads it slowly, for a reason that is not known: on an H200
             // it took 22 ms for 5.2 M samples, and 4.4 ms with a storage buffer.
             match gradients || 16 * vectors > self.target.uniform_bytes {
-                true => source.bind("dense", Access::Read, "array<vec4<f32>>"),
+                true => source.bind("dense", Read, "array<vec4<f32>>"),
                 false => source.bind("dense", Access::Uniform, &format!("array<vec4<f32>, {vectors}>")),
             }
         }
@@ -238,7 +228,7 @@ impl Chain {
         if gradients {
             let atomics = self.target.atomics;
             for s in 0..self.segments() {
-                source.bind(&format!("grads_{s}"), Access::Write, &format!("array<atomic<{}>>", atomics.number()));
+                source.bind(&format!("grads_{s}"), Write, &format!("array<atomic<{}>>", atomics.number()));
                 let _ =
                     writeln!(text, "fn arena_add_{s}(i: u32, v: f32) {{\n{}}}", atomics.sum(&format!("grads_{s}[i]")));
             }
@@ -313,23 +303,15 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
         }
     }
 
-    fn step(source: &mut Source) {
-        source.add("step", include_str!("kernels/step.wgsl"));
-        source.bind("step", Access::Uniform, "Step");
-    }
-
     /// From positions to μ. With `keep` it writes the features and the channels that stages keep.
     pub fn forward(&self, keep: bool) -> Source {
-        let mut source = Source::default();
-        Self::step(&mut source);
-        source.bind("samples", Access::Read, "array<vec4<f32>>");
-        source.bind("mu", Access::Write, "array<f32>");
+        let mut source = begun(&[("samples", Read), ("mu", Write)]);
         let (pass, keep) = if keep { (Pass::Forward, self.kept()) } else { (Pass::Evaluate, 0) };
         if keep > 0 {
-            source.bind("features", Access::Write, "array<f32>");
+            source.bind("features", Write, "array<f32>");
         }
         if pass == Pass::Forward {
-            self.bind_tape(&mut source, Access::Write);
+            self.bind_tape(&mut source, Write);
         }
         self.declare(&mut source, &self.links, false);
         self.links.iter().for_each(|l| self.include(&mut source, l, pass));
@@ -362,10 +344,7 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
 
     /// From positions to features, channel-major.
     pub fn encode(&self) -> Source {
-        let mut source = Source::default();
-        Self::step(&mut source);
-        source.bind("samples", Access::Read, "array<vec4<f32>>");
-        source.bind("features", Access::Write, "array<f32>");
+        let mut source = begun(&[("samples", Read), ("features", Write)]);
         let mut body =
             String::from("        let at = samples[row];\n        var x0 = array<f32, 3>(at.x, at.y, at.z);\n");
         let (mut from, width) = ("x0", self.features());
@@ -386,16 +365,13 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
 
     /// From the derivative with respect to μ to gradients and to the inputs of `sums`.
     pub fn backward(&self) -> Source {
-        let mut source = Source::default();
-        Self::step(&mut source);
-        source.bind("samples", Access::Read, "array<vec4<f32>>");
-        source.bind("dmu", Access::Read, "array<f32>");
+        let mut source = begun(&[("samples", Read), ("dmu", Read)]);
         let kept = self.kept();
         if kept > 0 {
-            let access = if self.scatters() { Access::Write } else { Access::Read };
+            let access = if self.scatters() { Write } else { Read };
             source.bind("features", access, "array<f32>");
         }
-        self.bind_tape(&mut source, Access::Write);
+        self.bind_tape(&mut source, Write);
         self.declare(&mut source, &self.links, true);
         self.additions(&mut source);
         self.links.iter().skip(usize::from(self.scatters())).for_each(|l| self.include(&mut source, l, Pass::Backward));
@@ -446,11 +422,7 @@ fn {prefix}grad(i: u32, v: f32) {{ {scattered} }}
 
     /// From the derivatives with respect to the features to the encoder's gradients.
     pub fn scatter(&self) -> Source {
-        let mut source = Source::default();
-        Self::step(&mut source);
-        source.bind("samples", Access::Read, "array<vec4<f32>>");
-        source.bind("dmu", Access::Read, "array<f32>");
-        source.bind("features", Access::Read, "array<f32>");
+        let mut source = begun(&[("samples", Read), ("dmu", Read), ("features", Read)]);
         self.declare(&mut source, &self.links[..1], true);
         self.additions(&mut source);
         let l = &self.links[0];
@@ -539,11 +511,9 @@ fn arena_scatter_pair(i: u32, v: vec2<f32>) { arena_grad(i, v.x); arena_grad(i +
 
     /// Sums over rows, added to the partial sums of each share.
     pub fn sums(&self) -> Source {
-        let mut source = Source::default();
-        Self::step(&mut source);
-        source.bind("dmu", Access::Read, "array<f32>");
-        self.bind_tape(&mut source, Access::Read);
-        source.bind("partial", Access::Write, "array<f32>");
+        let mut source = begun(&[("dmu", Read)]);
+        self.bind_tape(&mut source, Read);
+        source.bind("partial", Write, "array<f32>");
         let (blocks, summed) = (&self.blocks, self.summed());
         let mut text = format!("const summed = {summed}u;\nconst blocks = {}u;\n", blocks.len());
         source.add("sums", include_str!("kernels/sums.wgsl"));
@@ -566,7 +536,7 @@ fn arena_scatter_pair(i: u32, v: vec2<f32>) { arena_grad(i, v.x); arena_grad(i +
     /// Adds all shares' partial sums to the arena's gradients.
     pub fn merge(&self) -> Source {
         let mut source = Source::default();
-        source.bind("partial", Access::Read, "array<f32>");
+        source.bind("partial", Read, "array<f32>");
         self.declare(&mut source, &[], true);
         let mut text = String::from("fn arena_index(i: u32) -> u32 {\n");
         for RowSum { sum, partial } in &self.sums {
@@ -608,11 +578,8 @@ fn main(
 
     /// One stage alone: `y` of `x`, both channel-major in buffers of their own.
     pub fn single_forward(&self) -> Source {
-        let mut source = Source::default();
-        Self::step(&mut source);
-        source.bind("x", Access::Read, "array<f32>");
-        source.bind("y", Access::Write, "array<f32>");
-        self.bind_tape(&mut source, Access::Write);
+        let mut source = begun(&[("x", Read), ("y", Write)]);
+        self.bind_tape(&mut source, Write);
         self.declare(&mut source, &self.links, false);
         let l = &self.links[0];
         self.include(&mut source, l, Pass::Forward);
@@ -634,12 +601,8 @@ fn main(
 
     /// One stage alone: gradients and `dx` of `x` and `dy`.
     pub fn single_backward(&self) -> Source {
-        let mut source = Source::default();
-        Self::step(&mut source);
-        for (name, access) in [("x", Access::Read), ("dy", Access::Read), ("dx", Access::Write)] {
-            source.bind(name, access, "array<f32>");
-        }
-        self.bind_tape(&mut source, Access::Write);
+        let mut source = begun(&[("x", Read), ("dy", Read), ("dx", Write)]);
+        self.bind_tape(&mut source, Write);
         self.declare(&mut source, &self.links, true);
         self.additions(&mut source);
         let l = &self.links[0];
@@ -715,11 +678,8 @@ fn check(sums: &[Sum], keeps: usize, params: usize) -> std::result::Result<(), S
 pub fn sample(projector: &dyn Projector) -> Result<Source> {
     let name = titled("projector", &projector.describe());
     let fragment = fragment_of(&name, projector.wgsl())?;
-    let mut source = Source::default();
-    Chain::step(&mut source);
+    let mut source = begun(&[("rays", Read), ("samples", Write)]);
     source.add("rays", RAY);
-    source.bind("rays", Access::Read, "array<Ray>");
-    source.bind("samples", Access::Write, "array<vec4<f32>>");
     source.add("random numbers", RANDOM);
     source.add(&name, &fragment.named("projector_"));
     source.add("sample", include_str!("kernels/sample.wgsl"));
@@ -766,10 +726,7 @@ fn blocks_of(sums: &[RowSum]) -> Vec<String> {
 
 /// Points of blocks.
 pub fn blocks() -> Source {
-    let mut source = Source::default();
-    Chain::step(&mut source);
-    source.bind("corners", Access::Read, "array<vec4<f32>>");
-    source.bind("samples", Access::Write, "array<vec4<f32>>");
+    let mut source = begun(&[("corners", Read), ("samples", Write)]);
     source.add("blocks", include_str!("kernels/blocks.wgsl"));
     source
 }
@@ -786,9 +743,8 @@ pub fn loss_of_rays(loss: &dyn Loss) -> Result<Source> {
 
 /// The loss of known points and its derivative with respect to μ.
 pub fn loss_of_points(loss: &dyn Loss) -> Result<Source> {
-    let mut source = derivatives();
+    let mut source = derivatives(&[("targets", Read)]);
     source.add("loss", &loss_at(loss)?);
-    source.bind("targets", Access::Read, "array<f32>");
     source.add("loss of points", include_str!("kernels/points.wgsl"));
     Ok(source)
 }
@@ -796,7 +752,7 @@ pub fn loss_of_points(loss: &dyn Loss) -> Result<Source> {
 /// The penalty of a prior's blocks and its derivative with respect to μ.
 pub fn penalty_of_blocks(prior: &dyn Prior) -> Result<Source> {
     let name = titled("prior", &prior.describe());
-    let mut source = derivatives();
+    let mut source = derivatives(&[]);
     source.add("blocks", &format!("const prior_edge = {}u;", prior.blocks().edge));
     source.add(&name, &fragment_of(&name, prior.wgsl())?.named("prior_"));
     source.add("penalty of blocks", include_str!("kernels/block_penalty.wgsl"));
@@ -804,11 +760,9 @@ pub fn penalty_of_blocks(prior: &dyn Prior) -> Result<Source> {
 }
 
 fn of_rays(loss: &str) -> Source {
-    let mut source = derivatives();
+    let mut source = derivatives(&[("rays", Read), ("samples", Read)]);
     source.add("loss", loss);
     source.add("rays", RAY);
-    source.bind("rays", Access::Read, "array<Ray>");
-    source.bind("samples", Access::Read, "array<vec4<f32>>");
     source.add("loss of rays", include_str!("kernels/rays.wgsl"));
     source
 }
@@ -817,14 +771,26 @@ fn loss_at(loss: &dyn Loss) -> Result<String> {
     Ok(fragment_of(&titled("loss", &loss.describe()), loss.wgsl())?.named("loss_"))
 }
 
-/// Common parts of the kernels that compute derivatives with respect to μ.
-fn derivatives() -> Source {
-    let mut source = Source::default();
-    Chain::step(&mut source);
-    source.bind("mu", Access::Read, "array<f32>");
-    source.bind("dmu", Access::Write, "array<f32>");
-    source.bind("losses", Access::Write, "array<f32>");
+/// A kernel that computes derivatives with respect to μ.
+fn derivatives(arrays: &[(&str, Access)]) -> Source {
+    let mut source = begun(&[&[("mu", Read), ("dmu", Write), ("losses", Write)], arrays].concat());
     source.add("total", TOTAL);
+    source
+}
+
+/// A source with the uniform buffer `step` and arrays.
+fn begun(arrays: &[(&str, Access)]) -> Source {
+    let mut source = Source::default();
+    source.add("step", include_str!("kernels/step.wgsl"));
+    source.bind("step", Access::Uniform, "Step");
+    for (name, access) in arrays {
+        let element = match *name {
+            "samples" | "corners" => "vec4<f32>",
+            "rays" => "Ray",
+            _ => "f32",
+        };
+        source.bind(name, *access, &format!("array<{element}>"));
+    }
     source
 }
 
@@ -833,7 +799,7 @@ pub fn adam() -> Source {
     let mut source = Source::default();
     source.bind("rule", Access::Uniform, "Rule");
     for name in ["params", "grads", "first", "second"] {
-        source.bind(name, Access::Write, "array<f32>");
+        source.bind(name, Write, "array<f32>");
     }
     source.add("adam", include_str!("kernels/adam.wgsl"));
     source

@@ -135,14 +135,8 @@ impl Adapter {
     }
 
     /// Preference among adapters; the highest number wins.
-    pub fn rank(&self) -> u32 {
-        match self.kind.as_str() {
-            "discrete GPU" => 4,
-            "integrated GPU" => 3,
-            "virtual GPU" => 2,
-            "other" => 1,
-            _ => 0,
-        }
+    pub fn rank(&self) -> Option<usize> {
+        ["other", "virtual GPU", "integrated GPU", "discrete GPU"].iter().position(|kind| *kind == self.kind)
     }
 }
 
@@ -223,12 +217,8 @@ impl Gpu {
         if limits.compare_exchange {
             adapter.atomics = Atomics::CompareExchange;
         }
-        if let Some(bytes) = limits.binding_bytes {
-            adapter.binding_bytes = adapter.binding_bytes.min(bytes);
-        }
-        if let Some(bytes) = limits.uniform_bytes {
-            adapter.uniform_bytes = adapter.uniform_bytes.min(bytes);
-        }
+        adapter.binding_bytes = adapter.binding_bytes.min(limits.binding_bytes.unwrap_or(u64::MAX));
+        adapter.uniform_bytes = adapter.uniform_bytes.min(limits.uniform_bytes.unwrap_or(u64::MAX));
         let source = &all[adapter.index];
         let wanted = wgpu::Features::SHADER_FLOAT32_ATOMIC | wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::SUBGROUP;
         let description = wgpu::DeviceDescriptor {

@@ -2,17 +2,16 @@
 
 use crate::arena;
 use crate::compose::{self, Chain, GROUP};
-use crate::kernel::{Buffers, Kernel, fits};
+use crate::kernel::{Kernel, admit};
 use crate::pace::Pace;
 use crate::profile::Profile;
-use crate::source::validate;
+use crate::programs::Programs;
 use crate::wave::{self, GpuRay, MOST_GROUPS, Wave};
 use crate::{Gpu, Shared};
 use conefield_core::backend::{Adam, BlockWork, Executable, StepStats, Work};
 use conefield_core::device::Source;
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;
-use conefield_core::parallel;
 use conefield_core::pipeline::Model;
 use conefield_core::prior::Prior;
 use conefield_core::stage::{Projector, UnitRay};
@@ -67,60 +66,15 @@ struct Rule {
     eps: f32,
 }
 
-/// The kernels of a pipeline, composed and checked; they are compiled at their first use. The first step adds those of
-/// loss and priors.
-pub struct Kernels {
-    sources: HashMap<String, Source>,
-}
-
-impl Kernels {
-    /// Composes all kernels. Refuses invalid WGSL and kernels that exceed the device's limits.
-    pub fn new(shared: &Shared, chain: &Chain, projector: &dyn Projector) -> Result<Self> {
-        let mut kernels = Self { sources: HashMap::new() };
-        let sources = [
-            ("sample", compose::sample(projector)?),
-            ("blocks", compose::blocks()),
-            ("forward", chain.forward(true)),
-            ("evaluate", chain.forward(false)),
-            ("encode", chain.encode()),
-            ("lines", compose::lines()),
-            ("adam", compose::adam()),
-        ];
-        for (label, source) in sources {
-            kernels.add(shared, label, source)?;
-        }
-        if chain.learns() {
-            kernels.add(shared, "backward", chain.backward())?;
-        }
-        if chain.scatters() {
-            kernels.add(shared, "scatter", chain.scatter())?;
-        }
-        if chain.summed() > 0 {
-            kernels.add(shared, "sums", chain.sums())?;
-            kernels.add(shared, "merge", chain.merge())?;
-        }
-        Ok(kernels)
-    }
-
-    /// Adds a kernel, or replaces the one with this label.
-    fn add(&mut self, shared: &Shared, label: &str, source: Source) -> Result<()> {
-        validate(&source)?;
-        fits(&shared.gpu, label, &source)?;
-        self.sources.insert(label.into(), source);
-        Ok(())
-    }
-}
-
 /// A pipeline on a device.
 pub struct Wgpu {
-    shared: Arc<Shared>,
+    programs: Programs,
     chain: Chain,
-    kernels: Kernels,
-    compiled: HashMap<String, Arc<Kernel>>,
-    bound: HashMap<String, wgpu::BindGroup>,
+    /// The kernels by their labels, checked; they are compiled at their first use. The first step adds those of loss and
+    /// priors.
+    sources: HashMap<String, Source>,
     /// The WGSL of the current kernels of loss and priors, with the edges of blocks.
     learned: Vec<(Option<Fragment>, usize)>,
-    buffers: Buffers,
     /// Whether the arena is on the device.
     loaded: bool,
     /// Whether the gradients on the device are known to be zero.
@@ -137,19 +91,37 @@ pub struct Wgpu {
 }
 
 impl Wgpu {
-    pub(crate) fn new(shared: Arc<Shared>, chain: Chain, kernels: Kernels) -> Self {
+    /// Composes all kernels. Refuses invalid WGSL and kernels that exceed the device's limits.
+    pub(crate) fn new(shared: Arc<Shared>, chain: Chain, projector: &dyn Projector) -> Result<Self> {
+        let mut all = vec![
+            ("sample", compose::sample(projector)?),
+            ("blocks", compose::blocks()),
+            ("forward", chain.forward(true)),
+            ("evaluate", chain.forward(false)),
+            ("encode", chain.encode()),
+            ("lines", compose::lines()),
+            ("adam", compose::adam()),
+        ];
+        if chain.learns() {
+            all.push(("backward", chain.backward()));
+        }
+        if chain.scatters() {
+            all.push(("scatter", chain.scatter()));
+        }
+        if chain.summed() > 0 {
+            all.extend([("sums", chain.sums()), ("merge", chain.merge())]);
+        }
+        all.iter().try_for_each(|(label, source)| admit(&shared.gpu, label, source))?;
+        let sources = all.into_iter().map(|(label, source)| (label.to_owned(), source)).collect();
         let adapter = &shared.gpu.adapter;
         let tape = TAPE_BYTES[usize::from(!adapter.software)].min(adapter.bound_bytes());
         let rows = tape / (4 * chain.tape().max(1) as u64);
         let most = rows.clamp(u64::from(LEAST_ROWS), u64::from(MOST_ROWS)) as u32;
-        Self {
-            shared,
+        Ok(Self {
+            programs: Programs::new(shared),
             chain,
-            kernels,
-            compiled: HashMap::new(),
-            bound: HashMap::new(),
+            sources,
             learned: vec![],
-            buffers: Buffers::default(),
             loaded: false,
             clean: false,
             update: None,
@@ -157,7 +129,7 @@ impl Wgpu {
             most,
             room: 0,
             profile: None,
-        }
+        })
     }
 
     /// Peak memory on the device in bytes.
@@ -188,7 +160,7 @@ impl Wgpu {
     }
 
     fn gpu(&self) -> &Gpu {
-        &self.shared.gpu
+        self.programs.gpu()
     }
 
     /// Uploads the arena unless it is on the device.
@@ -196,17 +168,17 @@ impl Wgpu {
         if self.loaded {
             return Ok(());
         }
-        let (shared, size) = (self.shared.clone(), self.shared.target().segment);
-        let params = model.arena.params.len();
-        arena::allocate(&shared.gpu, &mut self.buffers, &self.chain, params, size)?;
-        arena::upload(&shared, &self.buffers, &self.chain, &model.arena)?;
-        self.buffers.reserve(&shared.gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
-        for s in 0..self.chain.segments() {
-            let name = format!("rule_{s}");
-            self.buffers.reserve(&shared.gpu, &name, size_of::<Rule>() as u64, U::UNIFORM | U::COPY_DST)?;
+        let shared = self.programs.shared.clone();
+        let buffers = &mut self.programs.buffers;
+        arena::allocate(&shared.gpu, buffers, &self.chain)?;
+        arena::upload(&shared.gpu, buffers, &self.chain, &model.arena)?;
+        let rules = (0..self.chain.segments()).map(|s| (format!("rule_{s}"), size_of::<Rule>()));
+        for (name, bytes) in rules.chain([("step".into(), size_of::<Step>())]) {
+            buffers.reserve(&shared.gpu, &name, bytes as u64, U::UNIFORM | U::COPY_DST)?;
         }
         if self.chain.summed() > 0 {
-            self.buffers.reserve(&shared.gpu, "partial", self.partial_bytes(), U::STORAGE | U::COPY_DST)?;
+            let bytes = self.partial_bytes();
+            self.programs.buffers.reserve(&shared.gpu, "partial", bytes, U::STORAGE | U::COPY_DST)?;
         }
         if shared.profile && self.profile.is_none() {
             self.profile = Profile::new(&shared.gpu)?;
@@ -215,67 +187,33 @@ impl Wgpu {
         Ok(())
     }
 
-    fn reserve(&mut self, name: &str, bytes: u64, usage: U) -> Result<()> {
-        if self.buffers.reserve(&self.shared.gpu, name, bytes, usage)? {
-            self.bound.clear();
-        }
-        Ok(())
-    }
-
-    /// Makes room for `rows` rows.
+    /// Makes room for `rows` rows, and for one where all rays miss the scene: kernels then still bind the buffers.
     fn reserve_rows(&mut self, rows: u32) -> Result<()> {
+        let rows = rows.max(1);
         if rows <= self.room {
             return Ok(());
         }
         let n = u64::from(rows);
-        self.reserve("samples", 16 * n, U::STORAGE | U::COPY_DST)?;
-        self.reserve("mu", 4 * n, U::STORAGE | U::COPY_SRC)?;
-        self.reserve("dmu", 4 * n, U::STORAGE)?;
-        self.reserve("targets", 4 * n, U::STORAGE | U::COPY_DST)?;
-        self.reserve("features", 4 * n * self.chain.kept().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
-        self.reserve("tape", 4 * n * self.chain.tape().max(1) as u64, U::STORAGE)?;
+        self.programs.reserve_as("samples", 16 * n, U::STORAGE | U::COPY_DST)?;
+        self.programs.reserve_as("mu", 4 * n, U::STORAGE | U::COPY_SRC)?;
+        self.programs.reserve_as("dmu", 4 * n, U::STORAGE)?;
+        self.programs.reserve_as("targets", 4 * n, U::STORAGE | U::COPY_DST)?;
+        self.programs.reserve_as("features", 4 * n * self.chain.kept().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
+        self.programs.reserve_as("tape", 4 * n * self.chain.tape().max(1) as u64, U::STORAGE)?;
         self.room = rows;
         Ok(())
     }
 
-    /// Compiles the kernels of a step in parallel, because drivers compile slowly.
-    fn compile(&mut self) -> Result<()> {
-        let Shared { gpu, kernels, .. } = &*self.shared;
-        let of_step = |label: &str| !["evaluate", "encode", "lines"].contains(&label);
-        let missing = |(label, _): &(&String, &Source)| of_step(label) && !self.compiled.contains_key(*label);
-        let missing = self.kernels.sources.iter().filter(missing);
-        let compiled =
-            parallel::map(missing, |_, (label, source)| Ok((label.clone(), kernels.get(gpu, label, source)?)));
-        self.compiled.extend(compiled.into_iter().collect::<Result<Vec<_>>>()?);
-        Ok(())
-    }
-
-    /// The kernel called `label`, compiled.
-    fn kernel(&mut self, label: &str) -> Result<Arc<Kernel>> {
-        if let Some(kernel) = self.compiled.get(label) {
-            return Ok(kernel.clone());
-        }
-        let source = self.kernels.sources.get(label);
-        let source = source.ok_or_else(|| self.gpu().error(format!("no kernel {label}")))?;
-        let kernel = self.shared.kernels.get(&self.shared.gpu, label, source)?;
-        self.compiled.insert(label.into(), kernel.clone());
-        Ok(kernel)
-    }
-
-    /// The buffers of `kernel`, bound once under `label`. `name` returns the name of the buffer for one in the kernel.
-    fn bind(&mut self, kernel: &Kernel, label: &str, name: impl Fn(&str) -> String) -> Result<wgpu::BindGroup> {
-        if !self.bound.contains_key(label) {
-            let group = kernel.bind_as(&self.shared.gpu, |buffer| self.buffers.get(&name(buffer)))?;
-            self.bound.insert(label.into(), group);
-        }
-        Ok(self.bound[label].clone())
-    }
-
-    /// The kernel called `label`, compiled, with its buffers.
-    fn ready(&mut self, label: &str) -> Result<(Arc<Kernel>, wgpu::BindGroup)> {
-        let kernel = self.kernel(label)?;
-        let bound = self.bind(&kernel, label, str::to_owned)?;
-        Ok((kernel, bound))
+    /// The kernel called `label` with its buffers; see [`Programs::ready`].
+    fn ready(
+        &mut self,
+        label: &str,
+        bound: &str,
+        name: impl Fn(&str) -> String,
+    ) -> Result<(Arc<Kernel>, wgpu::BindGroup)> {
+        let kernel = self.sources.get_key_value(label);
+        let kernel = kernel.ok_or_else(|| self.programs.gpu().error(format!("no kernel {label}")))?;
+        self.programs.ready(kernel, bound, name)
     }
 
     /// Composes the kernels of the work's loss and priors, unless the last step had the same.
@@ -286,9 +224,9 @@ impl Wgpu {
             return Ok(());
         }
         for (label, source) in sources(work.loss, work.priors.iter().map(|p| p.prior))? {
-            self.compiled.remove(&label);
-            self.bound.remove(&label);
-            self.kernels.add(&self.shared, &label, source)?;
+            admit(self.gpu(), &label, &source)?;
+            self.programs.forget(&label);
+            self.sources.insert(label, source);
         }
         self.learned = fragments;
         Ok(())
@@ -297,7 +235,7 @@ impl Wgpu {
     /// Launches kernels one after the other, each with its number of groups.
     fn launch(&mut self, encoder: &mut wgpu::CommandEncoder, launches: &[(&str, usize)]) -> Result<()> {
         for &(label, groups) in launches.iter().filter(|(_, groups)| *groups > 0) {
-            let (kernel, bound) = self.ready(label)?;
+            let (kernel, bound) = self.ready(label, label, str::to_owned)?;
             let timestamp_writes = self.profile.as_mut().and_then(|p| p.around(label));
             let mut pass = encoder
                 .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(kernel.label()), timestamp_writes });
@@ -307,7 +245,7 @@ impl Wgpu {
     }
 
     fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
-        let buffer = self.buffers.get(name).ok_or_else(|| self.gpu().error(format!("no buffer {name}")))?;
+        let buffer = self.programs.buffer(name)?;
         if !bytes.is_empty() {
             self.gpu().write(buffer, 0, bytes);
         }
@@ -328,21 +266,21 @@ impl Wgpu {
     }
 
     /// Adds a copy of the first `bytes` of `name` into the staging buffer, for [`Wgpu::read`].
-    fn copy(&mut self, encoder: &mut wgpu::CommandEncoder, name: &str, bytes: u64, at: u64) -> Result<()> {
-        let from = self.buffers.get(name).cloned().ok_or_else(|| self.gpu().error(format!("no buffer {name}")))?;
-        if let Some(to) = self.buffers.get("staging")
-            && bytes > 0
-        {
-            encoder.copy_buffer_to_buffer(&from, 0, to, at, bytes);
+    fn copy(&self, encoder: &mut wgpu::CommandEncoder, name: &str, bytes: u64, at: u64) -> Result<()> {
+        if bytes > 0 {
+            let [from, to] = [self.programs.buffer(name)?, self.programs.buffer("staging")?];
+            encoder.copy_buffer_to_buffer(from, 0, to, at, bytes);
         }
         Ok(())
     }
 
     fn read(&self, bytes: u64, read: impl FnOnce(&[u8])) -> Result<()> {
-        match self.buffers.get("staging") {
-            Some(staging) => self.gpu().read(staging, bytes, read),
-            None => self.gpu().wait(),
-        }
+        self.gpu().read(self.programs.buffer("staging")?, bytes, read)
+    }
+
+    /// Makes room for `bytes` that are read.
+    fn stage(&mut self, bytes: u64) -> Result<()> {
+        self.programs.buffers.staging(&self.programs.shared.gpu, bytes).map(drop)
     }
 
     /// Runs the kernel `label` on `points`, in waves.
@@ -363,10 +301,10 @@ impl Wgpu {
             self.reserve_rows(rows)?;
             let stride = self.room;
             let bytes = 4 * u64::from(stride) * width as u64;
-            self.reserve(result, bytes, U::STORAGE | U::COPY_SRC)?;
+            self.programs.reserve_as(result, bytes, U::STORAGE | U::COPY_SRC)?;
             // The result ends with the last channel's rows.
             let wanted = 4 * (u64::from(stride) * (width as u64 - 1) + u64::from(rows));
-            self.buffers.staging(&self.shared.gpu, wanted)?;
+            self.stage(wanted)?;
             samples.clear();
             samples.extend(piece.iter().map(|p| [p[0], p[1], p[2], 0.0]));
             self.write("samples", bytemuck::cast_slice(&samples))?;
@@ -385,14 +323,18 @@ impl Wgpu {
 
     /// Collects the times of finished kernels.
     fn collect(&mut self) -> Result<()> {
-        self.profile.as_mut().map_or(Ok(()), |p| p.collect(&self.shared.gpu))
+        self.profile.as_mut().map_or(Ok(()), |p| p.collect(&self.programs.shared.gpu))
     }
 
     /// Makes room for a wave and writes its rays.
     fn place(&mut self, wave: &Wave) -> Result<()> {
         self.reserve_rows(wave.rows)?;
-        self.reserve("rays", (wave.rays.len().max(1) * size_of::<GpuRay>()) as u64, U::STORAGE | U::COPY_DST)?;
-        self.reserve("losses", 4 * wave.losses().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
+        self.programs.reserve_as(
+            "rays",
+            (wave.rays.len().max(1) * size_of::<GpuRay>()) as u64,
+            U::STORAGE | U::COPY_DST,
+        )?;
+        self.programs.reserve_as("losses", 4 * wave.losses().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
         self.write("rays", bytemuck::cast_slice(&wave.rays))
     }
 
@@ -414,15 +356,15 @@ impl Wgpu {
             let points = &work.points[wave.points.clone()];
             let samples: Vec<[f32; 4]> = points.iter().map(|(p, _)| [p[0], p[1], p[2], 0.0]).collect();
             let targets: Vec<f32> = points.iter().map(|p| p.1).collect();
-            let buffer = self.buffers.get("samples").ok_or_else(|| self.gpu().error("no buffer samples"))?;
-            self.gpu().write(buffer, 16 * u64::from(wave.ray_rows), bytemuck::cast_slice(&samples));
+            let (buffer, at) = (self.programs.buffer("samples")?, 16 * u64::from(wave.ray_rows));
+            self.gpu().write(buffer, at, bytemuck::cast_slice(&samples));
             self.write("targets", bytemuck::cast_slice(&targets))?;
         }
         let mut block_rows = 0;
         if let (Some(work), false) = (work.priors.get(wave.prior), wave.blocks.is_empty()) {
             let corners: Vec<[f32; 4]> =
                 work.corners[wave.blocks.clone()].iter().map(|c| [c[0], c[1], c[2], 0.0]).collect();
-            self.reserve("corners", 16 * corners.len() as u64, U::STORAGE | U::COPY_DST)?;
+            self.programs.reserve_as("corners", 16 * corners.len() as u64, U::STORAGE | U::COPY_DST)?;
             self.write("corners", bytemuck::cast_slice(&corners))?;
             let blocks = work.prior.blocks();
             step.blocks = wave.blocks.len() as u32;
@@ -476,27 +418,26 @@ fn of_blocks(prior: usize) -> String {
 impl Executable for Wgpu {
     fn admits(&self, loss: &dyn Loss, priors: &[Box<dyn Prior>]) -> Result<()> {
         let all = sources(loss, priors.iter().map(|p| p.as_ref()))?;
-        all.iter().try_for_each(|(label, source)| validate(source).and_then(|()| fits(self.gpu(), label, source)))
+        all.iter().try_for_each(|(label, source)| admit(self.gpu(), label, source))
     }
 
     fn step(&mut self, model: &mut Model, work: &Work<'_>) -> Result<StepStats> {
         self.learn_by(work)?;
         self.load(model)?;
-        if !self.compiled.contains_key("forward") {
-            self.compile()?;
-        }
+        let of_step = |(label, _): &(&String, &Source)| !["evaluate", "encode", "lines"].contains(&label.as_str());
+        self.programs.compile(self.sources.iter().filter(of_step))?;
         let started = Instant::now();
         let mut encoder = self.encoder();
         if !self.clean {
             for s in 0..self.chain.segments() {
-                self.buffers.get(&format!("grads_{s}")).inspect(|b| encoder.clear_buffer(b, 0, None));
+                self.programs.buffers.get(&format!("grads_{s}")).inspect(|b| encoder.clear_buffer(b, 0, None));
             }
         }
-        self.buffers.get("partial").inspect(|b| encoder.clear_buffer(b, 0, None));
+        self.programs.buffers.get("partial").inspect(|b| encoder.clear_buffer(b, 0, None));
         self.clean = false;
         let waves = wave::of_step(model.pipeline.projector.as_ref(), work, self.pace.size());
         let losses: usize = waves.iter().map(Wave::losses).sum();
-        self.buffers.staging(&self.shared.gpu, 4 * losses.max(1) as u64)?;
+        self.stage(4 * losses.max(1) as u64)?;
         let mut at = 0;
         for (i, wave) in waves.iter().enumerate() {
             if i > 0 {
@@ -535,11 +476,9 @@ impl Executable for Wgpu {
         // An update that waits uses the buffers that this one is about to overwrite.
         self.flush();
         let (bias1, bias2) = (1.0 - adam.beta1.powf(adam.step as f64), 1.0 - adam.beta2.powf(adam.step as f64));
-        let size = self.shared.target().segment;
-        let kernel = self.kernel("adam")?;
         let mut encoder = self.encoder();
         for s in 0..self.chain.segments() {
-            let count = arena::segment(&self.chain, s, model.arena.params.len(), size).len();
+            let count = self.chain.segment(s).len();
             let rule = Rule {
                 count: count as u32,
                 rate: (adam.lr / bias1) as f32,
@@ -551,13 +490,13 @@ impl Executable for Wgpu {
                 eps: adam.eps as f32,
             };
             self.write(&format!("rule_{s}"), bytemuck::bytes_of(&rule))?;
-            let bound = self.bind(&kernel, &format!("adam_{s}"), |part| format!("{part}_{s}"))?;
+            let (kernel, bound) = self.ready("adam", &format!("adam_{s}"), |part| format!("{part}_{s}"))?;
             let timestamp_writes = self.profile.as_mut().and_then(|p| p.around("adam"));
             let mut pass =
                 encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("adam"), timestamp_writes });
             kernel.launch(&mut pass, &bound, count.div_ceil(256).clamp(1, MOST_GROUPS) as u32);
         }
-        arena::refresh(&self.buffers, &self.chain, &mut encoder, self.shared.target().segment);
+        arena::refresh(&self.programs.buffers, &self.chain, &mut encoder);
         self.update = Some(encoder);
         self.clean = true;
         self.gpu().fault()
@@ -593,7 +532,7 @@ impl Executable for Wgpu {
         for wave in &waves {
             self.place(wave)?;
             let bytes = 4 * wave.rays.len() as u64;
-            self.buffers.staging(&self.shared.gpu, bytes)?;
+            self.stage(bytes)?;
             let (rows, rays) = (wave.rows, wave.rays.len() as u32);
             let step = Step { rows, ray_rows: rows, rays, stride: self.room, ..Step::default() };
             self.write("step", bytemuck::bytes_of(&step))?;
@@ -620,12 +559,12 @@ impl Executable for Wgpu {
             return Ok(());
         }
         self.flush();
-        let size = self.shared.target().segment;
-        arena::download(&self.shared.gpu, &mut self.buffers, &self.chain, &mut model.arena, size)
+        let Programs { shared, buffers, .. } = &mut self.programs;
+        arena::download(&shared.gpu, buffers, &self.chain, &mut model.arena)
     }
 
     fn renew(&mut self) {
         (self.loaded, self.update) = (false, None);
-        self.bound.clear();
+        self.programs.unbind();
     }
 }

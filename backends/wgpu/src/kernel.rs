@@ -44,8 +44,9 @@ impl Cache {
     }
 }
 
-/// Refuses a kernel that uses more buffers than the device binds.
-pub fn fits(gpu: &Gpu, label: &str, source: &Source) -> Result<()> {
+/// Refuses invalid WGSL, and a kernel that uses more buffers than the device binds.
+pub fn admit(gpu: &Gpu, label: &str, source: &Source) -> Result<()> {
+    validate(source)?;
     let (needs, has) = (source.storage_buffers(), gpu.adapter.storage_buffers);
     if needs <= has {
         return Ok(());
@@ -66,8 +67,7 @@ fn checks(source: &Source) -> wgpu::ShaderRuntimeChecks {
 }
 
 fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
-    fits(gpu, label, source)?;
-    validate(source)?;
+    admit(gpu, label, source)?;
     let started = Instant::now();
     let entry = |(i, access): (usize, Access)| wgpu::BindGroupLayoutEntry {
         binding: i as u32,
@@ -126,11 +126,6 @@ fn compile(gpu: &Gpu, label: &str, source: &Source) -> Result<Kernel> {
 pub struct Buffers(HashMap<String, wgpu::Buffer>);
 
 impl Buffers {
-    /// Adds a buffer, or replaces the one with this name.
-    pub fn insert(&mut self, name: impl Into<String>, buffer: wgpu::Buffer) {
-        self.0.insert(name.into(), buffer);
-    }
-
     /// The buffer called `name`.
     pub fn get(&self, name: &str) -> Option<&wgpu::Buffer> {
         self.0.get(name)
@@ -142,31 +137,25 @@ impl Buffers {
             return Ok(false);
         }
         let buffer = gpu.buffer(name, bytes, usage)?;
-        self.insert(name, buffer);
+        self.0.insert(name.into(), buffer);
         Ok(true)
+    }
+
+    /// The same buffer, new or not.
+    pub fn of(&mut self, gpu: &Gpu, name: &str, bytes: u64, usage: wgpu::BufferUsages) -> Result<wgpu::Buffer> {
+        self.reserve(gpu, name, bytes, usage)?;
+        Ok(self.0[name].clone())
     }
 
     /// The buffer `staging`, of at least `bytes`, through which results come back to the host.
     pub fn staging(&mut self, gpu: &Gpu, bytes: u64) -> Result<wgpu::Buffer> {
-        use wgpu::BufferUsages as U;
-        self.reserve(gpu, "staging", bytes, U::MAP_READ | U::COPY_DST)?;
-        self.get("staging").cloned().ok_or_else(|| gpu.error("no buffer staging"))
-    }
-
-    /// Total size in bytes.
-    pub fn bytes(&self) -> u64 {
-        self.0.values().map(wgpu::Buffer::size).sum()
+        self.of(gpu, "staging", bytes, wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST)
     }
 }
 
 impl Kernel {
-    /// A bind group of its buffers.
-    pub fn bind(&self, gpu: &Gpu, buffers: &Buffers) -> Result<wgpu::BindGroup> {
-        self.bind_as(gpu, |name| buffers.get(name))
-    }
-
     /// A bind group of the buffers that `find` returns for its names.
-    pub fn bind_as<'a>(&self, gpu: &Gpu, find: impl Fn(&str) -> Option<&'a wgpu::Buffer>) -> Result<wgpu::BindGroup> {
+    pub fn bind<'a>(&self, gpu: &Gpu, find: impl Fn(&str) -> Option<&'a wgpu::Buffer>) -> Result<wgpu::BindGroup> {
         let mut entries = vec![];
         for (i, name) in self.buffers.iter().enumerate() {
             let buffer = find(name).ok_or_else(|| gpu.error(format!("kernel {}: no buffer {name}", self.label)))?;

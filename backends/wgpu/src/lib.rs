@@ -1,33 +1,33 @@
 //! The wgpu backend: runs a pipeline as a few kernels on any GPU with Vulkan, Metal or DX12.
 //!
-//! - [`device`]: adapters and their features.
-//! - [`compose`], [`source`]: the text of kernels, put together from the stages' fragments.
-//! - [`kernel`]: compiled kernels and the buffers that they use.
-//! - [`arena`]: parameters, gradients and moments on the device.
-//! - [`wave`]: a step's work cut into pieces of bounded size.
-//! - [`executable`]: steps, updates, evaluation.
-//! - [`measure`]: measured limits of a device.
-//! - [`profile`]: time on the device.
+//! - `device`: adapters and their features.
+//! - `compose`, [`source`]: the text of kernels, put together from the stages' fragments.
+//! - `kernel`: compiled kernels and the buffers that they use.
+//! - `arena`: parameters, gradients and moments on the device.
+//! - `wave`: a step's work cut into pieces of bounded size.
+//! - `executable`: steps, updates, evaluation.
+//! - `measure`: measured limits of a device.
+//! - `profile`: time on the device.
 //! - `programs`: programs of fields with their own line integrals.
-//! - [`single`]: one stage alone, to compare it with the CPU.
+//! - `single`: one stage alone, to compare it with the CPU.
 //! - `place`: volumes and views on the device, and the kernels that combine them.
 //!
 //! Sums over rows have no fixed order. Results agree with the CPU's within rounding, and so do two runs.
 
-pub mod arena;
-pub mod compose;
-pub mod device;
-pub mod executable;
-pub mod kernel;
-pub mod measure;
+mod arena;
+mod compose;
+mod device;
+mod executable;
+mod kernel;
+mod measure;
 mod pace;
 mod place;
-pub mod profile;
+mod profile;
 mod programs;
-pub mod single;
+mod single;
 pub mod source;
 mod staging;
-pub mod wave;
+mod wave;
 
 use compose::{Chain, Target};
 use conefield_core::backend::{Backend, Executable, Explain};
@@ -36,10 +36,12 @@ use conefield_core::error::Result;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::place::{Moved, Place};
 use conefield_core::stage::{GradKind, titled};
-pub use device::{Adapter, Atomics, Gpu, Limits, adapters};
-use executable::{Kernels, Wgpu as Running};
+use device::Gpu;
+pub use device::{Adapter, Atomics, Limits, adapters};
+use executable::Wgpu as Running;
 use kernel::Cache;
-pub use place::DevicePlace;
+pub use measure::Ceiling;
+use place::DevicePlace;
 use programs::{Alone, Programs};
 use std::sync::Arc;
 
@@ -50,18 +52,17 @@ pub struct Wgpu {
 }
 
 /// State shared by all executables of a backend.
-pub struct Shared {
-    /// The device.
-    pub gpu: Gpu,
+struct Shared {
+    gpu: Gpu,
     /// Kernels by their text.
-    pub kernels: Cache,
+    kernels: Cache,
     /// Whether executables time their kernels.
-    pub profile: bool,
+    profile: bool,
 }
 
 impl Shared {
     /// Properties of the device on which the text of kernels depends.
-    pub fn target(&self) -> Target {
+    fn target(&self) -> Target {
         let adapter = &self.gpu.adapter;
         let bytes = adapter.bound_bytes();
         Target {
@@ -90,11 +91,6 @@ impl Wgpu {
     pub fn adapter(&self) -> &Adapter {
         &self.shared.gpu.adapter
     }
-
-    /// The state for running single stages on this device.
-    pub fn shared(&self) -> &Arc<Shared> {
-        &self.shared
-    }
 }
 
 impl Backend for Wgpu {
@@ -115,9 +111,8 @@ impl Backend for Wgpu {
             return Ok((Box::new(Alone { field, loaded: false }), explain));
         }
         let chain = Chain::new(pipeline, shared.target())?;
-        let kernels = Kernels::new(shared, &chain, pipeline.projector.as_ref())?;
+        let running = Running::new(shared.clone(), chain.clone(), pipeline.projector.as_ref())?;
         let adapter = &shared.gpu.adapter;
-        let running = Running::new(shared.clone(), chain.clone(), kernels);
         let device_bytes = running.device_bytes();
         let mut notes: Vec<String> = vec![];
         for (name, stage) in pipeline.stages() {

@@ -1,9 +1,9 @@
 //! Measured limits of a device, to compare the speed of kernels with.
 
-use crate::Shared;
-use crate::device::{Atomics, Gpu};
-use crate::kernel::{Buffers, Kernel};
-use conefield_core::device::{Access, Source};
+use crate::Wgpu;
+use crate::device::Atomics;
+use crate::programs::Programs;
+use conefield_core::device::{Access, Device, Program, Source};
 use conefield_core::error::Result;
 use serde::Serialize;
 use std::time::Instant;
@@ -91,10 +91,10 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(local_invocation_
     source
 }
 
-/// The shortest of some runs of `run`, in seconds.
-fn shortest(mut run: impl FnMut() -> Result<()>) -> Result<f64> {
+/// The shortest of `times` runs of `run`, in seconds.
+fn shortest(times: usize, mut run: impl FnMut() -> Result<()>) -> Result<f64> {
     let mut best = f64::INFINITY;
-    for _ in 0..5 {
+    for _ in 0..times {
         let started = Instant::now();
         run()?;
         best = best.min(started.elapsed().as_secs_f64());
@@ -102,43 +102,32 @@ fn shortest(mut run: impl FnMut() -> Result<()>) -> Result<f64> {
     Ok(best)
 }
 
-/// Seconds of one of `launches` launches in one submission.
-fn seconds(gpu: &Gpu, kernel: &Kernel, bound: &wgpu::BindGroup, groups: u32, launches: u32) -> Result<f64> {
-    let started = Instant::now();
-    let mut encoder = gpu.device.create_command_encoder(&Default::default());
-    {
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        (0..launches).for_each(|_| kernel.launch(&mut pass, bound, groups));
-    }
-    gpu.queue.submit([encoder.finish()]);
-    gpu.wait()?;
-    Ok(started.elapsed().as_secs_f64() / f64::from(launches))
-}
-
-impl Shared {
+impl Wgpu {
     /// Measures the device. Each rate is the best of five runs of at least a twentieth of a second.
     pub fn ceiling(&self) -> Result<Ceiling> {
-        let gpu = &self.gpu;
+        let gpu = &self.shared.gpu;
         let software = gpu.adapter.software;
         // A software device has few lanes and no memory of its own.
         let groups = if software { 64 } else { 1 << 14 };
         let large_bytes = if software { SMALL } else { gpu.adapter.bound_bytes().min(1 << 30) };
-        let best = |source: &Source, bytes: u64| -> Result<f64> {
-            let mut buffers = Buffers::default();
-            buffers.reserve(gpu, "data", bytes, U::STORAGE)?;
-            let kernel = self.kernels.get(gpu, "measure", source)?;
-            let bound = kernel.bind(gpu, &buffers)?;
+        // Seconds of a launch.
+        let best = |source: Source, bytes: u64| -> Result<f64> {
+            let mut device = Programs::new(self.shared.clone());
+            device.reserve("data", bytes)?;
+            let program = Program { label: "measure".into(), source };
+            let mut run = |launches: usize| {
+                device.run(&vec![(&program, groups); launches])?;
+                gpu.wait()
+            };
+            // The first run compiles.
+            run(1)?;
             let mut launches = 1;
-            while seconds(gpu, &kernel, &bound, groups, launches)? * f64::from(launches) < LONG && launches < 1 << 14 {
+            while shortest(1, || run(launches))? < LONG && launches < 1 << 14 {
                 launches *= 2;
             }
-            let mut best = f64::INFINITY;
-            for _ in 0..5 {
-                best = best.min(seconds(gpu, &kernel, &bound, groups, launches)?);
-            }
-            Ok(best)
+            Ok(shortest(5, || run(launches))? / launches as f64)
         };
-        let invocations = f64::from(groups * 64);
+        let invocations = (groups * 64) as f64;
         let each = "a = a * 0.999 + b; b = b * 0.998 + c; c = c * 0.997 + d; d = d * 0.996 + a;";
         let multiply = reading(&format!("    for (var i = 0u; i < {ROUNDS}u; i++) {{ {each} }}"));
         let in_order = |bytes: u64| {
@@ -150,9 +139,8 @@ impl Shared {
             reading(&format!("    var h = id.x;\n    for (var i = 0u; i < {READS}u; i++) {{ {read} }}"))
         };
         let sums = |place: &str| {
-            Ok::<_, conefield_core::Error>(
-                invocations * f64::from(READS) / best(&adding(gpu.adapter.atomics, place), SMALL)?,
-            )
+            let seconds = best(adding(gpu.adapter.atomics, place), SMALL)?;
+            Ok::<_, conefield_core::Error>(invocations * f64::from(READS) / seconds)
         };
         let small = SMALL.min(gpu.adapter.bound_bytes());
         let reads = invocations * f64::from(READS);
@@ -161,27 +149,27 @@ impl Shared {
         let bytes = sent.len() as u64;
         let device = gpu.buffer("transfer", bytes, U::COPY_DST | U::COPY_SRC)?;
         let host = gpu.buffer("read back", bytes, U::COPY_DST | U::MAP_READ)?;
-        let upload = shortest(|| {
+        let upload = shortest(5, || {
             gpu.queue.write_buffer(&device, 0, &sent);
             gpu.queue.submit([]);
             gpu.wait()
         })?;
-        let read_back = shortest(|| {
+        let read_back = shortest(5, || {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             encoder.copy_buffer_to_buffer(&device, 0, &host, 0, bytes);
             gpu.queue.submit([encoder.finish()]);
             gpu.read(&host, bytes, |found| assert_eq!(found.len() as u64, bytes))
         })?;
-        let submit_s = shortest(|| {
+        let submit_s = shortest(5, || {
             gpu.queue.submit([gpu.device.create_command_encoder(&Default::default()).finish()]);
             gpu.wait()
         })?;
         Ok(Ceiling {
-            multiply_adds: invocations * f64::from(ROUNDS * 16) / best(&multiply, SMALL)?,
+            multiply_adds: invocations * f64::from(ROUNDS * 16) / best(multiply, SMALL)?,
             large_bytes,
-            bytes: large_bytes as f64 / best(&in_order(large_bytes), large_bytes)?,
-            far_reads: reads / best(&random(large_bytes), large_bytes)?,
-            random_reads: reads / best(&random(small), small)?,
+            bytes: large_bytes as f64 / best(in_order(large_bytes), large_bytes)?,
+            far_reads: reads / best(random(large_bytes), large_bytes)?,
+            random_reads: reads / best(random(small), small)?,
             random_sums: sums("h >> 6u")?,
             neighbour_sums: sums("id.x + i * 64u")?,
             shared_sums: sums("(id.x - lane) + i * 64u")?,

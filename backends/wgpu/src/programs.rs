@@ -2,23 +2,23 @@
 
 use crate::Shared;
 use crate::arena::PIECE;
-use crate::kernel::{Buffers, Kernel, fits};
-use crate::source::validate;
+use crate::device::Gpu;
+use crate::kernel::{Buffers, Kernel, admit};
 use crate::wave::MOST_GROUPS;
 use conefield_core::backend::{Adam, Executable, StepStats, Work};
-use conefield_core::device::{Device, Launch, Program};
+use conefield_core::device::{Device, Launch, Program, Source};
 use conefield_core::error::{Error, Result};
 use conefield_core::parallel;
 use conefield_core::pipeline::Model;
 use conefield_core::stage::{OnDevice, UnitGrid, UnitRay};
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use wgpu::BufferUsages as U;
 
-/// Named buffers, and the programs that ran on them.
-pub struct Programs {
-    shared: Arc<Shared>,
-    buffers: Buffers,
+/// Named buffers, and the kernels that ran on them by their labels.
+pub(crate) struct Programs {
+    pub(crate) shared: Arc<Shared>,
+    pub(crate) buffers: Buffers,
     kernels: HashMap<String, Arc<Kernel>>,
     /// Kernels with their buffers; none of them is outdated.
     bound: HashMap<String, wgpu::BindGroup>,
@@ -29,37 +29,70 @@ impl Programs {
         Self { shared, buffers: Buffers::default(), kernels: HashMap::new(), bound: HashMap::new() }
     }
 
-    fn buffer(&self, name: &str) -> Result<&wgpu::Buffer> {
-        self.buffers.get(name).ok_or_else(|| self.shared.gpu.error(format!("no buffer {name}")))
+    pub(crate) fn gpu(&self) -> &Gpu {
+        &self.shared.gpu
     }
 
-    fn reserve_as(&mut self, name: &str, bytes: u64, usage: U) -> Result<()> {
-        let gpu = &self.shared.gpu;
-        let most = gpu.adapter.bound_bytes();
-        if bytes > most {
-            return Err(gpu.error(format!("{name} takes {bytes} bytes, more than the {most} that a kernel may read")));
-        }
-        if self.buffers.reserve(gpu, name, bytes, usage | U::COPY_SRC | U::COPY_DST)? {
+    pub(crate) fn buffer(&self, name: &str) -> Result<&wgpu::Buffer> {
+        self.buffers.get(name).ok_or_else(|| self.gpu().error(format!("no buffer {name}")))
+    }
+
+    /// Makes sure that there is a buffer `name` of at least `bytes`.
+    pub(crate) fn reserve_as(&mut self, name: &str, bytes: u64, usage: U) -> Result<()> {
+        if self.buffers.reserve(&self.shared.gpu, name, bytes, usage)? {
             self.bound.clear();
         }
         Ok(())
     }
 
-    /// Compiles the programs that run for the first time, in parallel, because drivers compile slowly.
-    fn compile(&mut self, launches: &[Launch<'_>]) -> Result<()> {
-        let mut missing: Vec<&Program> = vec![];
-        for (program, _) in launches {
-            let known = self.kernels.contains_key(&program.label) || missing.iter().any(|p| p.label == program.label);
-            if !known {
-                missing.push(program);
-            }
+    /// The same for a buffer of others, which a kernel must be able to read as a whole.
+    fn reserve_whole(&mut self, name: &str, bytes: u64, usage: U) -> Result<()> {
+        let most = self.most_bytes();
+        if bytes > most {
+            let what = format!("{name} takes {bytes} bytes, more than the {most} that a kernel may read");
+            return Err(self.gpu().error(what));
         }
+        self.reserve_as(name, bytes, usage | U::COPY_SRC | U::COPY_DST)
+    }
+
+    /// Compiles those kernels that are missing in parallel, because drivers compile slowly.
+    pub(crate) fn compile<'a>(&mut self, all: impl Iterator<Item = (&'a String, &'a Source)>) -> Result<()> {
+        let missing: BTreeMap<_, _> = all.filter(|(label, _)| !self.kernels.contains_key(*label)).collect();
         let Shared { gpu, kernels, .. } = &*self.shared;
-        let compiled = parallel::map(missing, |_, program| {
-            Ok((program.label.clone(), kernels.get(gpu, &program.label, &program.source)?))
-        });
+        let compiled =
+            parallel::map(missing, |_, (label, source)| Ok((label.clone(), kernels.get(gpu, label, source)?)));
         self.kernels.extend(compiled.into_iter().collect::<Result<Vec<_>>>()?);
         Ok(())
+    }
+
+    /// Forgets a kernel, whose text has changed.
+    pub(crate) fn forget(&mut self, label: &str) {
+        self.kernels.remove(label);
+        self.bound.remove(label);
+    }
+
+    /// Forgets which buffers kernels use.
+    pub(crate) fn unbind(&mut self) {
+        self.bound.clear();
+    }
+
+    /// A kernel, compiled, with its buffers, which are bound once under `bound`. `name` returns the name of the buffer for
+    /// one in the kernel.
+    pub(crate) fn ready(
+        &mut self,
+        (label, source): (&String, &Source),
+        bound: &str,
+        name: impl Fn(&str) -> String,
+    ) -> Result<(Arc<Kernel>, wgpu::BindGroup)> {
+        if !self.kernels.contains_key(label) {
+            self.compile([(label, source)].into_iter())?;
+        }
+        let kernel = self.kernels[label].clone();
+        if !self.bound.contains_key(bound) {
+            let group = kernel.bind(self.gpu(), |buffer| self.buffers.get(&name(buffer)))?;
+            self.bound.insert(bound.into(), group);
+        }
+        Ok((kernel, self.bound[bound].clone()))
     }
 }
 
@@ -77,16 +110,15 @@ impl Device for Programs {
     }
 
     fn admits(&self, program: &Program) -> Result<()> {
-        validate(&program.source)?;
-        fits(&self.shared.gpu, &program.label, &program.source)
+        admit(self.gpu(), &program.label, &program.source)
     }
 
     fn reserve(&mut self, name: &str, bytes: u64) -> Result<()> {
-        self.reserve_as(name, bytes, U::STORAGE)
+        self.reserve_whole(name, bytes, U::STORAGE)
     }
 
     fn write(&mut self, name: &str, data: &[u8]) -> Result<()> {
-        self.reserve_as(name, data.len() as u64, U::STORAGE | U::UNIFORM)?;
+        self.reserve_whole(name, data.len() as u64, U::STORAGE | U::UNIFORM)?;
         self.shared.gpu.upload(self.buffer(name)?, 0, data)
     }
 
@@ -105,20 +137,17 @@ impl Device for Programs {
     }
 
     fn run(&mut self, launches: &[Launch<'_>]) -> Result<()> {
-        self.compile(launches)?;
-        for (program, _) in launches {
-            if let (false, Some(kernel)) = (self.bound.contains_key(&program.label), self.kernels.get(&program.label)) {
-                let bound = kernel.bind(&self.shared.gpu, &self.buffers)?;
-                self.bound.insert(program.label.clone(), bound);
-            }
-        }
-        let gpu = &self.shared.gpu;
+        self.compile(launches.iter().map(|(program, _)| (&program.label, &program.source)))?;
+        let ready = |(program, groups): &Launch<'_>| {
+            let Program { label, source } = program;
+            Ok((self.ready((label, source), label, str::to_owned)?, *groups))
+        };
+        let ready = launches.iter().map(ready).collect::<Result<Vec<_>>>()?;
+        let gpu = self.gpu();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        for (program, groups) in launches {
-            if let (Some(kernel), Some(bound)) = (self.kernels.get(&program.label), self.bound.get(&program.label)) {
-                kernel.launch(&mut pass, bound, (*groups).clamp(1, MOST_GROUPS) as u32);
-            }
+        for ((kernel, bound), groups) in ready {
+            kernel.launch(&mut pass, &bound, groups.clamp(1, MOST_GROUPS) as u32);
         }
         drop(pass);
         gpu.submit(encoder);

@@ -1,105 +1,82 @@
 //! One stage, projector, loss or prior alone on a device, to compare its WGSL with its Rust.
 
-use crate::Shared;
-use crate::arena;
+use crate::Wgpu;
 use crate::compose::{self, Chain, GROUP};
 use crate::executable::Step;
-use crate::kernel::Buffers;
-use crate::wave::{GpuRay, MOST_GROUPS};
-use conefield_core::arena::Arena;
-use conefield_core::device::Source;
+use crate::programs::Programs;
+use crate::wave::GpuRay;
+use conefield_core::device::{Device, Program, Source};
 use conefield_core::error::Result;
 use conefield_core::loss::Loss;
 use conefield_core::prior::Prior;
 use conefield_core::runner::Runner;
 use conefield_core::stage::{Projector, Samples, Stage, UnitRay};
-use wgpu::BufferUsages as U;
 
-impl Runner for Shared {
+/// Shares of the rows in the sums of a stage.
+const SHARES: usize = 3;
+/// Groups of a stage's kernels at most: some take several pieces of the rows.
+const GROUPS: usize = 7;
+
+impl Runner for Wgpu {
     fn pass(&self, stage: &dyn Stage, params: &[f32], x: &[f32], dy: &[f32], rows: usize) -> Result<[Vec<f32>; 3]> {
-        let (gpu, target) = (&self.gpu, self.target());
-        let chain = Chain::single(stage, target)?;
+        let chain = Chain::single(stage, self.shared.target())?;
         let info = stage.info();
-        let mut buffers = Buffers::default();
-        let mut arena = Arena::new(params.len());
-        arena.params.copy_from_slice(params);
-        arena::allocate(gpu, &mut buffers, &chain, params.len(), target.segment)?;
-        arena::upload(self, &buffers, &chain, &arena)?;
-        let groups = rows.div_ceil(GROUP as usize).min(7);
-        let (inputs, outputs) = (4 * (info.input * rows) as u64, 4 * (info.output * rows) as u64);
-        let usage = U::STORAGE | U::COPY_DST | U::COPY_SRC;
-        for (name, bytes) in [("x", inputs), ("dx", inputs), ("y", outputs), ("dy", outputs)] {
-            buffers.reserve(gpu, name, bytes, usage)?;
-        }
-        let shares = 3;
-        buffers.reserve(gpu, "partial", 4 * (shares * chain.summed()) as u64, usage)?;
-        buffers.reserve(gpu, "tape", 4 * (rows * chain.tape()) as u64, usage)?;
-        // No row is left out.
-        buffers.reserve(gpu, "dmu", 4 * rows as u64, usage)?;
-        for (name, data) in [("x", x), ("dy", dy), ("dmu", &vec![1.0; rows])] {
-            buffers.get(name).inspect(|b| gpu.write(b, 0, bytemuck::cast_slice(data)));
-        }
-        buffers.reserve(gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
-        let run = |label: &str, source: &Source, step: Step, groups: usize| -> Result<()> {
-            buffers.get("step").inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(&step)));
-            let kernel = self.kernels.get(gpu, label, source)?;
-            let bound = kernel.bind(gpu, &buffers)?;
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, groups as u32);
-            gpu.queue.submit([encoder.finish()]);
-            gpu.wait()
-        };
         let step = Step { rows: rows as u32, stride: rows as u32, ..Step::default() };
-        run("forward", &chain.single_forward(), step, groups)?;
-        run("backward", &chain.single_backward(), step, groups)?;
-        if chain.summed() > 0 {
-            run("sums", &chain.sums(), step, chain.summing(shares).min(MOST_GROUPS))?;
-            run("merge", &chain.merge(), step, chain.merging(shares).min(MOST_GROUPS))?;
+        let mut device = begun(self, step)?;
+        let segments = (0..chain.segments()).map(|s| (s, chain.segment(s)));
+        for (s, range) in segments.clone() {
+            device.reserve(&format!("grads_{s}"), 4 * range.len() as u64)?;
+            write(&mut device, &format!("params_{s}"), &params[range])?;
         }
-        arena::download(gpu, &mut buffers, &chain, &mut arena, target.segment)?;
-        let [y, dx] =
-            [("y", info.output * rows), ("dx", info.input * rows)].map(|(name, n)| self.fetch(&buffers, name, n));
-        Ok([y?, arena.grads.to_vec(), dx?])
+        if chain.dense_bytes() > 0 {
+            write(&mut device, "dense", params)?;
+        }
+        // No row is left out.
+        for (name, data) in [("x", x), ("dy", dy), ("dmu", &vec![1.0; rows])] {
+            write(&mut device, name, data)?;
+        }
+        let (inputs, outputs) = (info.input * rows, info.output * rows);
+        for (name, count) in
+            [("y", outputs), ("dx", inputs), ("tape", rows * chain.tape()), ("partial", SHARES * chain.summed())]
+        {
+            device.reserve(name, 4 * count as u64)?;
+        }
+        let groups = rows.div_ceil(GROUP as usize).min(GROUPS);
+        let mut kernels =
+            vec![("forward", chain.single_forward(), groups), ("backward", chain.single_backward(), groups)];
+        if chain.summed() > 0 {
+            kernels.push(("sums", chain.sums(), chain.summing(SHARES)));
+            kernels.push(("merge", chain.merge(), chain.merging(SHARES)));
+        }
+        for (label, source, groups) in kernels {
+            run(&mut device, label, source, groups)?;
+        }
+        let mut grads = vec![];
+        for (s, range) in segments {
+            grads.extend(read(&mut device, &format!("grads_{s}"), range.len())?);
+        }
+        Ok([read(&mut device, "y", outputs)?, grads, read(&mut device, "dx", inputs)?])
     }
 
     fn samples(&self, projector: &dyn Projector, rays: &[(UnitRay, Option<u64>)]) -> Result<Vec<Samples>> {
-        let gpu = &self.gpu;
-        let mut all = vec![];
         let source = compose::sample(projector)?;
-        for (ray, seed) in rays {
-            let count = projector.max_samples(ray);
-            let mut buffers = Buffers::default();
-            buffers.reserve(gpu, "samples", 16 * count as u64, U::STORAGE | U::COPY_SRC)?;
-            buffers.reserve(gpu, "rays", size_of::<GpuRay>() as u64, U::STORAGE | U::COPY_DST)?;
-            buffers.reserve(gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
-            let on_device = GpuRay::new(ray, 0.0, seed.unwrap_or(0), 0, count as u32);
-            let (rows, training) = (count as u32, u32::from(seed.is_some()));
-            let step = Step { rows, ray_rows: rows, rays: 1, training, ..Step::default() };
-            buffers.get("rays").inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(&on_device)));
-            buffers.get("step").inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(&step)));
-            let kernel = self.kernels.get(gpu, "sample", &source)?;
-            let bound = kernel.bind(gpu, &buffers)?;
-            let staging = gpu.buffer("staging", 16 * count as u64, U::MAP_READ | U::COPY_DST)?;
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            if count > 0 {
-                kernel.launch(
-                    &mut encoder.begin_compute_pass(&Default::default()),
-                    &bound,
-                    count.div_ceil(GROUP as usize) as u32,
-                );
-                buffers.get("samples").inspect(|b| encoder.copy_buffer_to_buffer(b, 0, &staging, 0, 16 * count as u64));
+        let of = |(ray, seed): &(UnitRay, Option<u64>)| {
+            let rows = projector.max_samples(ray);
+            if rows == 0 {
+                return Ok(Samples::default());
             }
-            gpu.queue.submit([encoder.finish()]);
-            let mut samples = Samples::default();
-            gpu.read(&staging, 16 * count as u64, |found| {
-                for s in bytemuck::cast_slice::<u8, [f32; 4]>(found) {
-                    samples.points.push([s[0], s[1], s[2]]);
-                    samples.weights.push(s[3]);
-                }
-            })?;
-            all.push(samples);
-        }
-        Ok(all)
+            let (count, training) = (rows as u32, u32::from(seed.is_some()));
+            let mut device = begun(self, Step { rows: count, ray_rows: count, rays: 1, training, ..Step::default() })?;
+            device.reserve("samples", 16 * rows as u64)?;
+            let ray = GpuRay::new(ray, 0.0, seed.unwrap_or(0), 0, count);
+            device.write("rays", bytemuck::bytes_of(&ray))?;
+            run(&mut device, "sample", source.clone(), rows.div_ceil(GROUP as usize))?;
+            let found = read(&mut device, "samples", 4 * rows)?;
+            let found = found.chunks_exact(4).map(|s| ([s[0], s[1], s[2]], s[3]));
+            let (points, weights) = found.unzip();
+            Ok(Samples { points, weights })
+        };
+        rays.iter().map(of).collect()
     }
 
     fn losses(&self, loss: &dyn Loss, pairs: &[[f32; 2]]) -> Result<Vec<[f32; 2]>> {
@@ -108,62 +85,57 @@ impl Runner for Shared {
         let of = |k: usize| pairs.iter().flat_map(|p| vec![p[k]; each]).collect::<Vec<f32>>();
         let rows = (each * pairs.len()) as u32;
         let step = Step { rows, point_rows: rows, point_scale: 1.0, ..Step::default() };
-        let source = compose::loss_of_points(loss)?;
         let inputs = [("mu", of(0)), ("targets", of(1))];
-        let [sums, slopes] = self.derivatives("loss of points", &source, step, &inputs, pairs.len())?;
+        let [sums, slopes] = derivatives(self, compose::loss_of_points(loss)?, step, &inputs, pairs.len())?;
         Ok(sums.iter().zip(slopes.iter().step_by(each)).map(|(sum, slope)| [sum / each as f32, *slope]).collect())
     }
 
     fn penalty(&self, prior: &dyn Prior, values: &[f32]) -> Result<(f32, Vec<f32>)> {
         let rows = values.len() as u32;
         let step = Step { rows, blocks: 1, edge: prior.blocks().edge as u32, block_scale: 1.0, ..Step::default() };
-        let source = compose::penalty_of_blocks(prior)?;
         let inputs = [("mu", values.to_vec())];
-        let [sum, slopes] = self.derivatives("penalty of blocks", &source, step, &inputs, 1)?;
+        let [sum, slopes] = derivatives(self, compose::penalty_of_blocks(prior)?, step, &inputs, 1)?;
         Ok((sum[0], slopes))
     }
 }
 
-impl Shared {
-    /// Runs a kernel that makes derivatives by μ, a group for each of the `losses`. Returns these and the derivatives.
-    fn derivatives(
-        &self,
-        label: &str,
-        source: &Source,
-        step: Step,
-        inputs: &[(&str, Vec<f32>)],
-        losses: usize,
-    ) -> Result<[Vec<f32>; 2]> {
-        let gpu = &self.gpu;
-        let mut buffers = Buffers::default();
-        buffers.reserve(gpu, "step", size_of::<Step>() as u64, U::UNIFORM | U::COPY_DST)?;
-        buffers.get("step").inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(&step)));
-        for (name, values) in inputs {
-            buffers.reserve(gpu, name, 4 * values.len() as u64, U::STORAGE | U::COPY_DST)?;
-            buffers.get(name).inspect(|b| gpu.write(b, 0, bytemuck::cast_slice(values)));
-        }
-        let outputs = [("losses", losses), ("dmu", step.rows as usize)];
-        for (name, count) in outputs {
-            buffers.reserve(gpu, name, 4 * count as u64, U::STORAGE | U::COPY_SRC)?;
-        }
-        let kernel = self.kernels.get(gpu, label, source)?;
-        let bound = kernel.bind(gpu, &buffers)?;
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, losses as u32);
-        gpu.queue.submit([encoder.finish()]);
-        let [losses, slopes] = outputs.map(|(name, count)| self.fetch(&buffers, name, count));
-        Ok([losses?, slopes?])
+/// Runs a kernel that makes derivatives by μ, a group for each of the `losses`. Returns these and the derivatives.
+fn derivatives(
+    backend: &Wgpu,
+    source: Source,
+    step: Step,
+    inputs: &[(&str, Vec<f32>)],
+    losses: usize,
+) -> Result<[Vec<f32>; 2]> {
+    let mut device = begun(backend, step)?;
+    for (name, values) in inputs {
+        write(&mut device, name, values)?;
     }
+    let rows = step.rows as usize;
+    device.reserve("losses", 4 * losses as u64)?;
+    device.reserve("dmu", 4 * rows as u64)?;
+    run(&mut device, "derivatives", source, losses)?;
+    Ok([read(&mut device, "losses", losses)?, read(&mut device, "dmu", rows)?])
+}
 
-    /// The first `count` numbers of a buffer.
-    fn fetch(&self, buffers: &Buffers, name: &str, count: usize) -> Result<Vec<f32>> {
-        let (gpu, bytes) = (&self.gpu, 4 * count as u64);
-        let staging = gpu.buffer("staging", bytes, U::MAP_READ | U::COPY_DST)?;
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        buffers.get(name).inspect(|b| encoder.copy_buffer_to_buffer(b, 0, &staging, 0, bytes));
-        gpu.queue.submit([encoder.finish()]);
-        let mut out = vec![0.0; count];
-        gpu.read(&staging, bytes, |found| out.copy_from_slice(bytemuck::cast_slice(found)))?;
-        Ok(out)
-    }
+/// A device with the uniform values `step`.
+fn begun(backend: &Wgpu, step: Step) -> Result<Programs> {
+    let mut device = Programs::new(backend.shared.clone());
+    device.write("step", bytemuck::bytes_of(&step))?;
+    Ok(device)
+}
+
+fn write(device: &mut Programs, name: &str, data: &[f32]) -> Result<()> {
+    device.write(name, bytemuck::cast_slice(data))
+}
+
+fn run(device: &mut Programs, label: &str, source: Source, groups: usize) -> Result<()> {
+    device.run(&[(&Program { label: label.into(), source }, groups)])
+}
+
+/// The first `count` numbers of a buffer.
+fn read(device: &mut Programs, name: &str, count: usize) -> Result<Vec<f32>> {
+    let mut out = vec![0.0; count];
+    device.read(name, 0, bytemuck::cast_slice_mut(&mut out))?;
+    Ok(out)
 }

@@ -18,8 +18,10 @@ pub(crate) struct Staging(VecDeque<Stage>);
 
 struct Stage {
     buffer: wgpu::Buffer,
-    /// The copy that reads it, and the message that it can be written again.
-    used: Option<(wgpu::SubmissionIndex, Receiver<std::result::Result<(), wgpu::BufferAsyncError>>)>,
+    /// The copy that reads it.
+    index: wgpu::SubmissionIndex,
+    /// The message that it can be written again.
+    mapped: Receiver<std::result::Result<(), wgpu::BufferAsyncError>>,
 }
 
 impl Staging {
@@ -41,7 +43,7 @@ impl Staging {
             let index = gpu.submit(encoder);
             let (sender, receiver) = channel();
             stage.slice(..).map_async(wgpu::MapMode::Write, move |r| drop(sender.send(r)));
-            self.0.push_back(Stage { buffer: stage, used: Some((index, receiver)) });
+            self.0.push_back(Stage { buffer: stage, index, mapped: receiver });
         }
         Ok(())
     }
@@ -58,11 +60,11 @@ impl Staging {
                 })
             });
         }
-        let Some(Stage { buffer, used }) = self.0.pop_front() else { return Err(gpu.error("no staging buffer")) };
-        if let Some((index, mapped)) = used {
-            gpu.wait_for(index)?;
-            gpu.heard(&mapped)?;
-        }
+        let Some(Stage { buffer, index, mapped }) = self.0.pop_front() else {
+            return Err(gpu.error("no staging buffer"));
+        };
+        gpu.wait_for(index)?;
+        gpu.heard(&mapped)?;
         Ok(buffer)
     }
 }

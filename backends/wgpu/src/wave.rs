@@ -60,10 +60,11 @@ impl Wave {
 fn cast<'a>(projector: &dyn Projector, rays: impl Iterator<Item = (&'a UnitRay, f32, u64)>, most: u32) -> Vec<Wave> {
     let mut waves = vec![Wave::default()];
     for (ray, measured, seed) in rays {
-        let count = projector.max_samples(ray) as u32;
+        // More rows than 32 bits count have no room on any device.
+        let count = u32::try_from(projector.max_samples(ray)).unwrap_or(u32::MAX);
         if let Some(wave) = waves.last()
             && !wave.rays.is_empty()
-            && (wave.rows + count > most || wave.rays.len() == MOST_GROUPS)
+            && (wave.rows.saturating_add(count) > most || wave.rays.len() == MOST_GROUPS)
         {
             waves.push(Wave::default());
         }
@@ -216,5 +217,7 @@ mod tests {
         let priors = [BlockWork { prior: &Named(8), corners: &corners, spacing: [0.1; 3] }];
         let rows: Vec<_> = of_step(&Fixed(100), &work(&rays, &[], &priors), 64).iter().map(|w| w.rows).collect();
         assert_eq!(rows, [100, 100, 100, 512, 512]);
+        let waves = of_rays(&Fixed(1 << 32), &[ray(); 2], 64);
+        assert_eq!(waves.iter().map(|w| w.rows).collect::<Vec<_>>(), [u32::MAX; 2]);
     }
 }

@@ -272,7 +272,7 @@ fn points_off_any_ray_stand_alone() {
     let found = smoothed_exe.step(&mut smoothed, &work).unwrap();
     assert_eq!((stats.loss.to_bits(), stats.prior.to_bits()), (found.loss.to_bits(), found.prior.to_bits()));
     assert!(stats.loss > 0.0 && stats.prior > 0.0 && plain.arena.grads.iter().any(|g| *g != 0.0));
-    assert!(plain.arena.grads == smoothed.arena.grads, "gradients differ");
+    assert!(*plain.arena.grads == *smoothed.arena.grads, "gradients differ");
 
     let (origin, direction) = ([-1.0, 0.4, 0.6], [1.0, 0.0, 0.0]);
     let ray = UnitRay { origin, direction, inside: [1.0, 2.0], published: [1.0, 2.0], per_mm: 0.01 };

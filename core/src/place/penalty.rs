@@ -1,6 +1,6 @@
 //! A penalty of coefficients, as a place works with it: its proximal map, and the update around that.
 
-use super::{Array, Slab, StatePart};
+use super::{Array, Mask, Slab, StatePart};
 use crate::error::{Error, Result};
 use crate::geometry::Vec3;
 use crate::parallel;
@@ -178,24 +178,30 @@ impl Dual<'_> {
 }
 
 /// An update of a proximal gradient method with momentum. The proximal map is applied to `v = ahead + step·gradient`
-/// after pulling and masking. Its result `u` is the new `x`, and `u + momentum·(u − x)` the new `ahead`. All slices
+/// after pulling and masking. Its result `u` is the new `x`, and `u + momentum·(u − x)` the new `ahead`. All arrays
 /// have the same length.
-pub struct Update<'a> {
+pub struct UpdateOf<'a, Numbers: ?Sized, Flags: ?Sized> {
     /// Negative gradient of the data term at `ahead`; unspecified afterwards.
-    pub gradient: &'a mut [f32],
+    pub gradient: &'a mut Numbers,
     /// Point of the gradient; afterwards the point of the next one.
-    pub ahead: &'a mut [f32],
+    pub ahead: &'a mut Numbers,
     /// The coefficients.
-    pub x: &'a mut [f32],
+    pub x: &'a mut Numbers,
     /// Step along `gradient`.
     pub step: f32,
     /// Extrapolation beyond the new coefficients.
     pub momentum: f32,
     /// The coefficients to pull towards, and the share of the way.
-    pub towards: Option<(&'a [f32], f32)>,
+    pub towards: Option<(&'a Numbers, f32)>,
     /// Coefficients that may be non-zero, if not all.
-    pub inside: Option<&'a [bool]>,
+    pub inside: Option<&'a Flags>,
 }
+
+/// The update of numbers in the host's memory.
+pub type Update<'a> = UpdateOf<'a, [f32], [bool]>;
+
+/// The update of arrays in a place.
+pub type ProximalStep<'a> = UpdateOf<'a, Array, Mask>;
 
 /// Numbers per task of [`Update::step`] and [`Update::momentum`]: few enough for the first-level cache.
 const PART: usize = 1 << 12;

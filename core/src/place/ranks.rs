@@ -10,7 +10,8 @@
 use super::map::{MULTIPLY, Map, Reduction};
 use super::views::filter;
 use super::{
-    Array, FilteredViews, Held, Mask, MeasuredViews, Penalty, Place, StatePart, Weighing, additive, prox_on_host,
+    Array, FilteredViews, Held, Mask, MeasuredViews, Penalty, Place, StatePart, ViewRays, Weighing, additive,
+    prox_on_host,
 };
 use crate::error::{Error, Result};
 use crate::geometry::Geometry;
@@ -57,7 +58,7 @@ impl Slab {
 
     /// The sum of the processes' numbers `x`.
     pub fn sum(&self, x: f64) -> f64 {
-        self.wire.all(x).iter().sum()
+        self.wire.sum(x)
     }
 }
 
@@ -82,6 +83,11 @@ impl Wire {
         let mut into = vec![vec![0.0; 2]; out.len()];
         self.exchange(&out, &mut into);
         into.iter().map(|x| bytemuck::cast([x[0], x[1]])).collect()
+    }
+
+    /// The sum of the processes' numbers `x`.
+    fn sum(&self, x: f64) -> f64 {
+        self.all(x).iter().sum()
     }
 }
 
@@ -130,11 +136,6 @@ impl Ranks {
 
     fn own(&self, planes: usize) -> Range<usize> {
         self.part(self.rank(), planes)
-    }
-
-    /// The sum of the processes' numbers `x`.
-    fn sum(&self, x: f64) -> f64 {
-        self.wire.all(x).iter().sum()
     }
 
     /// Some planes of this process, in the host's memory.
@@ -262,7 +263,7 @@ impl Ranks {
 
     /// The places of the first `count` of some images, in groups with about as many of each process.
     fn turns(&self, [images, rows, columns]: [usize; 3], count: usize) -> Vec<Vec<usize>> {
-        let used = |rank| self.part(rank, images).start.min(count)..self.part(rank, images).end.min(count);
+        let used = |rank| self.used(rank, images, count);
         let most = (0..self.count()).map(|rank| used(rank).len()).max().unwrap_or(0);
         let together = self.together(rows * columns);
         let some = |first: usize| {
@@ -272,10 +273,10 @@ impl Ranks {
         (0..most).step_by(together).map(some).collect()
     }
 
-    /// The first `count` of some images that are here.
-    fn used(&self, images: usize, count: usize) -> Range<usize> {
-        let own = self.own(images);
-        own.start.min(count)..own.end.min(count)
+    /// The images of process `rank` among the first `count`.
+    fn used(&self, rank: usize, images: usize, count: usize) -> Range<usize> {
+        let part = self.part(rank, images);
+        part.start.min(count)..part.end.min(count)
     }
 }
 
@@ -370,7 +371,7 @@ impl Place for Ranks {
     }
 
     fn agree(&self, flag: bool) -> bool {
-        self.sum(f64::from(u8::from(flag))) > 0.0
+        self.wire.sum(f64::from(u8::from(flag))) > 0.0
     }
 
     fn slab(&self, planes: usize, halo: usize) -> Option<Slab> {
@@ -432,41 +433,32 @@ impl Place for Ranks {
         Ok(if kind == Reduction::Maximum { all.into_iter().fold(0.0, f64::max) } else { all.iter().sum() })
     }
 
-    fn forward(
-        &self,
-        projector: &dyn VoxelProjector,
-        geometry: &Geometry,
-        views: &[usize],
-        volume: &Array,
-        images: &mut Array,
-    ) -> Result<()> {
+    fn forward(&self, rays: ViewRays<'_>, volume: &Array, images: &mut Array) -> Result<()> {
         let [count, rows, columns] = images.shape();
         let (own, here) = (self.own(volume.shape()[0]), at_hand(volume)?.1);
-        let slab = Geometry { volume: geometry.volume.slab(own.clone()), ..geometry.clone() };
-        for some in self.turns(images.shape(), views.len()) {
-            let seen: Vec<usize> = some.iter().map(|&i| views[i]).collect();
+        let slab = Geometry { volume: rays.geometry.volume.slab(own.clone()), ..rays.geometry.clone() };
+        for some in self.turns(images.shape(), rays.views.len()) {
+            let seen: Vec<usize> = some.iter().map(|&i| rays.views[i]).collect();
             let mut lines = self.here.zeros([some.len(), rows, columns])?;
             if !own.is_empty() {
-                self.here.forward(projector, &slab, &seen, here, &mut lines)?;
+                self.here.forward(ViewRays { geometry: &slab, views: &seen, ..rays }, here, &mut lines)?;
             }
             let lines = self.here.read(&lines)?;
             // Images of one process follow each other.
             let of = |rank| some.iter().filter(|i| self.part(rank, count).contains(i)).count() * rows * columns;
             let mut rest = lines.as_slice().unwrap_or_default();
-            let mut blocks = vec![];
-            for rank in 0..self.count() {
+            let block = |rank| {
                 let (block, others) = rest.split_at(of(rank));
-                blocks.push(block);
                 rest = others;
-            }
-            let me = self.rank();
-            let out = |rank: usize| if rank == me { vec![] } else { blocks[rank].to_vec() };
-            let out: Vec<_> = (0..self.count()).map(out).collect();
-            let other = |rank| vec![0.0; if rank == me { 0 } else { of(me) }];
-            let mut into: Vec<_> = (0..self.count()).map(other).collect();
+                block.to_vec()
+            };
+            let mut out: Vec<_> = (0..self.count()).map(block).collect();
+            let own = std::mem::take(&mut out[self.rank()]);
+            let mut into = vec![vec![0.0; own.len()]; out.len()];
+            into[self.rank()].clear();
             self.wire.exchange(&out, &mut into);
             let Some(first) = some.iter().find(|i| self.own(count).contains(i)) else { continue };
-            into[me] = blocks[me].to_vec();
+            into[self.rank()] = own;
             let mut all = into.into_iter();
             let mut sum = all.next().unwrap_or_default();
             for other in all {
@@ -478,29 +470,22 @@ impl Place for Ranks {
         Ok(())
     }
 
-    fn adjoint(
-        &self,
-        projector: &dyn VoxelProjector,
-        geometry: &Geometry,
-        views: &[usize],
-        images: &Array,
-        volume: &mut Array,
-    ) -> Result<()> {
+    fn adjoint(&self, rays: ViewRays<'_>, images: &Array, volume: &mut Array) -> Result<()> {
         let own = self.own(volume.shape()[0]);
         let here = at_hand_mut(volume)?.1;
-        let slab = Geometry { volume: geometry.volume.slab(own.clone()), ..geometry.clone() };
-        self.in_turns(images, views.len(), |some, images| {
-            let seen: Vec<usize> = some.iter().map(|&i| views[i]).collect();
+        let slab = Geometry { volume: rays.geometry.volume.slab(own.clone()), ..rays.geometry.clone() };
+        self.in_turns(images, rays.views.len(), |some, images| {
+            let seen: Vec<usize> = some.iter().map(|&i| rays.views[i]).collect();
             if own.is_empty() {
                 return Ok(());
             }
-            self.here.adjoint(projector, &slab, &seen, &images, here)
+            self.here.adjoint(ViewRays { geometry: &slab, views: &seen, ..rays }, &images, here)
         })
     }
 
     fn compare(&self, by: &Weighing<'_>, views: &[usize], images: &mut Array) -> Result<[f64; 2]> {
         let count = images.shape()[0];
-        let used = self.used(count, views.len());
+        let used = self.used(self.rank(), count, views.len());
         let weights = match by.weights {
             None => None,
             Some(weights) => {
@@ -525,11 +510,11 @@ impl Place for Ranks {
                 self.here.map(&MULTIPLY, [1.0, 0.0], here, &[&weights])?;
             }
         }
-        Ok(sums.map(|x| self.sum(x)))
+        Ok(sums.map(|x| self.wire.sum(x)))
     }
 
     fn weigh(&self, by: &Weighing<'_>, spread: bool, views: &[usize], images: &mut Array) -> Result<()> {
-        let used = self.used(images.shape()[0], views.len());
+        let used = self.used(self.rank(), images.shape()[0], views.len());
         let here = at_hand_mut(images)?.1;
         let by = Weighing { shadow: None, weights: None, ..*by };
         if used.is_empty() { Ok(()) } else { self.here.weigh(&by, spread, &views[used], here) }
@@ -546,7 +531,7 @@ impl Place for Ranks {
         let (start, here) = at_hand_mut(slab)?;
         if here.on_host().is_some() {
             // Each image is filtered once. Devices pass on raw images, and each filters all of them.
-            let used = self.used(images.shape()[0], views.len());
+            let used = self.used(self.rank(), images.shape()[0], views.len());
             self.here.change(at_hand_mut(images)?.1, &mut |images| filter(work, &views[used.clone()], images))?;
         }
         self.in_turns(images, views.len(), |some, mut images| {
@@ -579,17 +564,14 @@ impl Place for Ranks {
     fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {
         match penalty.slab().cloned() {
             None => Ok(penalty.value(self.read(x)?.view())),
-            Some(slab) => Ok(self.sum(self.here.penalty(penalty, &self.near(x, &slab)?)?)),
+            Some(slab) => Ok(self.wire.sum(self.here.penalty(penalty, &self.near(x, &slab)?)?)),
         }
     }
 
     fn adapt(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<Option<f64>> {
-        if !penalty.adapts() {
-            return Ok(None);
-        }
         Ok(match penalty.slab().cloned() {
             None => penalty.adapt(self.read(x)?.view()),
-            Some(slab) => self.here.adapt(penalty, &self.near(x, &slab)?)?.map(|value| self.sum(value)),
+            Some(slab) => self.here.adapt(penalty, &self.near(x, &slab)?)?.map(|value| self.wire.sum(value)),
         })
     }
 }

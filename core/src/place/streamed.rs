@@ -1,7 +1,7 @@
 //! A device without room for a method's arrays. They live in the host's memory; the device computes line integrals of one
 //! slab of the volume after another.
 
-use super::{Array, Host, Penalty, Place, ProximalStep, additive};
+use super::{Array, Host, Penalty, Place, ProximalStep, ViewRays, additive};
 use crate::error::{Error, Result};
 use crate::geometry::Geometry;
 use crate::parallel;
@@ -93,10 +93,6 @@ fn elsewhere() -> Error {
 }
 
 impl Place for Streamed {
-    fn device(&self) -> Option<String> {
-        None
-    }
-
     fn zeros(&self, shape: [usize; 3]) -> Result<Array> {
         Host.zeros(shape)
     }
@@ -117,8 +113,8 @@ impl Place for Streamed {
         Host.adopt(from)
     }
 
-    fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
-        Host.update(step, penalty)
+    fn update(&self, step: ProximalStep<'_>, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
+        Host.update(step, tau, penalty)
     }
 
     fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
@@ -126,43 +122,31 @@ impl Place for Streamed {
         self.device.admits(projector)
     }
 
-    fn forward(
-        &self,
-        projector: &dyn VoxelProjector,
-        geometry: &Geometry,
-        views: &[usize],
-        volume: &Array,
-        images: &mut Array,
-    ) -> Result<()> {
+    fn forward(&self, rays: ViewRays<'_>, volume: &Array, images: &mut Array) -> Result<()> {
         let mut room = self.room(volume.shape(), images.shape())?;
         let (volume, images) = (volume.on_host().ok_or_else(elsewhere)?, images.on_host_mut().ok_or_else(elsewhere)?);
-        images.slice_mut(s![..views.len(), .., ..]).fill(0.0);
-        for (own, slab) in slabs(geometry, room.slab.shape()[0]) {
+        images.slice_mut(s![..rays.views.len(), .., ..]).fill(0.0);
+        for (own, slab) in slabs(rays.geometry, room.slab.shape()[0]) {
             self.device.fill(&mut room.slab, 0.0)?;
             self.device.load(volume.slice(s![own, .., ..]), &mut room.slab, 0)?;
-            for some in parts(views.len(), room.images.shape()[0]) {
-                self.device.forward(projector, &slab, &views[some.clone()], &room.slab, &mut room.images)?;
+            for some in parts(rays.views.len(), room.images.shape()[0]) {
+                let rays = ViewRays { geometry: &slab, views: &rays.views[some.clone()], ..rays };
+                self.device.forward(rays, &room.slab, &mut room.images)?;
                 self.add(&room.images, images.slice_mut(s![some, .., ..]))?;
             }
         }
         Ok(())
     }
 
-    fn adjoint(
-        &self,
-        projector: &dyn VoxelProjector,
-        geometry: &Geometry,
-        views: &[usize],
-        images: &Array,
-        volume: &mut Array,
-    ) -> Result<()> {
+    fn adjoint(&self, rays: ViewRays<'_>, images: &Array, volume: &mut Array) -> Result<()> {
         let mut room = self.room(volume.shape(), images.shape())?;
         let (images, volume) = (images.on_host().ok_or_else(elsewhere)?, volume.on_host_mut().ok_or_else(elsewhere)?);
-        for (own, slab) in slabs(geometry, room.slab.shape()[0]) {
+        for (own, slab) in slabs(rays.geometry, room.slab.shape()[0]) {
             self.device.fill(&mut room.slab, 0.0)?;
-            for some in parts(views.len(), room.images.shape()[0]) {
+            for some in parts(rays.views.len(), room.images.shape()[0]) {
                 self.device.load(images.slice(s![some.clone(), .., ..]), &mut room.images, 0)?;
-                self.device.adjoint(projector, &slab, &views[some], &room.images, &mut room.slab)?;
+                let rays = ViewRays { geometry: &slab, views: &rays.views[some], ..rays };
+                self.device.adjoint(rays, &room.images, &mut room.slab)?;
             }
             self.add(&room.slab, volume.slice_mut(s![own, .., ..]))?;
         }

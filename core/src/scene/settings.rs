@@ -105,10 +105,11 @@ pub enum LevelRule {
 
 /// Where the object can be inside the volume. Iterative methods keep other voxels at 0; for fields, the unit cube is
 /// fitted to the region, and rays are sampled inside it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum SupportRule {
     /// Anywhere.
+    #[default]
     Box,
     /// Without air: cells through which several views see only air are left out. Truncated views do not count.
     Carve,
@@ -203,7 +204,7 @@ impl AttenuationScale {
 }
 
 /// How an iterative method treats the scan.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct VoxelScene {
     /// Where the object can be inside the volume.
@@ -214,13 +215,6 @@ pub struct VoxelScene {
     /// Bounds of attenuation.
     #[serde(skip_serializing_if = "BoundsSettings::are_default")]
     pub bounds: BoundsSettings,
-}
-
-impl Default for VoxelScene {
-    fn default() -> Self {
-        let bounds = BoundsSettings::default();
-        Self { support: SupportRule::Box, surround: SurroundRule::None, bounds }
-    }
 }
 
 impl VoxelScene {
@@ -278,14 +272,11 @@ impl RegionSettings {
     }
 
     /// Makes an error about `scene.support` one about the region.
-    pub fn concern(i: usize, e: Error) -> Error {
-        match e {
-            Error::Invalid { place, field, found, expected } => {
-                let field = field.replacen("scene.support", &format!("{}.within", Self::key(i)), 1);
-                Error::Invalid { place, field, found, expected }
-            }
-            other => other,
+    pub fn concern(i: usize, mut e: Error) -> Error {
+        if let Error::Invalid { field, .. } = &mut e {
+            *field = field.replacen("scene.support", &format!("{}.within", Self::key(i)), 1);
         }
+        e
     }
 
     fn validate(&self, i: usize) -> Result<()> {

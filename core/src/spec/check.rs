@@ -11,7 +11,9 @@ use serde_json::Value;
 
 /// Refuses unknown keys, unknown types and values of the wrong type.
 pub(super) fn spec(root: &Node) -> Result<()> {
-    table(root, "spec")?;
+    if !matches!(root.kind, Is::Table(_)) {
+        return Err(invalid(&root.at, "spec", root.shown(), "a table".into()));
+    }
     for (key, schema) in label() {
         if let Some(value) = root.get(key) {
             setting(value, &schema, &Context::new(&schema, None), key)?;
@@ -22,12 +24,12 @@ pub(super) fn spec(root: &Node) -> Result<()> {
 
 /// Checks the settings of one stage, with their type, as those in a spec are checked; `source` names them in errors.
 pub fn settings(kind: Kind, table: &Value, source: &str) -> Result<()> {
-    stage(&parse(source, &table.to_string(), 0)?, kind, "").map_err(|e| match e {
+    stage(&parse(source, &table.to_string(), 0)?, kind, "").map_err(|mut e| {
         // They are one line: its columns say nothing.
-        Error::Invalid { field, found, expected, .. } => {
-            Error::Invalid { place: source.into(), field, found, expected }
+        if let Error::Invalid { place, .. } = &mut e {
+            *place = source.into();
         }
-        other => other,
+        e
     })
 }
 
@@ -135,7 +137,7 @@ fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<
     }
 }
 
-/// Checks the keys of a table.
+/// Checks the keys of a table. Refuses one that lacks a key without default.
 fn object(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
     let empty = serde_json::Map::new();
     let properties = schema["properties"].as_object().unwrap_or(&empty);
@@ -147,18 +149,11 @@ fn object(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<(
             None if schema["additionalProperties"] == Value::Bool(false) => {
                 let own = properties.keys().map(String::as_str).filter(|k| *k != "type");
                 let known: Vec<&str> = label.iter().copied().chain(own).collect();
-                return Err(unknown(&e.at, &at, &e.key, &known));
+                return Err(invalid(&e.at, &at, "an unknown key".into(), suggest(&e.key, &known)));
             }
             None => {}
         }
     }
-    required(node, schema, cx, path)
-}
-
-/// Refuses a table that lacks a key without default.
-fn required(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
-    let empty = serde_json::Map::new();
-    let properties = schema["properties"].as_object().unwrap_or(&empty);
     for key in schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str) {
         if node.get(key).is_none() {
             let want = properties.get(key).map_or("a value".into(), |s| wanted(cx.resolve(s), cx));
@@ -277,21 +272,10 @@ fn misnamed(node: &Node, path: &str, allowed: &[Value]) -> Option<Error> {
     Some(invalid(&node.at, path, format!("{text:?}"), suggest(text, &names)))
 }
 
-fn table(node: &Node, path: &str) -> Result<()> {
-    match node.kind {
-        Is::Table(_) => Ok(()),
-        _ => Err(invalid(&node.at, path, node.shown(), "a table".into())),
-    }
-}
-
 pub(super) fn join(path: &str, key: &str) -> String {
     if path.is_empty() { key.into() } else { format!("{path}.{key}") }
 }
 
 pub(super) fn invalid(at: &At, path: &str, found: String, expected: String) -> Error {
     Error::invalid(at.to_string(), path, found, expected)
-}
-
-fn unknown(at: &At, path: &str, key: &str, known: &[&str]) -> Error {
-    invalid(at, path, "an unknown key".into(), suggest(key, known))
 }

@@ -69,18 +69,6 @@ pub(crate) struct Node {
     pub(crate) kind: Is,
 }
 
-impl Node {
-    /// Adds the names of all sources used here.
-    pub(crate) fn sources(&self, all: &mut BTreeSet<String>) {
-        all.insert(self.at.source.name.clone());
-        match &self.kind {
-            Is::Array(items) => items.iter().for_each(|i| i.sources(all)),
-            Is::Table(entries) => entries.iter().for_each(|e| e.value.sources(all)),
-            _ => {}
-        }
-    }
-}
-
 /// The content of a value.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Is {
@@ -104,6 +92,16 @@ pub(crate) struct Entry {
 }
 
 impl Node {
+    /// Adds the names of all sources used here.
+    pub(crate) fn sources(&self, all: &mut BTreeSet<String>) {
+        all.insert(self.at.source.name.clone());
+        match &self.kind {
+            Is::Array(items) => items.iter().for_each(|i| i.sources(all)),
+            Is::Table(entries) => entries.iter().for_each(|e| e.value.sources(all)),
+            _ => {}
+        }
+    }
+
     /// A table without entries.
     pub(crate) fn empty_table(at: At) -> Self {
         Self { at, kind: Is::Table(vec![]) }

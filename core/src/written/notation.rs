@@ -23,21 +23,10 @@ fn toml_table(source: &Arc<Source>, table: &DeTable<'_>, at: At) -> Result<Node>
     for (key, value) in table {
         let (key, at) = (key.get_ref().to_string(), At::byte(source, key.span().start));
         let value =
-            toml_value(source, value.get_ref(), At::byte(source, value.span().start)).map_err(|e| below(&key, e))?;
+            toml_value(source, value.get_ref(), At::byte(source, value.span().start)).map_err(|e| e.below(&key))?;
         entries.push(Entry { key, at, value });
     }
     Ok(Node { at, kind: Is::Table(entries) })
-}
-
-/// The error of a value at `step` of a table or list.
-fn below(step: &dyn fmt::Display, error: Error) -> Error {
-    match error {
-        Error::Invalid { place, field, found, expected } => {
-            let field = if field.is_empty() { step.to_string() } else { format!("{step}.{field}") };
-            Error::Invalid { place, field, found, expected }
-        }
-        other => other,
-    }
 }
 
 fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At) -> Result<Node> {
@@ -60,7 +49,8 @@ fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At) -> Result<Node>
                 .iter()
                 .enumerate()
                 .map(|(i, v)| {
-                    toml_value(source, v.get_ref(), At::byte(source, v.span().start)).map_err(|e| below(&i, e))
+                    toml_value(source, v.get_ref(), At::byte(source, v.span().start))
+                        .map_err(|e| e.below(&i.to_string()))
                 })
                 .collect::<Result<_>>()?,
         ),

@@ -7,6 +7,7 @@ use conefield_core::finite::range;
 use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, norm};
 use conefield_core::method::{Context, Job, Method, Observer, Reconstruction, Record};
 use conefield_core::parallel;
+use conefield_core::place::ViewRays;
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use conefield_projectors::voxel::Joseph;
@@ -153,7 +154,8 @@ impl Level {
             let place = backend.place();
             let all: Vec<usize> = (0..fold.held_out.len()).collect();
             let (volume, mut lines) = (place.adopt(volume)?, place.zeros(fold.test.projections.dim().into())?);
-            place.forward(&Joseph {}, &among(&fold.held_out), &all, &volume, &mut lines)?;
+            let rays = ViewRays { projector: &Joseph {}, geometry: &among(&fold.held_out), views: &all };
+            place.forward(rays, &volume, &mut lines)?;
             let mut residual = place.take(lines)?;
             residual.zip_mut_with(&fold.test.projections, |a, p| *a = p - *a);
             Ok(residual)

@@ -497,8 +497,8 @@ impl FistaIterate {
         let Arrays { model, penalty, x, ahead, gradient, towards, .. } = &mut self.arrays;
         let towards = towards.as_ref().map(|towards| (towards, self.pull));
         let inside = model.inside(problem);
-        let by = ProximalStep { gradient, ahead, x, step, momentum, towards, inside, tau };
-        problem.place.update(by, penalty.as_mut())?;
+        let by = ProximalStep { gradient, ahead, x, step, momentum, towards, inside };
+        problem.place.update(by, tau, penalty.as_mut())?;
         Ok(misfits)
     }
 
@@ -521,7 +521,9 @@ impl Iteration for FistaIterate {
         let place = problem.place;
         copy(place, &self.arrays.x, &mut self.arrays.before)?;
         // A changed penalty must not count as progress or regress.
-        if let Some(value) = place.adapt(self.arrays.penalty.as_mut(), &self.arrays.x)? {
+        if self.arrays.penalty.adapts()
+            && let Some(value) = place.adapt(self.arrays.penalty.as_mut(), &self.arrays.x)?
+        {
             self.objective = self.misfit + self.lambda * value;
         }
         let (mut residual, mut misfit) = (0.0, 0.0);

@@ -4,7 +4,7 @@ use crate::watched;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
 use conefield_core::method::Job;
-use conefield_core::place::{Array, Place};
+use conefield_core::place::{Array, Place, ViewRays};
 use conefield_core::scan::Scan;
 use conefield_core::voxel::VoxelProjector;
 use ndarray::{Array3, ArrayView3};
@@ -54,7 +54,7 @@ impl<'a> VolumeMonitor<'a> {
         let mut found = place.zeros([1, rows, columns])?;
         let (mut square, mut top) = (0.0, 0.0f32);
         for view in 0..geometry.views.len() {
-            place.forward(projector, geometry, &[view], volume, &mut found)?;
+            place.forward(ViewRays { projector, geometry, views: &[view] }, volume, &mut found)?;
             for (a, &b) in place.read(&found)?.iter().zip(scan.view(view)) {
                 square += f64::from(a - b).powi(2);
                 top = top.max(b);

@@ -6,7 +6,9 @@ use conefield_core::data_term::Misfit;
 use conefield_core::error::Result;
 use conefield_core::geometry::Geometry;
 use conefield_core::parallel;
-use conefield_core::place::{ADD, Array, Bounds, CLIP, INVERT, Mask, MeasuredViews, Place, Reduction, Weighing};
+use conefield_core::place::{
+    ADD, Array, Bounds, CLIP, INVERT, Mask, MeasuredViews, Place, Reduction, ViewRays, Weighing,
+};
 use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::space::Space;
 use conefield_core::voxel::VoxelProjector;
@@ -73,7 +75,11 @@ impl Problem<'_> {
 
     /// Overwrites the first images of `out` with `A·x` for some views.
     pub fn forward(&self, views: &[usize], x: &Array, out: &mut Array) -> Result<()> {
-        self.place.forward(self.projector, self.geometry, views, x, out)
+        self.place.forward(self.rays(views), x, out)
+    }
+
+    fn rays<'a>(&'a self, views: &'a [usize]) -> ViewRays<'a> {
+        ViewRays { projector: self.projector, geometry: self.geometry, views }
     }
 
     /// Overwrites the first images of `out` with `W·(p − A·x)` for some views, with p = 0 in air if requested; W is 1 or
@@ -93,7 +99,7 @@ impl Problem<'_> {
 
     /// Adds `Aᵀ·y` for some views, whose images are the first of `y`, to `out`.
     pub(super) fn add_back(&self, views: &[usize], y: &Array, out: &mut Array) -> Result<()> {
-        self.place.adjoint(self.projector, self.geometry, views, y, out)
+        self.place.adjoint(self.rays(views), y, out)
     }
 
     /// Sets the voxels outside the object's support to `value`.

@@ -3,8 +3,8 @@
 
 mod translations;
 
-use conefield_backend_wgpu::{Limits, Shared, Wgpu, source};
-use std::sync::{Arc, OnceLock};
+use conefield_backend_wgpu::{Limits, Wgpu, source};
+use std::sync::OnceLock;
 
 /// The adapter that was asked for.
 fn asked() -> Option<usize> {
@@ -24,13 +24,13 @@ fn open(limits: Limits) -> Option<Wgpu> {
 
 /// The device, opened once a program; `None`, said on stderr with what is not tried, where there is no adapter.
 #[allow(dead_code)]
-pub fn shared(what: &str) -> Option<Arc<Shared>> {
-    static DEVICE: OnceLock<Option<Arc<Shared>>> = OnceLock::new();
-    let device = DEVICE.get_or_init(|| open(Limits::default()).map(|w| w.shared().clone()));
+pub fn shared(what: &str) -> Option<&'static Wgpu> {
+    static DEVICE: OnceLock<Option<Wgpu>> = OnceLock::new();
+    let device = DEVICE.get_or_init(|| open(Limits::default()));
     if device.is_none() {
         eprintln!("SKIPPED: no adapter for {what}");
     }
-    device.clone()
+    device.as_ref()
 }
 
 /// Backends on the device: with its own limits, and with lower ones: no atomic sums; buffers so small that everything is

@@ -115,7 +115,7 @@ fn drift_is_logged_where_it_is_asked_for_and_changes_nothing() {
     assert!((found[1].epoch - 3.0).abs() < 1e-12);
     let (plain, without) = solve(&with("/callbacks", json!([{"type": "rollback"}])), &scan).unwrap();
     assert!(drift(&without).is_empty() && !serde_json::to_string(&without[0]).unwrap().contains("drift"));
-    assert_eq!(model(solution).arena.params, model(plain).arena.params);
+    assert_eq!(*model(solution).arena.params, *model(plain).arena.params);
     // A rate too small to change a number leaves nothing to see.
     let (_, still) = solve(&with("/optimizer/lr", json!(1e-30)), &scan).unwrap();
     assert!(drift(&still).iter().all(|d| d.mean_l1 == 0.0) && drift(&still).len() == 3);

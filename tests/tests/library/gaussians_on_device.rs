@@ -277,6 +277,23 @@ impl Device for Watched {
     }
 }
 
+/// Two bins with 2^31 Gaussians each: their lists have no room, and the sum of their lengths does not wrap.
+#[test]
+fn lists_beyond_32_bits_are_refused() {
+    let add = "atomicAdd(&counts[bin], 1u);";
+    let many = "atomicOr(&counts[0], 0x80000000u); atomicOr(&counts[1], 0x80000000u);";
+    for (limits, backend) in on_devices() {
+        let (inner, counts) = (backend.device().unwrap(), Arc::new(Mutex::new([0; 2])));
+        let device = Watched { inner, counts, fault: Some(["gaussians: count", add, many]) };
+        let model = mixture(0.01);
+        let mut field = model.pipeline.field.lines().unwrap().on_device(Box::new(device)).unwrap();
+        field.load(&model.arena.params).unwrap();
+        let grid = UnitGrid { first: [0.1; 3], spacing: [0.1; 3], shape: [1, 8, 8] };
+        let e = field.values(&grid, &mut [0.0; 64]).unwrap_err().to_string();
+        assert!(e.contains("entries"), "{limits}: {e}");
+    }
+}
+
 /// A step moves numbers: views stay on the device, and so do Gaussians with their gradients and moments.
 #[test]
 fn a_step_moves_numbers_and_launches_few_kernels() {

@@ -62,5 +62,5 @@ fn slices_are_those_of_the_field_and_change_nothing() {
     }
     let thick = |k: usize| with.last[k].0.each_ref().map(|r| (r.start, r.len()));
     assert_eq!(thick(1), [(0, 16), (8, 1), (0, 16)]);
-    assert!(model(plain).arena.params == model(watched).arena.params);
+    assert!(*model(plain).arena.params == *model(watched).arena.params);
 }

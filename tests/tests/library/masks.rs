@@ -80,5 +80,5 @@ fn channels_that_are_not_there_are_refused_and_nothing_changes() {
         let e = model.mask(keep).unwrap_err().to_string();
         assert!(e.contains("channels 0 to 5"), "{e}");
     }
-    assert!(model.masks().is_empty() && model.arena.params == old);
+    assert!(model.masks().is_empty() && *model.arena.params == *old);
 }

@@ -8,7 +8,9 @@ use conefield_core::backend::Backend;
 use conefield_core::data_term::DataTermSpec;
 use conefield_core::geometry::Geometry;
 use conefield_core::method::Job;
-use conefield_core::place::{Array, Host, Map, Place, ProximalStep, Reduction, StatePart, Streamed, Weighing};
+use conefield_core::place::{
+    Array, Host, Map, Place, ProximalStep, Reduction, StatePart, Streamed, ViewRays, Weighing,
+};
 use conefield_core::random::{mix, unit};
 use conefield_core::regularizer::{Bounds, Dual, Kernels, Penalty, RegularizerSpec};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
@@ -74,9 +76,10 @@ fn errors(place: &dyn Place, p: &dyn VoxelProjector, g: &Geometry) -> conefield_
     let (x32, y32) = (x.mapv(|v| v as f32), y.mapv(|v| v as f32));
     // Room for more views than are asked for.
     let mut found = place.adopt(Array3::from_elem((views.len() + 3, rows, columns), 7.0))?;
-    place.forward(p, g, &views, &place.adopt(x32.clone())?, &mut found)?;
+    let rays = ViewRays { projector: p, geometry: g, views: &views };
+    place.forward(rays, &place.adopt(x32.clone())?, &mut found)?;
     let mut back = place.adopt(Array3::ones(x.dim()))?;
-    place.adjoint(p, g, &views, &place.adopt(y32.clone())?, &mut back)?;
+    place.adjoint(rays, &place.adopt(y32.clone())?, &mut back)?;
     let found = place.take(found)?.slice_move(s![..views.len(), .., ..]);
     let back = place.take(back)?;
     let dot =
@@ -303,7 +306,9 @@ fn updates_differ(
         let inside = place.mask(kept)?;
         let mut numbers = vec![];
         for seed in 10..13 {
-            numbers.extend(place.adapt(penalty.as_mut(), &x)?);
+            if penalty.adapts() {
+                numbers.extend(place.adapt(penalty.as_mut(), &x)?);
+            }
             let mut gradient = place.adopt(volume(g.volume.shape, seed))?;
             let step = ProximalStep {
                 gradient: &mut gradient,
@@ -313,9 +318,8 @@ fn updates_differ(
                 inside: masked.then_some(&inside),
                 step: 0.3,
                 momentum: 0.6,
-                tau,
             };
-            place.update(step, penalty.as_mut())?;
+            place.update(step, tau, penalty.as_mut())?;
             numbers.push(place.penalty(penalty.as_mut(), &x)?);
         }
         let state = penalty.state();
@@ -569,9 +573,6 @@ fn a_pass_moves_scalars_and_a_run_its_views_and_its_volume() {
 pub struct Little(pub u64);
 
 impl Place for Little {
-    fn device(&self) -> Option<String> {
-        Host.device()
-    }
     fn zeros(&self, shape: [usize; 3]) -> conefield_core::Result<Array> {
         let bytes = 4 * shape.iter().product::<usize>() as u64;
         if bytes > self.0 {

@@ -14,6 +14,7 @@ use conefield_core::method::{Job, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::prior::Prior;
 use conefield_core::random::mix;
+use conefield_core::runner::Runner;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::stage::{
     Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Samples, Scope, Stage, UnitRay,
@@ -93,6 +94,27 @@ fn steps_agree(settings: &Value) {
             wrong[top] *= 1.01;
             assert!(worst(&pipeline, &wrong, &exact) > limit);
         }
+    }
+}
+
+/// The first rays of a pipeline may have no samples, as those beside the object.
+#[test]
+fn rays_that_miss_the_scene_are_zero() {
+    let scan = scan();
+    let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
+    for (name, backend) in crate::device::backends("rays beside the scene") {
+        let mut model = Model::random(crate::common::pipeline(&spec(&settings()).unwrap()), 3);
+        let ray = UnitRay { inside: [0.0; 2], ..scene.pixel_ray(&scan.geometry, 0, 8, 8) };
+        assert_eq!(model.pipeline.projector.max_samples(&ray), 0);
+        let mut exe = backend.compile(&model.pipeline).unwrap().0;
+        let mut lines = [1.0; 3];
+        exe.render(&model, &[ray; 3], &mut lines).unwrap();
+        assert_eq!(lines, [0.0; 3], "{name}");
+        let mut exe = backend.compile(&model.pipeline).unwrap().0;
+        let rays = [TrainRay { ray, target: 2.0 }; 3];
+        let work = Work { step: 1, seed: 1, loss: &L2 {}, rays: &rays, points: &[], priors: &[] };
+        let stats = exe.step(&mut model, &work).unwrap();
+        assert_eq!((stats.samples, stats.loss), (0, 2.0), "{name}");
     }
 }
 

@@ -1,7 +1,7 @@
 //! Elementwise maps, masks and reductions.
 
 use super::launch::{Room, Task, each, summing};
-use super::{Array, Mask, flag, parts, plane};
+use super::{Array, Chunk, Mask, flag, parts, plane};
 use crate::Shared;
 use conefield_core::device::{Access, Source};
 use conefield_core::error::Result;
@@ -39,22 +39,37 @@ fn uniform([a, b]: [f64; 2]) -> (&'static str, impl Fn(u32, u32) -> Elements) {
     ("elements", move |begin, end| Elements { begin, end, a, b })
 }
 
-pub(super) fn fill(shared: &Shared, room: &mut Room, x: &mut Array, value: f32) -> Result<()> {
-    let plane = plane(x.shape());
+/// Runs `body` for every element i of `out`; `with` are further buffers, each with its type in WGSL.
+fn apply(
+    shared: &Shared,
+    room: &mut Room,
+    (label, body): (&str, &str),
+    factors: [f64; 2],
+    out: &Array,
+    with: &[(&str, &str, &[Chunk])],
+) -> Result<()> {
+    let mut source = begun();
+    source.bind("out", Access::Write, "array<f32>");
+    with.iter().for_each(|(name, ty, _)| source.bind(name, Access::Read, ty));
+    source.add(label, &each("elements", body));
+    let plane = plane(out.shape());
+    for (k, part) in parts(out).iter().enumerate() {
+        let others = with.iter().filter_map(|(name, _, parts)| Some((*name, &parts.get(k)?.buffer)));
+        let bind: Vec<_> = [("out", &part.buffer)].into_iter().chain(others).collect();
+        let task = Task { label, source: &source, bind: &bind };
+        room.run(shared, task, uniform(factors), (part.planes.len() * plane) as u32)?;
+    }
+    Ok(())
+}
+
+pub(super) fn fill(shared: &Shared, room: &mut Room, x: &Array, value: f32) -> Result<()> {
     if value == 0.0 {
         let mut encoder = shared.gpu.device.create_command_encoder(&Default::default());
         parts(x).iter().for_each(|part| encoder.clear_buffer(&part.buffer, 0, None));
         shared.gpu.submit(encoder);
         return Ok(());
     }
-    let mut source = begun();
-    source.bind("out", Access::Write, "array<f32>");
-    source.add("fill", &each("elements", "out[i] = elements.a;"));
-    for part in parts(x) {
-        let task = Task { label: "fill", source: &source, bind: &[("out", &part.buffer)] };
-        room.run(shared, task, uniform([f64::from(value), 0.0]), (part.planes.len() * plane) as u32)?;
-    }
-    Ok(())
+    apply(shared, room, ("fill", "out[i] = elements.a;"), [f64::from(value), 0.0], x, &[])
 }
 
 pub(super) fn scatter(shared: &Shared, (from, first): (&Array, usize), out: &mut Array, at: &[usize]) {
@@ -73,18 +88,9 @@ pub(super) fn scatter(shared: &Shared, (from, first): (&Array, usize), out: &mut
 }
 
 pub(super) fn keep(shared: &Shared, room: &mut Room, x: &mut Array, inside: &Mask, value: f32) -> Result<()> {
-    let mut source = begun();
-    source.bind("out", Access::Write, "array<f32>");
-    source.bind("inside", Access::Read, "array<u32>");
     let body = format!("if !{} {{ out[i] = elements.a; }}", flag("inside", "i"));
-    source.add("mask", &each("elements", &body));
-    let plane = plane(x.shape());
-    for (part, inside) in parts(x).iter().zip(parts(inside)) {
-        let bind = [("out", &part.buffer), ("inside", &inside.buffer)];
-        let task = Task { label: "mask", source: &source, bind: &bind };
-        room.run(shared, task, uniform([f64::from(value), 0.0]), (part.planes.len() * plane) as u32)?;
-    }
-    Ok(())
+    let inside = [("inside", "array<u32>", parts(inside))];
+    apply(shared, room, ("mask", &body), [f64::from(value), 0.0], x, &inside)
 }
 
 pub(super) fn map(
@@ -95,21 +101,11 @@ pub(super) fn map(
     out: &mut Array,
     inputs: &[&Array],
 ) -> Result<()> {
-    let mut source = begun();
-    source.bind("out", Access::Write, "array<f32>");
     let names = &["first", "second"][..map.inputs];
-    names.iter().for_each(|name| source.bind(name, Access::Read, "array<f32>"));
     let number = |k: usize| names.get(k).map_or("0.0".to_owned(), |name| format!("{name}[i]"));
     let body = include_str!("../kernels/map.wgsl").replace("FIRST", &number(0)).replace("SECOND", &number(1));
-    source.add(map.name, &each("elements", &body.replace("VALUE", map.wgsl)));
-    let plane = plane(out.shape());
-    for (k, part) in parts(out).iter().enumerate() {
-        let others = names.iter().zip(inputs).filter_map(|(name, x)| Some((*name, &parts(x).get(k)?.buffer)));
-        let bind: Vec<_> = [("out", &part.buffer)].into_iter().chain(others).collect();
-        let task = Task { label: map.name, source: &source, bind: &bind };
-        room.run(shared, task, uniform(factors), (part.planes.len() * plane) as u32)?;
-    }
-    Ok(())
+    let inputs: Vec<_> = names.iter().zip(inputs).map(|(name, x)| (*name, "array<f32>", parts(x))).collect();
+    apply(shared, room, (map.name, &body.replace("VALUE", map.wgsl)), factors, out, &inputs)
 }
 
 pub(super) fn reduce(shared: &Shared, room: &mut Room, kind: Reduction, x: &Array, y: &Array) -> Result<f64> {

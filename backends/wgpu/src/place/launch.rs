@@ -98,11 +98,9 @@ impl Room {
         largest: bool,
     ) -> Result<[f64; 2]> {
         let groups = count.div_ceil(SUMMED).clamp(1, SUMS);
-        self.buffers.reserve(&shared.gpu, "sums", 8 * u64::from(groups), ARRAY)?;
-        let sums = self.buffers.get("sums").cloned();
-        let bind: Vec<_> = task.bind.iter().copied().chain(sums.as_ref().map(|sums| ("sums", sums))).collect();
+        let sums = self.buffers.of(&shared.gpu, "sums", 8 * u64::from(groups), ARRAY)?;
+        let bind: Vec<_> = task.bind.iter().copied().chain([("sums", &sums)]).collect();
         self.launch(shared, Task { bind: &bind, ..task }, name, &[(uniform(0, count), groups)], 0)?;
-        let Some(sums) = sums else { return Ok([0.0; 2]) };
         let mut total = [0.0f64; 2];
         self.read(&shared.gpu, &sums, 0, 2 * groups as usize, |found| {
             for pair in found.chunks_exact(2) {
@@ -128,17 +126,17 @@ impl Room {
         while self.batches.len() >= AHEAD {
             self.finish_one(gpu)?;
         }
-        self.buffers.reserve(gpu, uniform, size_of::<T>() as u64, U::UNIFORM | U::COPY_DST)?;
+        let values = self.buffers.of(gpu, uniform, size_of::<T>() as u64, U::UNIFORM | U::COPY_DST)?;
         let kernel = shared.kernels.get(gpu, label, source)?;
         let find = |name: &str| {
             let given = bind.iter().find(|(n, _)| *n == name).map(|(_, buffer)| *buffer);
             given.or_else(|| self.buffers.get(name))
         };
-        let bound = kernel.bind_as(gpu, find)?;
+        let bound = kernel.bind(gpu, find)?;
         let submitted = Instant::now();
         let mut last = None;
         for (value, groups) in parts {
-            self.buffers.get(uniform).inspect(|b| gpu.write(b, 0, bytemuck::bytes_of(value)));
+            gpu.write(&values, 0, bytemuck::bytes_of(value));
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let groups = (*groups).min(MOST_GROUPS as u32);
             kernel.launch(&mut encoder.begin_compute_pass(&Default::default()), &bound, groups);
@@ -165,8 +163,8 @@ impl Room {
 
     /// Overwrites the first numbers of the room's buffer `name`.
     pub(super) fn write<T: bytemuck::Pod>(&mut self, gpu: &Gpu, name: &str, data: &[T]) -> Result<()> {
-        self.buffers.reserve(gpu, name, size_of_val(data) as u64, ARRAY)?;
-        self.buffers.get(name).inspect(|b| gpu.write(b, 0, bytemuck::cast_slice(data)));
+        let buffer = self.buffers.of(gpu, name, size_of_val(data) as u64, ARRAY)?;
+        gpu.write(&buffer, 0, bytemuck::cast_slice(data));
         Ok(())
     }
 

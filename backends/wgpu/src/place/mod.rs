@@ -17,11 +17,10 @@ mod stencils;
 
 use crate::Shared;
 use conefield_core::error::Result;
-use conefield_core::geometry::Geometry;
 use conefield_core::parallel;
 use conefield_core::place::{
     Array, FilteredViews, Map, Mask, MeasuredViews, Place, ProximalStep, Reduction, SPARE, Streamed, VariationSlope,
-    Weighing, prox_on_host, zeros_with_spare,
+    ViewRays, Weighing, prox_on_host, zeros_with_spare,
 };
 use conefield_core::regularizer::{Kernels, Penalty};
 use conefield_core::voxel::VoxelProjector;
@@ -206,28 +205,12 @@ impl Place for DevicePlace {
         elements::reduce(&self.shared, &mut self.room(), kind, x, y)
     }
 
-    fn forward(
-        &self,
-        projector: &dyn VoxelProjector,
-        geometry: &Geometry,
-        views: &[usize],
-        volume: &Array,
-        images: &mut Array,
-    ) -> Result<()> {
-        let walks = rays::Walks::new(&self.shared, projector)?;
-        walks.forward(&mut self.room(), geometry, views, volume, images)
+    fn forward(&self, rays: ViewRays<'_>, volume: &Array, images: &mut Array) -> Result<()> {
+        rays::Walks::new(&self.shared, rays.projector)?.run(&mut self.room(), true, rays, volume, images)
     }
 
-    fn adjoint(
-        &self,
-        projector: &dyn VoxelProjector,
-        geometry: &Geometry,
-        views: &[usize],
-        images: &Array,
-        volume: &mut Array,
-    ) -> Result<()> {
-        let walks = rays::Walks::new(&self.shared, projector)?;
-        walks.adjoint(&mut self.room(), geometry, views, images, volume)
+    fn adjoint(&self, rays: ViewRays<'_>, images: &Array, volume: &mut Array) -> Result<()> {
+        rays::Walks::new(&self.shared, rays.projector)?.run(&mut self.room(), false, rays, volume, images)
     }
 
     fn compare(&self, by: &Weighing<'_>, views: &[usize], images: &mut Array) -> Result<[f64; 2]> {
@@ -266,10 +249,10 @@ impl Place for DevicePlace {
         filtered::backproject(&self.shared, &mut self.room(), work, (views, images), (slab, first))
     }
 
-    fn update(&self, step: ProximalStep<'_>, penalty: &mut dyn Penalty) -> Result<()> {
+    fn update(&self, step: ProximalStep<'_>, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
         match penalty.kernels() {
-            Some(kernels) => stencils::update(&self.shared, &mut self.room(), step, kernels),
-            None => self.update_around(step, penalty),
+            Some(kernels) => stencils::update(&self.shared, &mut self.room(), step, tau, kernels),
+            None => self.update_around(step, tau, penalty),
         }
     }
 
@@ -290,9 +273,6 @@ impl Place for DevicePlace {
     }
 
     fn adapt(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<Option<f64>> {
-        if !penalty.adapts() {
-            return Ok(None);
-        }
         match penalty.kernels() {
             Some(Kernels::Dual(dual)) => stencils::adapt(&self.shared, &mut self.room(), dual, x).map(Some),
             _ => Ok(penalty.adapt(self.read(x)?.view())),

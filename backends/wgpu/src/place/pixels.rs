@@ -49,22 +49,17 @@ impl Sources<'_> {
         let pixels = plane(images.shape());
         for part in parts(images) {
             let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
-            // Measured views that are not on the device come for each use.
-            let loaded = match &by.views.here {
-                Some(_) => None,
+            let mut loaded;
+            let (measured, wanted): (_, Vec<usize>) = match &by.views.here {
+                Some(here) => (parts(here), some.to_vec()),
+                // Measured views that are not on the device come for each use.
                 None => {
-                    let mut loaded = place.zeros([some.len(), images.shape()[1], images.shape()[2]])?;
+                    loaded = place.zeros([some.len(), images.shape()[1], images.shape()[2]])?;
                     for (i, &view) in some.iter().enumerate() {
-                        let view = by.views.measured.slice(s![view..view + 1, .., ..]);
-                        place.load(view, &mut loaded, i)?;
+                        place.load(by.views.measured.slice(s![view..view + 1, .., ..]), &mut loaded, i)?;
                     }
-                    Some(loaded)
+                    (parts(&loaded), (0..some.len()).collect())
                 }
-            };
-            let (measured, wanted): (_, Vec<usize>) = match (&by.views.here, &loaded) {
-                (Some(here), _) => (parts(here), some.to_vec()),
-                (None, Some(loaded)) => (parts(loaded), (0..some.len()).collect()),
-                (None, None) => (&[][..], vec![]),
             };
             let of_all = by.shadow.map(parts).or_else(|| by.weights.map(parts));
             for held in measured {

@@ -1,13 +1,14 @@
 //! Line integrals of voxel volumes and their adjoint.
 
+use super::elements::fill;
 use super::launch::{Room, Task, each};
 use super::{Array, parts, plane};
 use crate::Shared;
-use crate::device::Atomics;
 use crate::source::validate;
 use conefield_core::device::{Access, Source, fragment_of};
 use conefield_core::error::Result;
 use conefield_core::geometry::{Geometry, cross, dot, norm, sub};
+use conefield_core::place::ViewRays;
 use conefield_core::voxel::VoxelProjector;
 use conefield_core::wgsl::Fragment;
 
@@ -51,28 +52,6 @@ fn projected(geometry: &Geometry, view: usize) -> [[f32; 4]; 4] {
     [[x, y, z, near], voxels(corner), voxels(w.u), voxels(w.v)]
 }
 
-fn kernel(fragment: &Fragment, name: &str, atomics: Atomics, forward: bool) -> Source {
-    let mut source = Source::default();
-    source.add("projection", include_str!("../kernels/project.wgsl"));
-    source.bind("projection", Access::Uniform, "Projection");
-    source.bind("views", Access::Read, "array<ProjectedView>");
-    let (what, begin, end) = if forward {
-        source.bind("volume", Access::Read, "array<f32>");
-        source.bind("lines", Access::Write, "array<f32>");
-        ("value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[line] += value;")
-    } else {
-        source.bind("volume", Access::Write, &format!("array<atomic<{}>>", atomics.number()));
-        source.bind("lines", Access::Read, "array<f32>");
-        let begin = "value = lines[line];\n        if value == 0.0 { continue; }";
-        (format!("let v = weight * value;\n{}", atomics.sum("volume[i]")), begin, "")
-    };
-    source.add("visit", &include_str!("../kernels/visit.wgsl").replace("WHAT", &what));
-    source.add(name, &fragment.named("walk_"));
-    let body = format!("let line = line_of(i);\n        {begin}\n        walk_walk(projected(line));\n        {end}");
-    source.add("rays", &each("projection", &body));
-    source
-}
-
 /// A projector's kernels: they take line integrals of the buffer `volume` and add up `lines`, or the reverse.
 pub(super) struct Walks<'a> {
     shared: &'a Shared,
@@ -89,7 +68,27 @@ impl<'a> Walks<'a> {
     }
 
     fn kernel(&self, forward: bool) -> Source {
-        kernel(&self.fragment, &self.name, self.shared.gpu.adapter.atomics, forward)
+        let atomics = self.shared.gpu.adapter.atomics;
+        let mut source = Source::default();
+        source.add("projection", include_str!("../kernels/project.wgsl"));
+        source.bind("projection", Access::Uniform, "Projection");
+        source.bind("views", Access::Read, "array<ProjectedView>");
+        let (what, begin, end) = if forward {
+            source.bind("volume", Access::Read, "array<f32>");
+            source.bind("lines", Access::Write, "array<f32>");
+            ("value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[line] += value;")
+        } else {
+            source.bind("volume", Access::Write, &format!("array<atomic<{}>>", atomics.number()));
+            source.bind("lines", Access::Read, "array<f32>");
+            let begin = "value = lines[line];\n        if value == 0.0 { continue; }";
+            (format!("let v = weight * value;\n{}", atomics.sum("volume[i]")), begin, "")
+        };
+        source.add("visit", &include_str!("../kernels/visit.wgsl").replace("WHAT", &what));
+        source.add(&self.name, &self.fragment.named("walk_"));
+        let body =
+            format!("let line = line_of(i);\n        {begin}\n        walk_walk(projected(line));\n        {end}");
+        source.add("rays", &each("projection", &body));
+        source
     }
 
     /// Refuses invalid WGSL.
@@ -97,41 +96,19 @@ impl<'a> Walks<'a> {
         [true, false].into_iter().try_for_each(|forward| validate(&self.kernel(forward)))
     }
 
-    pub(super) fn forward(
-        &self,
-        room: &mut Room,
-        geometry: &Geometry,
-        views: &[usize],
-        volume: &Array,
-        images: &mut Array,
-    ) -> Result<()> {
-        // Line integrals are added up part by part of the volume.
-        let mut encoder = self.shared.gpu.device.create_command_encoder(&Default::default());
-        parts(images).iter().for_each(|part| encoder.clear_buffer(&part.buffer, 0, None));
-        self.shared.gpu.submit(encoder);
-        self.walk(room, true, geometry, views, volume, images)
-    }
-
-    pub(super) fn adjoint(
-        &self,
-        room: &mut Room,
-        geometry: &Geometry,
-        views: &[usize],
-        images: &Array,
-        volume: &mut Array,
-    ) -> Result<()> {
-        self.walk(room, false, geometry, views, volume, images)
-    }
-
-    fn walk(
+    /// Overwrites `images` if `forward`, else adds to `volume`.
+    pub(super) fn run(
         &self,
         room: &mut Room,
         forward: bool,
-        geometry: &Geometry,
-        views: &[usize],
+        ViewRays { geometry, views, .. }: ViewRays<'_>,
         volume: &Array,
         images: &Array,
     ) -> Result<()> {
+        if forward {
+            // Line integrals are added up part by part of the volume.
+            fill(self.shared, room, images, 0.0)?;
+        }
         let pixels = plane(images.shape());
         let label = if forward { "forward projection" } else { "adjoint of projection" };
         let source = &self.kernel(forward);

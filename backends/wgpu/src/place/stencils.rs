@@ -118,10 +118,10 @@ impl<'a> Volume<'a> {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         let sides = [("before", k.checked_sub(1)), ("after", Some(k + 1))];
         for (name, neighbour) in sides {
-            room.buffers.reserve(gpu, name, bytes, ARRAY)?;
-            let (Some(to), Some(from)) = (room.buffers.get(name), neighbour.and_then(|n| all.get(n))) else { continue };
+            let to = room.buffers.of(gpu, name, bytes, ARRAY)?;
+            let Some(from) = neighbour.and_then(|n| all.get(n)) else { continue };
             let at = if name == "before" { (from.planes.len() - 1) as u64 * bytes } else { 0 };
-            encoder.copy_buffer_to_buffer(&from.buffer, at, to, 0, bytes);
+            encoder.copy_buffer_to_buffer(&from.buffer, at, &to, 0, bytes);
         }
         gpu.submit(encoder);
         Ok(())
@@ -174,16 +174,8 @@ impl<'a> Volume<'a> {
     }
 }
 
-/// A volume with the factors of a step, whose result is within `bounds`.
-fn of_step<'a>(shared: &'a Shared, step: &ProximalStep<'_>, bounds: Bounds) -> Volume<'a> {
-    let mut volume = Volume::new(shared, step.x);
-    let pull = step.towards.map_or(0.0, |(_, share)| share);
-    volume.whole = Stencil { step: step.step, momentum: step.momentum, pull, ..volume.whole };
-    volume.within(bounds)
-}
-
 /// Overwrites the gradient with the argument of the proximal map.
-fn argument(shared: &Shared, room: &mut Room, step: &ProximalStep<'_>, bounds: Bounds) -> Result<()> {
+fn argument(volume: &Volume<'_>, room: &mut Room, step: &ProximalStep<'_>) -> Result<()> {
     let mut bindings = vec![("gradient", Write), ("ahead", Read)];
     let mut v = "let z = ahead[i];\n        var v = z + stencil.step * gradient[i];\n".to_owned();
     if step.towards.is_some() {
@@ -196,46 +188,35 @@ fn argument(shared: &Shared, room: &mut Room, step: &ProximalStep<'_>, bounds: B
         v += &format!("        if !{} {{ v = -3.4e38; }}\n", flag("inside", "i"));
     }
     let source = kernel(&bindings, &[], &(v + "        gradient[i] = v;"));
-    let volume = of_step(shared, step, bounds);
     for (k, part) in parts(step.gradient).iter().enumerate() {
         let mut bind = Volume::bind(k, &[("gradient", step.gradient), ("ahead", step.ahead)]);
         bind.extend(step.towards.map(|(towards, _)| ("towards", &parts(towards)[k].buffer)));
         bind.extend(step.inside.map(|inside| ("inside", &parts(inside)[k].buffer)));
         let task = Task { label: "argument of the prior", source: &source, bind: &bind };
-        room.run(shared, task, volume.uniform(part), volume.count(part))?;
+        room.run(volume.shared, task, volume.uniform(part), volume.count(part))?;
     }
     Ok(())
 }
 
-/// New coefficients, and the point of the next gradient, in WGSL from the result `u` of the proximal map.
-fn extrapolation(u: &str) -> String {
-    format!("let u = {u};\n        ahead[i] = u + stencil.momentum * (u - x[i]);\n        x[i] = u;")
-}
-
-/// Ends an update without a penalty: the proximal map only clips.
-fn finish(shared: &Shared, room: &mut Room, step: ProximalStep<'_>, bounds: Bounds) -> Result<()> {
-    let flat = [("gradient", Read), ("x", Write), ("ahead", Write)];
-    let source = kernel(&flat, &[], &extrapolation(CLIPPED));
-    let arrays: [(&str, &Array); 3] = [("gradient", step.gradient), ("x", step.x), ("ahead", step.ahead)];
-    of_step(shared, &step, bounds).run(room, ("extrapolation", &source), &arrays, None)
-}
-
 /// A whole update with a penalty that has kernels.
-pub(super) fn update(shared: &Shared, room: &mut Room, step: ProximalStep<'_>, kernels: Kernels<'_>) -> Result<()> {
-    let (Kernels::Clip(bounds) | Kernels::Dual(Dual { bounds, .. })) = kernels;
-    argument(shared, room, &step, bounds)?;
-    let Kernels::Dual(dual) = kernels else { return finish(shared, room, step, bounds) };
-    if step.tau < f32::MIN_POSITIVE {
-        return finish(shared, room, step, bounds);
-    }
-    let volume = of_step(shared, &step, bounds).of_dual(&dual, step.tau);
+pub(super) fn update(
+    shared: &Shared,
+    room: &mut Room,
+    step: ProximalStep<'_>,
+    tau: f32,
+    kernels: Kernels<'_>,
+) -> Result<()> {
+    let mut volume = Volume::new(shared, step.x);
+    let pull = step.towards.map_or(0.0, |(_, share)| share);
+    volume.whole = Stencil { step: step.step, momentum: step.momentum, pull, ..volume.whole };
+    argument(&volume, room, &step)?;
+    let [gradient, ahead, x] = [step.gradient, step.ahead, step.x].map(|x| &*x);
+    // New coefficients, and the point of the next gradient.
+    let end =
+        |u: &str| format!("let u = {u};\n        ahead[i] = u + stencil.momentum * (u - x[i]);\n        x[i] = u;");
+    let arrays = [("gradient", Read, gradient), ("x", Write, x), ("ahead", Write, ahead)];
     // The iterate of the dual steps has the memory of the next point, which is overwritten at the end.
-    dual_steps(&volume, room, &dual, [step.gradient, step.ahead])?;
-    let p = duals(&dual);
-    let flat = [("gradient", Read), ("x", Write), ("ahead", Write)];
-    let source = kernel(&[&OF_DUAL[..], &flat, &BEFORE].concat(), &[PRIMAL], &extrapolation("primal_of(i)"));
-    let arrays = [&p[..], &[("gradient", &*step.gradient), ("x", &*step.x), ("ahead", &*step.ahead)]].concat();
-    volume.run(room, ("extrapolation", &source), &arrays, Some(p[0].1))
+    finish(volume, room, (kernels, tau), [gradient, ahead], ("extrapolation", &end), &arrays)
 }
 
 /// [`conefield_core::place::Place::prox`] with kernels. `iterate` is for the dual steps.
@@ -246,22 +227,34 @@ pub(super) fn prox(
     tau: f32,
     kernels: Kernels<'_>,
 ) -> Result<()> {
-    let (Kernels::Clip(bounds) | Kernels::Dual(Dual { bounds, .. })) = kernels;
-    let volume = Volume::new(shared, v).within(bounds);
+    let end = |u: &str| format!("gradient[i] = {u};");
     let label = "proximal map of the prior";
+    finish(Volume::new(shared, v), room, (kernels, tau), [v, iterate], (label, &end), &[("gradient", Write, v)])
+}
+
+/// Makes the dual steps of the proximal map of `v`, for which `iterate` is overwritten, and runs a kernel on its result:
+/// `body` takes the result at voxel i in WGSL. Without a penalty the map only clips.
+fn finish(
+    volume: Volume<'_>,
+    room: &mut Room,
+    (kernels, tau): (Kernels<'_>, f32),
+    [v, iterate]: [&Array; 2],
+    (label, body): (&str, &dyn Fn(&str) -> String),
+    arrays: &[(&'static str, Access, &Array)],
+) -> Result<()> {
+    let (Kernels::Clip(bounds) | Kernels::Dual(Dual { bounds, .. })) = kernels;
+    let volume = volume.within(bounds);
+    let flat: Vec<_> = arrays.iter().map(|(name, access, _)| (*name, *access)).collect();
+    let arrays: Vec<_> = arrays.iter().map(|(name, _, x)| (*name, *x)).collect();
     let dual = match kernels {
         Kernels::Dual(dual) if tau >= f32::MIN_POSITIVE => dual,
-        _ => {
-            let source = kernel(&[("gradient", Write)], &[], &format!("gradient[i] = {CLIPPED};"));
-            return volume.run(room, (label, &source), &[("gradient", v)], None);
-        }
+        _ => return volume.run(room, (label, &kernel(&flat, &[], &body(CLIPPED))), &arrays, None),
     };
     let volume = volume.of_dual(&dual, tau);
     dual_steps(&volume, room, &dual, [v, iterate])?;
     let p = duals(&dual);
-    let bindings = [&OF_DUAL[..], &[("gradient", Write)], &BEFORE].concat();
-    let source = kernel(&bindings, &[PRIMAL], "gradient[i] = primal_of(i);");
-    volume.run(room, (label, &source), &[&p[..], &[("gradient", v)]].concat(), Some(p[0].1))
+    let source = kernel(&[&OF_DUAL[..], &flat, &BEFORE].concat(), &[PRIMAL], &body("primal_of(i)"));
+    volume.run(room, (label, &source), &[&p[..], &arrays].concat(), Some(p[0].1))
 }
 
 /// The dual variables by name.

@@ -15,6 +15,6 @@ pub fn adapter(asked: &Asked) -> Result<()> {
 
 /// Rates of the device, by micro-benchmarks.
 pub fn limits(asked: &Asked) -> Result<()> {
-    say(&json!({ "limits": Wgpu::open(Some(asked.adapter))?.shared().ceiling()? }));
+    say(&json!({ "limits": Wgpu::open(Some(asked.adapter))?.ceiling()? }));
     Ok(())
 }

@@ -7,7 +7,7 @@ use conefield_benches::{rays, spread};
 use conefield_core::backend::{Adam, Backend, Executable, TrainRay, Work};
 use conefield_core::method::{Context, Job, Method, Silent};
 use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::place::Array;
+use conefield_core::place::{Array, ViewRays};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
@@ -143,7 +143,7 @@ pub fn kernels(asked: &Asked) -> Result<()> {
     let (counts, side): (&[usize], usize) =
         if asked.software { (&[64], 32) } else { (&[256, 1024, 4096, 16_384, 65_536], 256) };
     let backend = open(asked, Limits::default())?;
-    let ceiling = backend.shared().ceiling()?;
+    let ceiling = backend.ceiling()?;
     // Multiply-adds: forward, forward once more on the way back, and two products backward. Table accesses: 8 corners of 10 levels,
     // read and then updated.
     let (macs, reads) = (4.0 * pipeline(SAMPLES)?.macs() as f64, 2.0 * 8.0 * 10.0);
@@ -201,6 +201,7 @@ pub fn voxels(asked: &Asked) -> Result<()> {
     let scan = simulate(&truth, &protocol.with_detector([side, side]))?;
     let g = &scan.geometry;
     let all: Vec<usize> = (0..views).collect();
+    let rays = ViewRays { projector: &Joseph {}, geometry: g, views: &all };
     let place = backend.place();
     let (x, mut lines) = (place.adopt(truth.data.clone())?, place.zeros(scan.projections.dim().into())?);
     let mut volume = place.zeros(g.volume.shape)?;
@@ -210,12 +211,12 @@ pub fn voxels(asked: &Asked) -> Result<()> {
     let report = |what: &str, time| say(&json!({ "work": what, "voxel_updates_per_s": rates(updates, time) }));
 
     let time = repeated(|| {
-        place.forward(&Joseph {}, g, &all, &x, &mut lines)?;
+        place.forward(rays, &x, &mut lines)?;
         Ok(done(&lines)?)
     })?;
     report("forward projection", time);
     let time = repeated(|| {
-        place.adjoint(&Joseph {}, g, &all, &lines, &mut volume)?;
+        place.adjoint(rays, &lines, &mut volume)?;
         Ok(done(&volume)?)
     })?;
     report("its adjoint", time);

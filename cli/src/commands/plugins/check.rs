@@ -224,7 +224,7 @@ struct Device(OnceLock<Result<Wgpu, String>>);
 impl Device {
     fn runner(&self) -> Result<&dyn Runner, String> {
         let opened = self.0.get_or_init(|| Wgpu::open(None).map_err(|e| e.to_string()));
-        opened.as_ref().map(|device| &**device.shared() as &dyn Runner).map_err(String::clone)
+        opened.as_ref().map(|device| device as &dyn Runner).map_err(String::clone)
     }
 }
 

@@ -1,6 +1,11 @@
 // Where each bin's list begins, and where they end; the counts are zero afterwards. One group; each lane takes a run of bins.
 var<workgroup> sums: array<u32, 256>;
 
+// The sum, or the largest number: lists of more entries have no room either.
+fn together(a: u32, b: u32) -> u32 {
+    return a + min(b, 0xffffffffu - a);
+}
+
 @compute @workgroup_size(256)
 fn main(@builtin(local_invocation_index) lane: u32) {
     let each = (bins.count + 255u) / 256u;
@@ -8,7 +13,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     let end = min(begin + each, bins.count);
     var own = 0u;
     for (var i = begin; i < end; i++) {
-        own += counts[i];
+        own = together(own, counts[i]);
     }
     sums[lane] = own;
     workgroupBarrier();
@@ -18,7 +23,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
             before = sums[lane - step];
         }
         workgroupBarrier();
-        sums[lane] += before;
+        sums[lane] = together(sums[lane], before);
         workgroupBarrier();
     }
     var at = sums[lane] - own;
