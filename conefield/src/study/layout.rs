@@ -10,11 +10,11 @@
 //! curves/CASE.png           PSNR over steps and time
 //! ```
 
+use crate::files;
+use conefield_core::Result;
 use conefield_core::error::ensure;
-use conefield_core::{Error, Result};
 use conefield_io::{Contents, Progressed};
 use std::fs;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// The copy of the study's file, which also identifies the folder of a study.
@@ -75,21 +75,10 @@ impl Layout<'_> {
 
     /// Refuses a folder with files that no study writes. Returns whether it contains a study.
     pub fn look(&self) -> Result<bool> {
-        let place = self.0.display().to_string();
-        let entries = match fs::read_dir(self.0) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(false),
-            entries => entries.map_err(|e| Error::io(self.0, e))?,
-        };
-        let mut any = false;
-        for entry in entries {
-            let entry = entry.map_err(|e| Error::io(self.0, e))?;
-            let found = format!("a folder with {} in it", entry.file_name().to_string_lossy());
-            ensure(known(&entry.path()), &place, "output", found, "a new or empty folder")?;
-            // Unfinished files do not count.
-            any |= !conefield_io::is_unfinished(&entry.file_name());
-        }
+        let entries = files::written_by(self.0, known)?;
+        let any = entries.iter().any(|e| !conefield_io::is_unfinished(e.file_name().unwrap_or_default()));
         // Only a folder with a study's file may be removed with its content.
-        let marked = !any || self.study().is_file();
+        let (marked, place) = (!any || self.study().is_file(), self.0.display().to_string());
         ensure(marked, &place, "output", format!("a folder without {STUDY}"), "a new or empty folder, or a study's")?;
         Ok(any)
     }
