@@ -58,7 +58,7 @@ pub struct Written {
 }
 
 /// A volume to simulate.
-#[derive(Deserialize, JsonSchema)]
+#[derive(Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WrittenVolume {
     /// A file, or phantom:head, phantom:abdomen or phantom:random:SEED, each optionally with :SIZE.
@@ -74,7 +74,7 @@ pub struct WrittenVolume {
 }
 
 /// An existing scan.
-#[derive(Deserialize, JsonSchema)]
+#[derive(Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WrittenScan {
     /// The file or folder.
@@ -88,7 +88,7 @@ pub struct WrittenScan {
 }
 
 /// A method.
-#[derive(Deserialize, JsonSchema)]
+#[derive(Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WrittenSpec {
     /// A shipped spec, a method type or a file.
@@ -190,40 +190,34 @@ impl Protocol {
 #[derive(Debug)]
 pub struct Entry<T>(pub T);
 
-/// Conversion from the short form.
-pub trait Named {
-    /// The table whose first key is `name`.
-    fn named(name: String) -> Self;
-}
-
-impl Named for WrittenVolume {
-    fn named(volume: String) -> Self {
-        Self { volume, name: None, values: None, downsample: None, window: None }
+impl From<String> for WrittenVolume {
+    fn from(volume: String) -> Self {
+        Self { volume, ..Self::default() }
     }
 }
 
-impl Named for WrittenScan {
-    fn named(scan: String) -> Self {
-        Self { scan, name: None, reference: None, window: None }
+impl From<String> for WrittenScan {
+    fn from(scan: String) -> Self {
+        Self { scan, ..Self::default() }
     }
 }
 
-impl Named for WrittenSpec {
-    fn named(spec: String) -> Self {
-        Self { spec, name: None, set: vec![], init: None }
+impl From<String> for WrittenSpec {
+    fn from(spec: String) -> Self {
+        Self { spec, ..Self::default() }
     }
 }
 
-impl<'de, T: Deserialize<'de> + Named> Deserialize<'de> for Entry<T> {
+impl<'de, T: Deserialize<'de> + From<String>> Deserialize<'de> for Entry<T> {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
         struct Either<T>(PhantomData<T>);
-        impl<'de, T: Deserialize<'de> + Named> Visitor<'de> for Either<T> {
+        impl<'de, T: Deserialize<'de> + From<String>> Visitor<'de> for Either<T> {
             type Value = Entry<T>;
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 f.write_str("a text or a table")
             }
             fn visit_str<E: Error>(self, text: &str) -> Result<Self::Value, E> {
-                Ok(Entry(T::named(text.into())))
+                Ok(Entry(T::from(text.into())))
             }
             fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<Self::Value, A::Error> {
                 T::deserialize(MapAccessDeserializer::new(map)).map(Entry)
