@@ -74,13 +74,7 @@ impl Wanted {
         watch: &Watch,
         begin: Instant,
     ) -> Result<Run<'a>> {
-        ensure(
-            self.peak.is_none_or(|p| p > 0.0 && p.is_finite()),
-            "arguments",
-            "peak",
-            self.peak.unwrap_or(0.0),
-            "a number above 0",
-        )?;
+        let peak = arguments::peak(self.peak)?;
         let held = arguments::held_out(self.hold_out.as_ref(), scan.geometry.views.len())?;
         if let Some(reference) = &reference {
             input::check_reference("reference", reference, &scan)?;
@@ -98,7 +92,7 @@ impl Wanted {
             seed: self.seed,
         };
         let session = Session::open(request, backend, memory, begin)?;
-        let mut run = session.plan(Input::new(scan, held, reference, self.peak)?, 0.0, &|| watch.cancelled())?;
+        let mut run = session.plan(Input::new(scan, held, reference, peak)?, 0.0, &|| watch.cancelled())?;
         let plan = run.method.plan.as_mut();
         let starts = match plan.links() {
             [first, ..] => first.starts_from_volume(),
@@ -267,14 +261,7 @@ pub fn evaluate<'py>(
             let [a, b] = [label_map(a.0, a.1.data.view())?, label_map(b.0, b.1.data.view())?];
             return Ok(json!({ "dice": dice(a.view(), b.view())? }));
         }
-        ensure(
-            peak.is_none_or(|p| p > 0.0 && p.is_finite()),
-            "arguments",
-            "peak",
-            peak.unwrap_or(0.0),
-            "a number above 0",
-        )?;
-        let peak = score::peak(peak, &reference);
+        let peak = score::peak(arguments::peak(peak)?, &reference);
         let mut all = json!(score::score("the volume", &volume, &reference, peak)?);
         all["peak"] = peak.into();
         Ok(all)
