@@ -315,7 +315,6 @@ mod tests {
         }
         for (from, to, says) in [
             ("psnr = 30.0", "psnr = nan", "psnr: found nan"),
-            ("steps = 4", "steps = 0", "points[0].runs"),
             ("made = \"test\"", "made = \"test\"\npass_s = 0", "pass_s"),
             ("psnr = 30.0", "psnr = 30.0\nbeside_s = -1.0", "points[0].runs"),
             ("kind", "kinds", "a:9:1: points.0.kinds: found a key that is not known here"),
