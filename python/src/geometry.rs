@@ -1,6 +1,6 @@
 //! Positions of source, detector and voxels.
 
-use crate::arrays::{given_any, owned};
+use crate::arrays::{given, owned};
 use crate::errors::{OrRaise, raised};
 use conefield_core::Error;
 use conefield_core::error::ensure;
@@ -27,7 +27,7 @@ impl Geometry {
     fn array<'py>(&self, py: Python<'py>, of: impl Fn(&View) -> Vec<f64>) -> Bound<'py, PyArray2<f64>> {
         let rows: Vec<Vec<f64>> = self.0.views.iter().map(of).collect();
         let width = rows.first().map_or(0, Vec::len);
-        given_any(py, Array2::from_shape_fn((rows.len(), width), |(i, k)| rows[i][k]))
+        given(py, Array2::from_shape_fn((rows.len(), width), |(i, k)| rows[i][k]))
     }
 }
 

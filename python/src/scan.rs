@@ -6,7 +6,7 @@ use crate::geometry::Geometry;
 use crate::volume::{made, taken};
 use crate::work::without_lock;
 use conefield::memory::Memory;
-use conefield::parse::{self, AnglesOption};
+use conefield::parse;
 use conefield::simulation::{self, Changes};
 use conefield::{files, input};
 use conefield_core::error::ensure;
@@ -185,7 +185,7 @@ pub fn simulate(
             views: wanted.views,
             detector: wanted.detector,
             offset: wanted.offset,
-            angles: angles as Option<AnglesOption>,
+            angles,
             noise,
             seed: wanted.seed,
         };
