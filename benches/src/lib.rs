@@ -16,8 +16,6 @@ use conefield_projectors::ray_march::{RayMarch, Sampling};
 use conefield_solvers::losses::L1;
 use rayon::prelude::*;
 use serde_json::Value;
-use std::error::Error;
-use std::path::Path;
 use std::time::Instant;
 
 /// Rays of a step of the published configuration, and samples of a ray.
@@ -180,14 +178,6 @@ pub fn rays(count: usize) -> Vec<TrainRay> {
             }
         })
         .collect()
-}
-
-/// Name and folder of the run that `NAME=RUN_FOLDER` says, and the lines of its `metrics.jsonl`.
-pub fn metrics(run: &str) -> std::result::Result<(&str, &Path, Vec<Value>), Box<dyn Error>> {
-    let (name, folder) = run.split_once('=').ok_or("a run is NAME=FOLDER")?;
-    let folder = Path::new(folder);
-    let text = std::fs::read_to_string(folder.join("metrics.jsonl"))?;
-    Ok((name, folder, text.lines().map(serde_json::from_str).collect::<std::result::Result<_, _>>()?))
 }
 
 /// Seconds of training and PSNR, of a record of the metrics that has one.
