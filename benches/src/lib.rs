@@ -15,7 +15,6 @@ use conefield_fields::normalizers::layer_norm::LayerNorm;
 use conefield_projectors::ray_march::{RayMarch, Sampling};
 use conefield_solvers::losses::L1;
 use rayon::prelude::*;
-use serde_json::Value;
 use std::time::Instant;
 
 /// Rays of a step of the published configuration, and samples of a ray.
@@ -178,9 +177,4 @@ pub fn rays(count: usize) -> Vec<TrainRay> {
             }
         })
         .collect()
-}
-
-/// Seconds of training and PSNR, of a record of the metrics that has one.
-pub fn quality(record: &Value) -> Option<(f64, f64)> {
-    record["seconds"].as_f64().zip(record["psnr"].as_f64())
 }

@@ -8,7 +8,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parallel;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Unit};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, written};
 use conefield_scans::diagnosis::quantiles::median;
 use ndarray::{Array3, ArrayViewMut3};
 use serde::{Deserialize, Serialize};
@@ -146,12 +146,10 @@ impl FromStr for KnownValue {
                 _ => Err("expected sphere:X,Y,Z,R with a radius above 0, in mm".into()),
             },
             Some(("box", list)) => match numbers(list).as_deref() {
-                Some(&[a, b, c, d, e, f]) => {
-                    let corners = [[a, d], [b, e], [c, f]];
-                    let [low, high] =
-                        [f64::min as fn(f64, f64) -> f64, f64::max].map(|pick| corners.map(|[p, q]| pick(p, q)));
-                    Ok(Self::Median(Region::Box { low, high }))
-                }
+                Some(&[a, b, c, d, e, f]) => Ok(Self::Median(Region::Box {
+                    low: [a.min(d), b.min(e), c.min(f)],
+                    high: [a.max(d), b.max(e), c.max(f)],
+                })),
                 _ => Err("expected box:X,Y,Z,X,Y,Z, two corners in mm".into()),
             },
             _ => Err(wrong()),
@@ -247,7 +245,8 @@ impl How {
                 Some([water, 0.0].map(KnownValue::Given))
             }
             Self::File(path) => {
-                let CalibrationFile { water, air, energy_kev } = read(path)?;
+                let text = conefield_core::files::read_text(path, LONGEST)?;
+                let CalibrationFile { water, air, energy_kev } = written::read(&path.display().to_string(), &text)?;
                 remark = energy_kev.map_or(String::new(), |e| format!(" at {e} keV"));
                 Some([water, air].map(KnownValue::Given))
             }
@@ -272,11 +271,6 @@ impl How {
         }
         Ok(Calibration { levels, unit: unit.cloned(), place: place.to_owned(), remark })
     }
-}
-
-fn read(path: &Path) -> Result<CalibrationFile> {
-    let text = conefield_core::files::read_text(path, LONGEST)?;
-    conefield_core::written::read(&path.display().to_string(), &text)
 }
 
 impl Calibration {

@@ -5,7 +5,7 @@ use crate::arrays::plain;
 use crate::field::{Field, collect};
 use crate::scan::Scan;
 use crate::specs::SpecArgument;
-use crate::volume::{made, taken, taken_if};
+use crate::volume::{made, taken};
 use crate::work::{Callback, Progress, Watch, without_lock};
 use conefield::explain::Explanation;
 use conefield::input::{self, Input};
@@ -172,7 +172,8 @@ pub fn reconstruct<'py>(
 ) -> PyResult<Reconstructed<'py>> {
     let begin = Instant::now();
     let wanted: Wanted = arguments::read(py, wanted)?;
-    let (start, reference, function) = (taken_if(start)?, taken_if(reference)?, callback(function));
+    let [start, reference] = [start, reference].map(|v| v.map(taken).transpose());
+    let (start, reference, function) = (start?, reference?, callback(function));
     let scan = scan.get();
     let (volume, record, field) = without_lock(py, |watch| {
         let backend =

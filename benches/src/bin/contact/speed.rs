@@ -242,7 +242,8 @@ pub fn training(asked: &Asked) -> Result<()> {
         return Err(String::from_utf8_lossy(&done.stderr).into());
     }
     let records: Vec<Value> = metrics?.lines().map(serde_json::from_str).collect::<std::result::Result<_, _>>()?;
-    let points: Vec<(f64, f64)> = records.iter().filter_map(conefield_benches::quality).collect();
+    let points: Vec<(f64, f64)> =
+        records.iter().filter_map(|r| r["seconds"].as_f64().zip(r["psnr"].as_f64())).collect();
     let reached = |mark: f64| points.iter().find(|(_, psnr)| *psnr >= mark).map(|(seconds, _)| *seconds);
     let marks: Value =
         [25, 30, 32, 34, 35, 36, 37].map(|mark| (mark.to_string(), json!(reached(mark.into())))).into_iter().collect();
