@@ -121,20 +121,7 @@ mod tests {
     #[test]
     fn an_equal_result_has_no_number_for_its_psnr() {
         let scores = serde_json::json!({ "psnr": null, "ssim_2d": 1.0, "ssim_3d": null, "ssim_skimage": 1.0 });
-        let figures = Figures {
-            steps: 1,
-            train_s: 1.0,
-            export_s: 0.5,
-            total_s: 2.0,
-            peak_bytes: None,
-            threads: 2,
-            parameters: 0,
-            samples: 0,
-            samples_per_s: None,
-            loss: None,
-            held_out: None,
-            scores: Some(scores),
-        };
+        let figures = Figures { steps: 1, train_s: 1.0, total_s: 2.0, scores: Some(scores), ..Figures::default() };
         let outcome = Outcome { status: Status::Done, error: None, figures: Some(figures) };
         let shown = Columns::of(true, true).cells(&outcome);
         assert_eq!(shown, ["inf", "1.0000", "-", "1.0000", "-", "1", "1.00", "2.00", "-"]);

@@ -369,20 +369,7 @@ mod tests {
 
     fn reached(psnr: f64, total_s: f64) -> Outcome {
         let scores = json!({ "psnr": psnr, "ssim_2d": psnr / 100.0, "ssim_3d": null, "ssim_skimage": null });
-        let figures = Figures {
-            steps: 3,
-            train_s: 1.0,
-            export_s: 0.5,
-            total_s,
-            peak_bytes: Some(1 << 20),
-            threads: 2,
-            parameters: 0,
-            samples: 0,
-            samples_per_s: None,
-            loss: None,
-            held_out: None,
-            scores: Some(scores),
-        };
+        let figures = Figures { total_s, scores: Some(scores), ..Figures::default() };
         Outcome { status: Status::Done, error: None, figures: Some(figures) }
     }
 

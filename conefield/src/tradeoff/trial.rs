@@ -34,7 +34,7 @@ impl TrialInput {
 }
 
 /// The figures in a run's `record.json`, by the same names.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Figures {
     /// Steps or passes.
     pub steps: u64,
