@@ -8,7 +8,7 @@ use crate::input::Input;
 use crate::machine::{Machine, simd_level};
 use crate::memory;
 use crate::method::{self, Planned, Read};
-use crate::record::{Ends, RunRecord, Written};
+use crate::record::{RunRecord, Written};
 use crate::tradeoff::front::Front;
 use crate::tradeoff::schedule::{Budget, Schedule};
 use crate::{plugins, ranks, score, specs};
@@ -238,7 +238,7 @@ impl Run<'_> {
             seed: self.seed,
             scan: None,
             held_out_views: self.input.held.clone(),
-            limits: Ends::from(&self.limits),
+            limits: self.limits,
             budget_s: self.budget,
             plan: self.schedule.clone(),
             init: None,
