@@ -355,7 +355,7 @@ impl Work<'_> {
     }
 
     /// The outcomes of all runs, after all have ended; draws the pictures.
-    fn report(&self) -> Result<StudyReport> {
+    fn report(&self) -> Result<StudyReport<'_>> {
         let outcome = |c: &Cell| match self.failure(c) {
             Some(error) => Ok((*c, Outcome::failed(error))),
             None => Outcome::of_run(&self.run(c)).map(|o| (*c, o)),

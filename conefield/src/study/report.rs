@@ -3,6 +3,7 @@
 use crate::machine::Machine;
 use crate::study::definition::{Cell, Protocol, Source, Study};
 use crate::study::layout::{Layout, group};
+use crate::study::method::Method;
 use crate::study::outcome::{COLUMNS, Column, Columns, Outcome};
 use crate::study::spread::Spread;
 use crate::tradeoff::json::{read_json, to_json};
@@ -16,31 +17,23 @@ use std::path::{Path, PathBuf};
 
 /// The content of `table.json`.
 #[derive(Serialize)]
-pub struct StudyReport {
+pub struct StudyReport<'a> {
     version: &'static str,
     /// The commit of the build, if the builder set it.
     commit: Option<&'static str>,
-    name: String,
-    description: String,
+    name: &'a str,
+    description: &'a str,
     /// The complete study file.
-    study: String,
-    seeds: Vec<u64>,
-    protocol: Protocol,
-    baseline: Option<String>,
-    methods: Vec<MethodRecord>,
+    study: &'a str,
+    seeds: &'a [u64],
+    protocol: &'a Protocol,
+    baseline: Option<&'a str>,
+    methods: &'a [Method],
     cases: Vec<CaseRecord>,
     /// All runs.
     runs: Vec<RunLine>,
     /// Statistics over the seeds for each case and method.
     summary: Vec<Line>,
-}
-
-#[derive(Serialize)]
-struct MethodRecord {
-    name: String,
-    spec: String,
-    set: Vec<String>,
-    init: Option<String>,
 }
 
 /// The data of a comparison.
@@ -137,10 +130,10 @@ fn machine(run: &Path) -> Result<Option<Machine>> {
     read_json::<Known>(&run.join("record.json")).map(|k| k.machine)
 }
 
-impl StudyReport {
+impl<'a> StudyReport<'a> {
     /// The report on the runs in `layout`, which have all ended; `outcomes` are their outcomes.
     pub fn new(
-        study: &Study,
+        study: &'a Study,
         layout: &Layout<'_>,
         cases: Vec<CaseRecord>,
         outcomes: Vec<(Cell, Outcome)>,
@@ -153,22 +146,16 @@ impl StudyReport {
             let machine = if outcome.figures.is_some() { machine(&run)? } else { None };
             runs.push(RunLine { case, seed: cell.seed, method, run, machine, outcome });
         }
-        let methods = study.methods.iter().map(|m| MethodRecord {
-            name: m.name.clone(),
-            spec: m.spec.clone(),
-            set: m.sets.clone(),
-            init: m.init.clone(),
-        });
         Ok(Self {
             version: env!("CARGO_PKG_VERSION"),
             commit: option_env!("CONEFIELD_COMMIT"),
-            name: study.name.clone(),
-            description: study.description.clone(),
-            study: study.text.clone(),
-            seeds: study.seeds.clone(),
-            protocol: study.protocol.clone(),
-            baseline: study.baseline.map(|b| study.methods[b].name.clone()),
-            methods: methods.collect(),
+            name: &study.name,
+            description: &study.description,
+            study: &study.text,
+            seeds: &study.seeds,
+            protocol: &study.protocol,
+            baseline: study.baseline.map(|b| &study.methods[b].name[..]),
+            methods: &study.methods,
             cases,
             runs,
             summary,
@@ -254,7 +241,7 @@ impl StudyReport {
                 key => any(key),
             })
             .collect();
-        let against = self.baseline.as_deref();
+        let against = self.baseline;
         let compared = columns.iter().filter(|c| match c.key {
             "psnr" | "ssim_2d" | "total_s" => true,
             key => key == "held_out" && !scores,
