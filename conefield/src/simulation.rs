@@ -50,7 +50,7 @@ pub fn prepared(volume: Volume, values: Values, size: usize) -> Result<Volume> {
 pub fn protocol(name: &str, grid: &VoxelGrid) -> Result<Protocol> {
     match name {
         "r2" => Ok(Protocol::r2(grid)),
-        path => read_protocol(Path::new(path)),
+        path => written::read(path, &read_text(Path::new(path), LONGEST)?),
     }
 }
 
@@ -138,11 +138,6 @@ pub fn check_memory(volume: &Volume, g: &Geometry) -> Result<()> {
         let detector = detector.map(|k| format!("a detector of {}x{}", g.detector[0] >> k, g.detector[1] >> k));
         views.into_iter().chain(detector).collect()
     })
-}
-
-fn read_protocol(path: &Path) -> Result<Protocol> {
-    let text = read_text(path, LONGEST)?;
-    written::read(&path.display().to_string(), &text)
 }
 
 fn read_angles(path: &Path) -> Result<Vec<f64>> {
