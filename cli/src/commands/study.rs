@@ -372,7 +372,7 @@ impl Work<'_> {
             cases.push(CaseRecord::new(&c.name, &c.source, &input));
             self.draw(case, &input, &outcomes)?;
         }
-        StudyReport::new(self.study, &self.layout, cases, outcomes)
+        Ok(StudyReport::new(self.study, &self.layout, cases, outcomes))
     }
 
     /// Draws the results on a case: slices with the first seed, curves of all.

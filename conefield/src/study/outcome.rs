@@ -1,6 +1,7 @@
 //! The outcome of a run, and its table columns.
 
 use crate::score::SCORES;
+use crate::tradeoff::json::read_json;
 use crate::tradeoff::trial::Figures;
 use conefield_core::Result;
 use conefield_evaluation::report::text::{bytes, number};
@@ -34,7 +35,8 @@ pub struct Outcome {
 impl Outcome {
     /// The outcome of the finished run in `folder`.
     pub fn of_run(folder: &Path) -> Result<Self> {
-        Ok(Self { status: Status::Done, error: None, figures: Some(Figures::of_run(folder)?) })
+        let figures = read_json(&folder.join("record.json"))?;
+        Ok(Self { status: Status::Done, error: None, figures: Some(figures) })
     }
 
     /// The outcome of a failed run.

@@ -6,12 +6,12 @@ use crate::study::layout::{Layout, group};
 use crate::study::method::Method;
 use crate::study::outcome::{COLUMNS, Column, Columns, Outcome};
 use crate::study::spread::Spread;
-use crate::tradeoff::json::{read_json, to_json};
+use crate::tradeoff::json::to_json;
 use crate::tradeoff::statistics::mean;
 use crate::tradeoff::trial::TrialInput;
 use conefield_core::Result;
 use conefield_evaluation::report::Table;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -120,33 +120,17 @@ struct Line {
 /// Name of the mean over all cases.
 const ALL: &str = "all";
 
-/// The machine of a run, from its record.
-fn machine(run: &Path) -> Result<Option<Machine>> {
-    #[derive(Deserialize)]
-    struct Known {
-        #[serde(default)]
-        machine: Option<Machine>,
-    }
-    read_json::<Known>(&run.join("record.json")).map(|k| k.machine)
-}
-
 impl<'a> StudyReport<'a> {
     /// The report on the runs in `layout`, which have all ended; `outcomes` are their outcomes.
-    pub fn new(
-        study: &'a Study,
-        layout: &Layout<'_>,
-        cases: Vec<CaseRecord>,
-        outcomes: Vec<(Cell, Outcome)>,
-    ) -> Result<Self> {
+    pub fn new(study: &'a Study, layout: &Layout<'_>, cases: Vec<CaseRecord>, outcomes: Vec<(Cell, Outcome)>) -> Self {
         let summary = Summary { study, outcomes: &outcomes }.lines();
-        let mut runs = vec![];
-        for (cell, outcome) in outcomes {
+        let line = |(cell, outcome): (Cell, Outcome)| {
             let (case, method) = (study.cases[cell.case].name.clone(), study.methods[cell.method].name.clone());
             let run = layout.run(&case, cell.seed, &method);
-            let machine = if outcome.figures.is_some() { machine(&run)? } else { None };
-            runs.push(RunLine { case, seed: cell.seed, method, run, machine, outcome });
-        }
-        Ok(Self {
+            let machine = outcome.figures.as_ref().and_then(|f| f.machine.clone());
+            RunLine { case, seed: cell.seed, method, run, machine, outcome }
+        };
+        Self {
             version: env!("CARGO_PKG_VERSION"),
             commit: option_env!("CONEFIELD_COMMIT"),
             name: &study.name,
@@ -157,9 +141,9 @@ impl<'a> StudyReport<'a> {
             baseline: study.baseline.map(|b| &study.methods[b].name[..]),
             methods: &study.methods,
             cases,
-            runs,
+            runs: outcomes.into_iter().map(line).collect(),
             summary,
-        })
+        }
     }
 
     /// Writes both tables.
