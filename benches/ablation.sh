@@ -10,15 +10,10 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 steps=${3:-900}
 seeds=${4:-0 1 2}
 volumes=${5:-chest_128 head_256 engine_256}
 backend=${6:-auto}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 read -ra variants <<<"${7:-NAF field +LN +LN+MCI +LN+MCI+mask}"
 whole='callbacks=["rollback"]'
 published=(--set optimizer.lr=1e-3 --set projector.samples=192)

@@ -9,13 +9,8 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 steps=${3:-1000}
 volume=${4:-chest_128}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 scan=$out/$volume
 published_scan "$data" "$volume" "$scan"
 none='normalizers=[]'

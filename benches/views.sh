@@ -7,16 +7,12 @@
 # and views.md; an interrupted run goes on where it was.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-data=$1
-out=$2
+source benches/common.sh
 seconds=${3:-300}
 views=${4:-10 25 50 75 100}
 volume=${5:-abdomen_128}
 downsample=${6:-1}
 detector=${7:-512x512}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 comparisons=()
 for n in $views; do
     scan=$out/scan-$n
