@@ -17,8 +17,9 @@ use conefield_solvers::losses::L1;
 use rayon::prelude::*;
 use std::time::Instant;
 
-/// Rays of a step of the published configuration, and samples of a ray.
+/// Rays of a step of the published configuration.
 pub const RAYS: usize = 1024;
+/// Samples of a ray in it.
 pub const SAMPLES: usize = 320;
 
 /// The published configuration with `samples` a ray: a hash grid of 10 levels of 2 features with tables of 2^19 entries,
@@ -37,11 +38,14 @@ pub fn published_with(encoder: Box<dyn Encoder>, samples: usize) -> Result<Pipel
 
 /// A model in training.
 pub struct Training {
+    /// The model.
     pub model: Model,
+    /// Its kernels on a backend.
     pub exe: Box<dyn Executable>,
 }
 
 impl Training {
+    /// Random parameters on `backend`.
     pub fn new(backend: &dyn Backend, pipeline: Pipeline) -> Result<Self> {
         let (exe, _) = backend.compile(&pipeline)?;
         Ok(Self { model: Model::random(pipeline, 1), exe })

@@ -288,7 +288,7 @@ impl Summary<'_> {
         let here = |c: &Cell| c.method == method && case.is_none_or(|case| case == c.case);
         let runs: Vec<&Outcome> = self.outcomes.iter().filter(|(c, _)| here(c)).map(|(_, o)| o).collect();
         let done = runs.iter().filter(|o| o.figures.is_some()).count();
-        let values = |method, column| self.values(case, method, column);
+        let values = |method: usize, column: &Column| self.values(case, method, column);
         let spread = |of: &dyn Fn(&Column) -> Vec<f64>| {
             COLUMNS.iter().filter_map(|column| Some((column.key, Spread::of(&of(column))?))).collect()
         };
