@@ -23,12 +23,6 @@ impl Geometry {
         geometry.validate("geometry").or_raise(py)?;
         Ok(Self(geometry))
     }
-
-    fn array<'py>(&self, py: Python<'py>, of: impl Fn(&View) -> Vec<f64>) -> Bound<'py, PyArray2<f64>> {
-        let rows: Vec<Vec<f64>> = self.0.views.iter().map(of).collect();
-        let width = rows.first().map_or(0, Vec::len);
-        given(py, Array2::from_shape_fn((rows.len(), width), |(i, k)| rows[i][k]))
-    }
 }
 
 #[pymethods]
@@ -107,7 +101,8 @@ impl Geometry {
 
     #[getter]
     fn vectors<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
-        self.array(py, |v| [v.source, v.detector, v.u, v.v].concat())
+        let at = |v: &View, k: usize| [v.source, v.detector, v.u, v.v][k / 3][k % 3];
+        given(py, Array2::from_shape_fn((self.0.views.len(), VECTOR), |(i, k)| at(&self.0.views[i], k)))
     }
 
     #[getter]

@@ -102,11 +102,6 @@ impl Wanted {
         ensure(start.is_none() || starts, "arguments", "init", name, "a method that starts from a volume")?;
         Ok(run)
     }
-
-    /// The reference of a run on `scan`.
-    fn reference(&self, scan: &Scan, given: Option<Volume>) -> Result<Option<Volume>> {
-        if self.truth { scan.reference().map(Some) } else { Ok(given) }
-    }
 }
 
 /// Describes what a spec builds, as text and as data; with a budget also what would run, and for how long.
@@ -178,7 +173,7 @@ pub fn reconstruct<'py>(
     let (volume, record, field) = without_lock(py, |watch| {
         let backend =
             arguments::backend(&wanted.backend)?.open_for_run(arguments::seconds("budget", wanted.budget.as_ref())?)?;
-        let reference = wanted.reference(scan, reference)?;
+        let reference = if wanted.truth { Some(scan.reference()?) } else { reference };
         let given = reference.as_ref().map(|_| wanted.truth);
         let mut run = wanted.planned(scan.scan.clone(), reference, start.as_ref(), backend.as_ref(), watch, begin)?;
         let mut progress = Progress::new(watch, function);
