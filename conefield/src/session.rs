@@ -9,6 +9,7 @@ use crate::machine::{Machine, simd_level};
 use crate::memory;
 use crate::method::{self, Planned, Read};
 use crate::record::{RunRecord, Written};
+use crate::tradeoff::calibrate::Bench;
 use crate::tradeoff::front::Front;
 use crate::tradeoff::schedule::{Budget, Schedule};
 use crate::{plugins, ranks, score, specs};
@@ -102,7 +103,7 @@ impl<'a> Session<'a> {
         if let Wish::Method(m) = &wish {
             specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held)?;
         }
-        let bench = input.bench(backend, request.seed, cancelled);
+        let bench = Bench { job: input.job(backend, request.seed, request.limits, None), cancelled };
         let budget = |seconds| Budget { begin, seconds, spent };
         let (method, schedule) = match wish {
             Wish::Method(mut method) => {

@@ -95,7 +95,7 @@ impl Budget {
         build: impl Fn(&str, &[String]) -> Result<Planned>,
     ) -> Result<(Planned, Schedule)> {
         let start = Instant::now();
-        let g = &bench.scan.geometry;
+        let g = &bench.job.scan.geometry;
         let size = Size::new(g.views.len(), g.detector, g.volume.shape);
         let front = &front.near(size);
         let mut points: Vec<_> = front.points.iter().collect();
@@ -107,7 +107,7 @@ impl Budget {
         let slower = match front.pass_s {
             // If it fails, the methods themselves are timed.
             Some(then) if iterates && (front.close(size) || front.larger(size)) => {
-                pass_s(bench.backend, bench.cancelled).ok().map(|s| s / then)
+                pass_s(bench.job.backend, bench.cancelled).ok().map(|s| s / then)
             }
             _ => None,
         };
