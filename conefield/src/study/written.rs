@@ -279,36 +279,24 @@ fn said<'de, D: Deserializer<'de>, T>(
     })
 }
 
-fn seconds<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
-    said(from, parse::seconds)
+/// Functions that deserialize a setting which is written as on the command line.
+macro_rules! settings {
+    ($($name:ident: $type:ty = $parse:path;)*) => {$(
+        fn $name<'de, D: Deserializer<'de>>(from: D) -> Result<Option<$type>, D::Error> {
+            said(from, $parse)
+        }
+    )*};
 }
 
-fn above_zero<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
-    said(from, parse::above_zero)
-}
-
-fn hold_out<'de, D: Deserializer<'de>>(from: D) -> Result<Option<HoldOut>, D::Error> {
-    said(from, parse::hold_out)
-}
-
-fn backend<'de, D: Deserializer<'de>>(from: D) -> Result<Option<BackendChoice>, D::Error> {
-    said(from, BackendChoice::from_str)
-}
-
-fn detector<'de, D: Deserializer<'de>>(from: D) -> Result<Option<[usize; 2]>, D::Error> {
-    said(from, parse::detector)
-}
-
-fn offset<'de, D: Deserializer<'de>>(from: D) -> Result<Option<[f64; 2]>, D::Error> {
-    said(from, parse::offset)
-}
-
-fn angles<'de, D: Deserializer<'de>>(from: D) -> Result<Option<AnglesOption>, D::Error> {
-    said(from, parse::angles)
-}
-
-fn noise<'de, D: Deserializer<'de>>(from: D) -> Result<Option<DetectorNoise>, D::Error> {
-    said(from, parse::noise)
+settings! {
+    seconds: f64 = parse::seconds;
+    above_zero: f64 = parse::above_zero;
+    hold_out: HoldOut = parse::hold_out;
+    backend: BackendChoice = BackendChoice::from_str;
+    detector: [usize; 2] = parse::detector;
+    offset: [f64; 2] = parse::offset;
+    angles: AnglesOption = parse::angles;
+    noise: DetectorNoise = parse::noise;
 }
 
 fn shown<S: Serializer>(held: &Option<HoldOut>, to: S) -> Result<S::Ok, S::Error> {
