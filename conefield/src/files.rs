@@ -50,19 +50,18 @@ fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
 
 /// The content of an output folder, nothing if there is none. Refuses a folder with anything that is not `known` to be what a
 /// command writes.
-pub fn written_by(folder: &Path, known: fn(&Path) -> bool) -> Result<Vec<PathBuf>> {
+pub fn written_by(folder: &Path, known: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {
     let entries = match std::fs::read_dir(folder) {
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
-        entries => entries.map_err(|e| Error::io(folder, e))?,
+        entries => entries.and_then(|all| all.map(|e| Ok(e?.path())).collect::<std::io::Result<Vec<_>>>()),
     };
-    let mut all = vec![];
-    for entry in entries {
-        let path = entry.map_err(|e| Error::io(folder, e))?.path();
-        let found = format!("a folder with {} in it", path.file_name().unwrap_or_default().to_string_lossy());
-        ensure(known(&path), &folder.display().to_string(), "output", found, "a new or empty folder")?;
-        all.push(path);
+    let mut entries = entries.map_err(|e| Error::io(folder, e))?;
+    entries.sort();
+    if let Some(other) = entries.iter().find(|path| !known(path)) {
+        let found = format!("a folder with {} in it", other.file_name().unwrap_or_default().to_string_lossy());
+        return Err(Error::invalid(folder.display().to_string(), "output", found, "a new or empty folder"));
     }
-    Ok(all)
+    Ok(entries)
 }
 
 /// Reads a scan and logs warnings about problems for a reconstruction.
