@@ -31,7 +31,7 @@ pub struct Scan {
 #[derive(Clone)]
 enum Truth {
     Unknown,
-    Known(Volume),
+    Known(Arc<Volume>),
     /// That of the scan at this path, if it has one.
     Of(PathBuf),
 }
@@ -45,7 +45,7 @@ impl Scan {
     /// The volume it was simulated from, if known; read from the scan's files if necessary.
     pub fn truth(&self) -> conefield_core::Result<Option<Volume>> {
         match &self.truth {
-            Truth::Known(truth) => Ok(Some(truth.clone())),
+            Truth::Known(truth) => Ok(Some(Volume::clone(truth))),
             Truth::Of(path) => conefield_io::read_truth(path),
             Truth::Unknown => Ok(None),
         }
@@ -202,6 +202,6 @@ pub fn simulate(
         let (scan, truth) = simulation::scan(volume, values, &protocol, &wanted.source)?;
         Ok((scan, Some(truth)))
     })?;
-    let truth = truth.map_or(Truth::Unknown, Truth::Known);
+    let truth = truth.map_or(Truth::Unknown, |truth| Truth::Known(Arc::new(truth)));
     Ok(Scan { scan: Arc::new(scan), path: None, truth })
 }
