@@ -5,21 +5,15 @@
 # and with LayerNorm (LN), MCI weights and the FFT mask. MCI weights come from 600 steps on abdomen_128, for the abdomen from chest_128;
 # +LN+MCI@VOLUME,VOLUME:STEPS[:RATE] takes others. Each has STEPS (900) of 1024 rays with 192 samples inside the volume. Each of SEEDS
 # ("0 1 2") is another noise and another start. OUT_FOLDER/ablation.md has PSNR by steps, mean and half the range over SEEDS; VOLUME.png
-# has the curves. Steps are counted, not timed: other work on the machine changes nothing. BACKEND "wgpu" trains on a GPU.
+# has the curves, drawn by PYTHON with matplotlib. Steps are counted, not timed: other work on the machine changes nothing. BACKEND "wgpu" trains on a GPU.
 # What is there is not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 steps=${3:-900}
 seeds=${4:-0 1 2}
 volumes=${5:-chest_128 head_256 engine_256}
 backend=${6:-auto}
-cargo build --release --quiet --bin conefield
-cargo build --release --quiet -p conefield-benches --bin curves
-bin=${CARGO_TARGET_DIR:-target}/release
-mkdir -p "$out"
 read -ra variants <<<"${7:-NAF field +LN +LN+MCI +LN+MCI+mask}"
 whole='callbacks=["rollback"]'
 published=(--set optimizer.lr=1e-3 --set projector.samples=192)
@@ -29,7 +23,7 @@ weights() {
     IFS=: read -r from steps rate <<<"$1"
     IFS=, read -ra from <<<"$from"
     from=("${from[@]/#/$data/volumes/}")
-    [[ -f $file ]] || "$bin/conefield" -q pretrain "${from[@]/%/.nii.gz}" --spec ni-naf --set "$whole" "${published[@]}" \
+    [[ -f $file ]] || "$bin" -q pretrain "${from[@]/%/.nii.gz}" --spec ni-naf --set "$whole" "${published[@]}" \
         --set "optimizer.lr=${rate:-1e-3}" --steps "$steps" -o "$file" >/dev/null
     echo "$file"
 }
@@ -55,12 +49,12 @@ for volume in $volumes; do
             run=$out/$volume-$seed-$variant
             curves+=("$variant=$run")
             [[ -f $run/record.json ]] && continue
-            "$bin/conefield" -q reconstruct "$scan" "${set[@]}" "${published[@]}" -o "$run" --force --seed "$seed" --steps "$steps" \
+            "$bin" -q reconstruct "$scan" "${set[@]}" "${published[@]}" -o "$run" --force --seed "$seed" --steps "$steps" \
                 --backend "$backend" --reference truth --set training.report_every=50 >/dev/null
             rm -f "$run/volume.nii.gz"
         done
     done
-    "$bin/curves" --steps "$out/$volume.png" "$volume, 50 noisy views, one line a seed" "${curves[@]}"
+    "${PYTHON:-python3}" benches/curves.py --steps "$out/$volume.png" "$volume, 50 noisy views, one line a seed" "${curves[@]}"
 done
 python3 - "$out" "$steps" "$seeds" "$volumes" "${variants[@]}" <<'PY' | tee "$out/ablation.md"
 import json, statistics, sys

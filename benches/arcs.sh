@@ -6,13 +6,9 @@
 # dB: the mean over the seeds and their standard deviation.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-data=$1
-out=$2
+source benches/common.sh
 specs=${3:-os-sart fista-tv smooth-tv limited-angle}
 seeds=${4:-0 1 2}
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet --bin conefield
-mkdir -p "$out"
 starts=(0 60 90)
 arcs="60 90 120 180"
 echo "| volume | spec |$(printf ' %s° |' $arcs)"

@@ -8,16 +8,11 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 budgets=${3:-5s 10s 20s 60s 180s}
 methods=${4:-best fista-tv}
 seeds=${5:-0 1 2}
 volumes=${6:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
 views=${7:-50}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 for volume in $volumes; do
     for seed in $seeds; do
         scan=$out/$volume-$views-$seed

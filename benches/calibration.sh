@@ -6,15 +6,11 @@
 # those of misplace.py. A row each: the result, then held-out error and PSNR of 30 passes of sirt, before and after correction.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-data=$1
-out=$2
+source benches/common.sh
 scans=${3:-head engine counts}
 seeds=${4:-0}
 errors=${5:-offset-u=0 offset-u=0.1 offset-u=0.5 offset-u=2 offset-u=20 rotation=1 tilt=1 tilt=2 slant=2 distance=2 distance=-2 step=0.1 step=-0.1 step=1 offset-v=2 jitter=0 jitter=0.5 jitter=2}
 python=${PYTHON:-python3}
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet --bin conefield
-mkdir -p "$out"
 
 psnr() { # of the scan $1
     "$bin" -q reconstruct "$1" --spec sirt --set stop.passes=30 --reference "$truth" -o "$1-run" --force >/dev/null

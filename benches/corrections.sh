@@ -7,15 +7,11 @@
 # smallest gain and the largest loss of any.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-data=$1
-out=$2
+source benches/common.sh
 volumes=${3:-head engine}
 seeds=${4:-0 1 2}
 passes=${5:-10}
 python=${PYTHON:-python3}
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet --bin conefield
-mkdir -p "$out"
 
 # The options of each correction for scans with its fault and, after a bar, without it (if an option is the size of the fault).
 rows=(

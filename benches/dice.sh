@@ -6,11 +6,10 @@
 # then segments the 30 planes of each result, and says how. It needs Python with numpy and scipy.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$(realpath "$1")
 mkdir -p "$2/data/volumes"
 out=$(realpath "$2")
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-cargo build --release --quiet --bin conefield
 ct=$out/data/volumes/abdomen_ct.nii.gz
 [[ -f $ct ]] || "$bin" -q convert "$data/clinical/abdomen_ct_hu.nii.gz" "$ct" --values clip:-1000,2000
 ln -sf "$data/volumes/chest_128.nii.gz" "$out/data/volumes/"

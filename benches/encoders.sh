@@ -7,13 +7,12 @@
 # the steps that each made. What is there is not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$(realpath "$1")
 mkdir -p "$2"
 out=$(realpath "$2")
 seconds=${3:-20}
 seeds=${4:-0, 1, 2}
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet --bin conefield
 volume() { # NAME FACTOR
     echo "{ volume = \"$data/volumes/$1.nii.gz\", name = \"$1\", downsample = $2 }"
 }

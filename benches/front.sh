@@ -8,12 +8,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 front=${3:-conefield/specs/tradeoff/front.toml}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 backend=${4:-cpu}
 volumes=${5:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
 prior='prior="directional-total-variation"'

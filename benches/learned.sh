@@ -8,14 +8,9 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 python=$3
 inputs=${4:-smooth-tv light fdk}
 steps=${5:-2500}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 learn="abdomen_128-0 abdomen_128-1 head_256-0 head_256-1"
 test="chest_128-0 engine_256-0 teapot_256-0"
 weight='={ type = "directional-total-variation", edge = 0.7, weight = { noise = 0.25 } }'

@@ -5,13 +5,9 @@
 # threshold, with the mask, and the seconds of the whole command.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-data=$1
-out=$2
+source benches/common.sh
 specs=${3:-fdk os-sart fista-tv smooth-tv limited-angle}
 python=${PYTHON:-python3}
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet --bin conefield
-mkdir -p "$out"
 scans="ta_30 td_30 tb_60 tb_90"
 "$python" benches/limited-angle.py "$data" "$out"
 for scan in $scans; do

@@ -6,16 +6,11 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 python=$3
 field=${4:-balanced}
 steps=${5:-2500}
 tv=${6:-smooth-tv}
 volumes=${7:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 run() { # VOLUME SPEC OPTIONS...
     local name=$out/$1-$2
     [[ -f $name/record.json ]] || "$bin" -q reconstruct "$out/$1" --spec "$2" -o "$name" --force "${@:3}" >/dev/null

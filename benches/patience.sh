@@ -6,13 +6,8 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 seconds=${3:-90}
 volumes=${4:-engine_256 teapot_256 head_256 chest_128 abdomen_128}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 balanced=(--spec balanced --set training.seconds="$seconds" --set training.steps=1000000)
 for volume in $volumes; do
     scan=$out/$volume

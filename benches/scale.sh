@@ -7,16 +7,11 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 spec=${3:-balanced}
 steps=${4:-800}
 shares=${5:-1 0.5 0.25 0.12}
 seeds=${6:-0}
 volumes=${7:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 for volume in $volumes; do
     for seed in $seeds; do
         scan=$out/$volume-$seed

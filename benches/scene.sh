@@ -7,14 +7,9 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 seconds=${3:-60}
 volumes=${4:-engine_256 teapot_256 head_256 chest_128 abdomen_128}
 wanted=${5:-none support levels channels samples six-levels all}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 for volume in $volumes; do
     scan=$out/$volume
     published_scan "$data" "$volume" "$scan"

@@ -8,16 +8,11 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 variants=${3:-total-variation along-edges merged shipped three-from-144 three-from-128}
 seeds=${4:-0}
 volumes=${5:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
 views=${6:-50}
 backend=${7:-auto}
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-[[ -x $bin ]] || cargo build --release --quiet --bin conefield
-mkdir -p "$out"
 
 level() { # a method of the chain: SAMPLES PASSES
     echo "{ extends = \"fista-tv\", basis = { type = \"cubic\", spacing = 1, samples = $1 }, \

@@ -7,14 +7,9 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 seconds=${3:-600}
 specs=${4:-fdk,sart,os-sart,cgls,asd-pocs,fista-tv,naf,ni-naf}
 volumes=${5:-engine_256 teapot_256 head_256 chest_128 abdomen_128}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 : >"$out/tables.md"
 for volume in $volumes; do
     scan=$out/scan-$volume

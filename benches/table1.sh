@@ -8,13 +8,12 @@
 # OUT_FOLDER/abdomen/table.md have PSNR and ssim_2d, mean ± standard deviation over SEEDS ("0 1 2"). What is there is not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+source benches/common.sh
 data=$(realpath "$1")
 mkdir -p "$2"
 out=$(realpath "$2")
 seeds=${3:-0 1 2}
 volumes=${4:-chest_128 head_256 engine_256 abdomen_128}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
 published='"optimizer.lr=1e-3", "projector.samples=192"'
 steps=600 lines=150 gaussians=600
 

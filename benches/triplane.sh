@@ -6,17 +6,12 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
-data=$1
-out=$2
 budget=${3:-30s}
 seeds=${4:-0 1 2}
 volume=${5:-abdomen_128}
 specs="balanced accurate fast field-tv"
-cargo build --release --quiet --bin conefield
 (cd plugins/examples && cargo build --release --quiet --locked -p triplane)
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
 plugin=${CARGO_TARGET_DIR:-plugins/examples/target}/release/libtriplane.so
-mkdir -p "$out"
 for seed in $seeds; do
     scan=$out/$volume-$seed
     published_scan "$data" "$volume" "$scan" 50 "$seed"

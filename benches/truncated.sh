@@ -7,13 +7,9 @@
 # with both.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-data=$1
-out=$2
+source benches/common.sh
 seconds=${3:-60}
 specs=${4:-fdk os-sart fista-tv balanced}
-cargo build --release --quiet --bin conefield
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
-mkdir -p "$out"
 cat >"$out/protocol.toml" <<'T'
 unit = { name = "cube half side", mm = 64.0 }
 dso = 5.0

@@ -1,9 +1,9 @@
 //! From a known volume to its reconstruction, without files: simulate a scan, build a shipped spec with one setting
 //! changed, solve, score.
 
+use conefield::simulate::{Protocol, phantom, simulate};
 use conefield_backend_cpu::Cpu;
 use conefield_core::method::{Context, Job, Limits, Silent};
-use conefield_projectors::simulate::{Protocol, phantom, simulate};
 use std::error::Error;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -17,7 +17,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let limits = Limits { steps: Some(200), ..Limits::default() };
     let solution = plan.run(&Job { limits, ..Job::new(&scan, &backend) }, &mut Silent)?;
     let volume = solution.result.volume(&backend)?;
-    let psnr = conefield_evaluation::metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;
+    let psnr = conefield::metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;
     println!("{} steps in {:.1} s: {psnr:.2} dB", solution.steps, solution.train_s);
     Ok(())
 }

@@ -1,11 +1,10 @@
 //! An encoder of your own in the tree: settings, forward, backward and registration, then a reconstruction with it. The
 //! same lines make a plugin: docs/guide/writing-stages.md.
 
-use conefield_backend_cpu::Cpu;
+use conefield::Reconstruct;
+use conefield::simulate::{Protocol, phantom, simulate};
 use conefield_conformance::{Options, check_encoder};
-use conefield_core::method::{Context, Job, Limits, Silent};
 use conefield_core::prelude::*;
-use conefield_projectors::simulate::{Protocol, phantom, simulate};
 
 stage_type!(EncoderSpec, "waves", Waves, "waves of learned directions");
 
@@ -87,14 +86,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let protocol = Protocol::r2(&truth.grid).with_detector([48, 48]).with_views(30);
     let scan = simulate(&truth, &protocol)?;
 
-    let set = ["encoder.type=waves", "encoder.waves=48", "field.width=16"].map(String::from);
-    let loaded = conefield::specs::read("fast", &set)?;
-    let backend = Cpu::new();
-    let mut plan = loaded.spec.method.plan(&Context::new(&backend))?;
-    let limits = Limits { steps: Some(200), ..Limits::default() };
-    let solution = plan.run(&Job { limits, ..Job::new(&scan, &backend) }, &mut Silent)?;
-    let volume = solution.result.volume(&backend)?;
-    let psnr = conefield_evaluation::metrics::psnr(volume.data.view(), truth.data.view(), 1.0)?;
-    println!("{} steps in {:.1} s: {psnr:.2} dB", solution.steps, solution.train_s);
+    let run = Reconstruct::with("fast").set("encoder.type=waves").set("encoder.waves=48").set("field.width=16");
+    let result = run.steps(200).reference(truth).run(scan)?;
+    let psnr = result.scores.map_or(0.0, |s| s.psnr);
+    println!("{} steps in {:.1} s: {psnr:.2} dB", result.steps, result.train_s);
     Ok(())
 }

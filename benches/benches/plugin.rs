@@ -4,25 +4,14 @@
 //! `cargo bench -p conefield-benches --bench plugin`
 
 use conefield_backend_cpu::Cpu;
-use conefield_benches::{rays, spread};
-use conefield_core::backend::{Adam, Backend, Executable, TrainRay, Work};
-use conefield_core::pipeline::{Model, Pipeline};
+use conefield_benches::{RAYS, SAMPLES, Training, published, published_with, rays, spread};
 use conefield_core::registry::read;
-use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
-use conefield_core::stage::Encoder;
-use conefield_encoders::hash_grid::HashGrid;
-use conefield_fields::mlp::Mlp;
-use conefield_fields::normalizers::layer_norm::LayerNorm;
+use conefield_core::settings::EncoderSpec;
 use conefield_plugins::{Place, Plugins};
-use conefield_projectors::ray_march::{RayMarch, Sampling};
-use conefield_solvers::losses::L1;
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Instant;
 
-const RAYS: usize = 1024;
-const SAMPLES: usize = 320;
 const STEPS: u64 = 60;
 const WARM_UP: u64 = 10;
 
@@ -30,8 +19,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     Plugins::default().load(library()?, Place::Named)?;
     let loaded = read::<dyn EncoderSpec>(serde_json::json!({ "type": "rehashed" }))?;
     let rays = rays(RAYS);
-    let mut built_in = Runner::new(HashGrid::default().build()?)?;
-    let mut plugin = Runner::new(loaded.build()?)?;
+    let mut built_in = Training::new(&Cpu::new(), published(SAMPLES)?)?;
+    let mut plugin = Training::new(&Cpu::new(), published_with(loaded.build()?, SAMPLES)?)?;
     let (mut ratios, mut times) = (vec![], [vec![], vec![]]);
     for step in 1..=STEPS {
         // Which goes first changes, so that neither profits from the other's caches.
@@ -63,30 +52,6 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!("a step takes {ratio:.3} times as long (median of pairs; {low:.3} to {high:.3})");
     println!("parameters after {STEPS} steps: {}", if same { "the same bits" } else { "DIFFERENT" });
     Ok(())
-}
-
-struct Runner {
-    model: Model,
-    exe: Box<dyn Executable>,
-}
-
-impl Runner {
-    fn new(encoder: Box<dyn Encoder>) -> Result<Self, Box<dyn Error>> {
-        let width = encoder.info().output;
-        let norm = LayerNorm::default().build(width)?;
-        let march = RayMarch { samples: Some(SAMPLES), sampling: Sampling::Uniform, ..RayMarch::default() };
-        let pipeline = Pipeline::new(encoder, vec![norm], Mlp::default().build(width)?, march.build()?)?;
-        let (exe, _) = Cpu::new().compile(&pipeline)?;
-        Ok(Self { model: Model::random(pipeline, 1), exe })
-    }
-
-    /// Seconds of one step.
-    fn step(&mut self, rays: &[TrainRay], step: u64) -> Result<f64, Box<dyn Error>> {
-        let start = Instant::now();
-        self.exe.step(&mut self.model, &Work { step, seed: 0, loss: &L1 {}, rays, points: &[], priors: &[] })?;
-        self.exe.update(&mut self.model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?;
-        Ok(start.elapsed().as_secs_f64())
-    }
 }
 
 /// Builds the plugin.

@@ -7,42 +7,26 @@
 //! PyTorch beside it.
 
 use conefield_backend_cpu::Cpu;
-use conefield_benches::{multiply_adds, random_reads, rays, spread};
-use conefield_core::backend::{Adam, Backend, Work};
-use conefield_core::pipeline::{Model, Pipeline};
-use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
-use conefield_encoders::hash_grid::HashGrid;
-use conefield_fields::mlp::Mlp;
-use conefield_fields::normalizers::layer_norm::LayerNorm;
-use conefield_projectors::ray_march::{RayMarch, Sampling};
-use conefield_solvers::losses::L1;
+use conefield_benches::{RAYS, SAMPLES, Training, multiply_adds, points, published, random_reads, rays, spread, times};
+use conefield_core::backend::Backend;
 use std::error::Error;
 use std::time::Instant;
 
-const RAYS: usize = 1024;
-const SAMPLES: usize = 320;
 const STEPS: u64 = 40;
 const WARM_UP: u64 = 8;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let encoder = HashGrid::default().build()?;
-    let width = encoder.info().output;
-    let norm = LayerNorm::default().build(width)?;
-    let field = Mlp::default().build(width)?;
-    let march = RayMarch { samples: Some(SAMPLES), sampling: Sampling::Uniform, ..RayMarch::default() };
-    let pipeline = Pipeline::new(encoder, vec![norm], field, march.build()?)?;
-    let (mut exe, explain) = Cpu::new().compile(&pipeline)?;
-    println!("backend              {}", explain.backend);
+    let (backend, pipeline) = (Cpu::new(), published(SAMPLES)?);
+    println!("backend              {}", backend.describe());
     let macs = pipeline.macs();
-    let mut model = Model::random(pipeline, 1);
+    let mut training = Training::new(&backend, pipeline)?;
     let rays = rays(RAYS);
     let (mut total, mut dense, mut scatter, mut adam) = (vec![], vec![], vec![], vec![]);
     for step in 1..=STEPS {
         let start = Instant::now();
-        let work = Work { step, seed: 0, loss: &L1 {}, rays: &rays, points: &[], priors: &[] };
-        let stats = exe.step(&mut model, &work)?;
+        let stats = training.gradients(&rays, step)?;
         let updating = Instant::now();
-        exe.update(&mut model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?;
+        training.update(step)?;
         if step > WARM_UP {
             total.push(start.elapsed().as_secs_f64());
             dense.push(stats.dense_s);
@@ -63,19 +47,12 @@ fn main() -> Result<(), Box<dyn Error>> {
         println!("  {name:<18} {:5.1} % ({:.1} ms)", 100.0 * t / step, t * 1e3);
     }
 
-    let side = 128;
-    let points: Vec<[f32; 3]> = (0..side * side * side)
-        .map(|i| [i / (side * side), i / side % side, i % side].map(|k| (k as f32 + 0.5) / side as f32))
-        .collect();
-    let mut out = vec![0.0; points.len()];
-    let mut times: Vec<f64> = vec![];
-    for _ in 0..7 {
-        let start = Instant::now();
-        exe.evaluate(&model, &points, &mut out)?;
-        times.push(start.elapsed().as_secs_f64());
-    }
+    let points = points(128);
+    let (mut out, mut failed) = (vec![0.0; points.len()], None);
+    let Training { model, exe } = &mut training;
+    let [low, export, high] = times(7, || failed = exe.evaluate(model, &points, &mut out).err());
+    failed.map_or(Ok(()), Err)?;
     let n = points.len() as f64;
-    let [low, export, high] = spread(&mut times);
     println!(
         "export               {:.2} M points/s (median; {:.2} to {:.2})",
         n / export / 1e6,

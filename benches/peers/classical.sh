@@ -4,18 +4,15 @@
 # 50 views of 512 × 512 of a volume of 256³. RTK is installed into a virtual environment in target/.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
+source benches/common.sh
 volume=$1
-out=$2
 venv=target/rtk
 if [[ ! -x $venv/bin/python ]]; then
     python3 -m venv "$venv"
     "$venv/bin/pip" install --quiet itk-rtk numpy nibabel
 fi
-cargo build --release --quiet --bin conefield
 cargo bench --quiet -p conefield-benches --bench projectors --no-run
-bin=${CARGO_TARGET_DIR:-target}/release/conefield
 scan=$out/scan
-mkdir -p "$out"
 [[ -d $scan ]] || "$bin" -q simulate "$volume" -o "$scan" --protocol r2 --views 50 --noise tigre:1e4,10
 # In turn, so that a change of the machine's speed shows.
 for _ in $(seq "${3:-2}"); do

@@ -6,14 +6,10 @@
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 source benches/common.sh
-data=$1
-out=$2
 python=$3
 seeds=${4:-0 1 2}
 volumes=${5:-engine_256 head_256 teapot_256 chest_128 abdomen_128}
 views=${6:-50}
-cargo build --release --quiet --bin conefield
-mkdir -p "$out"
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 for volume in $volumes; do

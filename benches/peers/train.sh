@@ -6,7 +6,7 @@ cd "$(dirname "$0")/../.."
 venv=target/peers
 if [[ ! -x $venv/bin/python ]]; then
     python3 -m venv "$venv"
-    "$venv/bin/pip" install --quiet torch numpy nibabel
+    "$venv/bin/pip" install --quiet torch numpy
 fi
 cargo bench --quiet -p conefield-benches --bench training
 "$venv/bin/python" benches/peers/train.py

@@ -1,16 +1,80 @@
 //! Speed of conefield, measured in `benches/`, and what the machine allows at most, measured in the same run.
 
-use conefield_core::backend::TrainRay;
+use conefield_core::Result;
+use conefield_core::backend::{Adam, Backend, Executable, StepStats, TrainRay, Work};
 use conefield_core::dense::{WeightMatrix, affine};
 use conefield_core::pages::Pages;
+use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
+use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::simd::{Op, Simd, run};
-use conefield_core::stage::UnitRay;
+use conefield_core::stage::{Encoder, UnitRay};
+use conefield_encoders::hash_grid::HashGrid;
+use conefield_fields::mlp::Mlp;
+use conefield_fields::normalizers::layer_norm::LayerNorm;
+use conefield_projectors::ray_march::{RayMarch, Sampling};
+use conefield_solvers::losses::L1;
 use rayon::prelude::*;
-use serde_json::Value;
-use std::error::Error;
-use std::path::Path;
 use std::time::Instant;
+
+/// Rays of a step of the published configuration.
+pub const RAYS: usize = 1024;
+/// Samples of a ray in it.
+pub const SAMPLES: usize = 320;
+
+/// The published configuration with `samples` a ray: a hash grid of 10 levels of 2 features with tables of 2^19 entries,
+/// LayerNorm, an MLP.
+pub fn published(samples: usize) -> Result<Pipeline> {
+    published_with(HashGrid::default().build()?, samples)
+}
+
+/// The same with another encoder.
+pub fn published_with(encoder: Box<dyn Encoder>, samples: usize) -> Result<Pipeline> {
+    let width = encoder.info().output;
+    let norm = LayerNorm::default().build(width)?;
+    let march = RayMarch { samples: Some(samples), sampling: Sampling::Uniform, ..RayMarch::default() };
+    Pipeline::new(encoder, vec![norm], Mlp::default().build(width)?, march.build()?)
+}
+
+/// A model in training.
+pub struct Training {
+    /// The model.
+    pub model: Model,
+    /// Its kernels on a backend.
+    pub exe: Box<dyn Executable>,
+}
+
+impl Training {
+    /// Random parameters on `backend`.
+    pub fn new(backend: &dyn Backend, pipeline: Pipeline) -> Result<Self> {
+        let (exe, _) = backend.compile(&pipeline)?;
+        Ok(Self { model: Model::random(pipeline, 1), exe })
+    }
+
+    /// Gradients of a step.
+    pub fn gradients(&mut self, rays: &[TrainRay], step: u64) -> Result<StepStats> {
+        self.exe.step(&mut self.model, &Work { step, seed: 0, loss: &L1 {}, rays, points: &[], priors: &[] })
+    }
+
+    /// The update after them.
+    pub fn update(&mut self, step: u64) -> Result<()> {
+        self.exe.update(&mut self.model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })
+    }
+
+    /// Seconds of a whole step.
+    pub fn step(&mut self, rays: &[TrainRay], step: u64) -> Result<f64> {
+        let start = Instant::now();
+        self.gradients(rays, step)?;
+        self.update(step)?;
+        Ok(start.elapsed().as_secs_f64())
+    }
+}
+
+/// The centres of `side`³ voxels of the unit cube.
+pub fn points(side: usize) -> Vec<[f32; 3]> {
+    let at = |i: usize| [i / (side * side), i / side % side, i % side].map(|k| (k as f32 + 0.5) / side as f32);
+    (0..side * side * side).map(at).collect()
+}
 
 /// Minimum, median and maximum.
 pub fn spread(times: &mut [f64]) -> [f64; 3] {
@@ -117,17 +181,4 @@ pub fn rays(count: usize) -> Vec<TrainRay> {
             }
         })
         .collect()
-}
-
-/// Name and folder of the run that `NAME=RUN_FOLDER` says, and the lines of its `metrics.jsonl`.
-pub fn metrics(run: &str) -> Result<(&str, &Path, Vec<Value>), Box<dyn Error>> {
-    let (name, folder) = run.split_once('=').ok_or("a run is NAME=FOLDER")?;
-    let folder = Path::new(folder);
-    let text = std::fs::read_to_string(folder.join("metrics.jsonl"))?;
-    Ok((name, folder, text.lines().map(serde_json::from_str).collect::<Result<_, _>>()?))
-}
-
-/// Seconds of training and PSNR, of a record of the metrics that has one.
-pub fn quality(record: &Value) -> Option<(f64, f64)> {
-    record["seconds"].as_f64().zip(record["psnr"].as_f64())
 }

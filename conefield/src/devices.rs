@@ -95,6 +95,12 @@ mod tests {
         join((0..3).map(|_| Box::new(Cpu::new()) as Box<dyn Backend>).collect())
     }
 
+    /// Waits for a member that agrees.
+    fn wait(backend: &dyn Backend) -> Result<()> {
+        while !backend.place().agree(false) {}
+        Ok(())
+    }
+
     #[test]
     fn all_members_run_and_agree() {
         let (backend, agreed) = (three(), AtomicUsize::new(0));
@@ -108,17 +114,10 @@ mod tests {
 
     #[test]
     fn the_failure_of_one_ends_all() {
-        let backend = three();
-        let wait = |backend: &dyn Backend| {
-            while !backend.place().agree(false) {}
-            Ok(())
-        };
-        let count = AtomicUsize::new(0);
-        let one_fails = |other: &dyn Backend| {
-            if count.fetch_add(1, Ordering::Relaxed) == 1 {
-                return Err(Error::unsupported("device", "out of memory"));
-            }
-            wait(other)
+        let (backend, count) = (three(), AtomicUsize::new(0));
+        let one_fails = |other: &dyn Backend| match count.fetch_add(1, Ordering::Relaxed) {
+            1 => Err(Error::unsupported("device", "out of memory")),
+            _ => wait(other),
         };
         let e = backend.run(&mut || wait(backend.as_ref()), &one_fails).unwrap_err().to_string();
         assert!(e.contains("out of memory"), "{e}");
@@ -133,15 +132,7 @@ mod tests {
     fn a_panic_reaches_the_caller() {
         let backend = three();
         let panics = |_: &dyn Backend| -> Result<()> { resume_unwind(Box::new("lost")) };
-        let run = || {
-            backend.run(
-                &mut || {
-                    while !backend.place().agree(false) {}
-                    Ok(())
-                },
-                &panics,
-            )
-        };
+        let run = || backend.run(&mut || wait(backend.as_ref()), &panics);
         let panic = catch_unwind(AssertUnwindSafe(run)).unwrap_err();
         assert_eq!(panic.downcast_ref::<&str>(), Some(&"lost"));
     }

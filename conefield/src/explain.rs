@@ -72,54 +72,47 @@ impl Explanation {
 
     /// Text for people.
     pub fn text(&self) -> String {
-        text(self)
-    }
-}
-
-fn text(r: &Explanation) -> String {
-    let mut lines = vec![];
-    let shipped = r.source.strip_prefix(&r.spec) == Some(" (shipped)");
-    lines.push(if shipped || r.spec.is_empty() { r.source.clone() } else { format!("{} ({})", r.spec, r.source) });
-    if !r.extends.is_empty() {
-        lines.push(format!("extends {}", r.extends.join(", ")));
-    }
-    if !r.description.is_empty() {
-        lines.push(r.description.clone());
-    }
-    lines.push(String::new());
-    outlined(&r.outline, &mut lines);
-    for plugin in &r.plugins {
-        lines.push(format!("\nplugin: {}", plugin.line()));
-    }
-    if r.parameters > 0 {
+        let mut lines = vec![];
+        let shipped = self.source.strip_prefix(&self.spec) == Some(" (shipped)");
+        let name = format!("{} ({})", self.spec, self.source);
+        lines.push(if shipped || self.spec.is_empty() { self.source.clone() } else { name });
+        if !self.extends.is_empty() {
+            lines.push(format!("extends {}", self.extends.join(", ")));
+        }
+        if !self.description.is_empty() {
+            lines.push(self.description.clone());
+        }
         lines.push(String::new());
-        lines.push(format!(
-            "memory for the model: {} (parameters {p}, gradients {p}, moments {})",
-            bytes(r.model_bytes as u64),
-            bytes(8 * r.parameters as u64),
-            p = bytes(4 * r.parameters as u64),
-        ));
-    }
-    if let Some(s) = &r.scan {
-        if r.parameters == 0 {
+        outlined(&self.outline, &mut lines);
+        lines.extend(self.plugins.iter().map(|plugin| format!("\nplugin: {}", plugin.line())));
+        if self.parameters > 0 || self.scan.is_some() {
             lines.push(String::new());
         }
-        let ([rows, columns], [x, y, z]) = (s.detector, s.volume);
-        let samples = s.findings.samples.map_or(String::new(), |n| format!(", {n} samples on the middle ray"));
-        let views = s.views;
-        lines.push(format!("this scan: {views} views of {rows} x {columns}, volume {x} x {y} x {z}{samples}"));
-        lines.extend(s.findings.lines.iter().map(|line| format!("  {line}")));
-        lines.push(format!("memory for this scan: {}", s.memory.line()));
-        let limit = memory::limit();
-        if let Some(beside) = s.memory.beside(limit) {
-            let (limit, beside) = (bytes(limit), bytes(beside));
+        if self.parameters > 0 {
             lines.push(format!(
-                "it stays below {limit}, with scratch files of up to {beside} on the disk of the output"
+                "memory for the model: {} (parameters {p}, gradients {p}, moments {})",
+                bytes(self.model_bytes as u64),
+                bytes(8 * self.parameters as u64),
+                p = bytes(4 * self.parameters as u64),
             ));
-            lines.extend(s.reads.iter().map(|line| format!("  {line}")));
         }
+        if let Some(s) = &self.scan {
+            let ([rows, columns], [x, y, z], views) = (s.detector, s.volume, s.views);
+            let samples = s.findings.samples.map_or(String::new(), |n| format!(", {n} samples on the middle ray"));
+            lines.push(format!("this scan: {views} views of {rows} x {columns}, volume {x} x {y} x {z}{samples}"));
+            lines.extend(s.findings.lines.iter().map(|line| format!("  {line}")));
+            lines.push(format!("memory for this scan: {}", s.memory.line()));
+            let limit = memory::limit();
+            if let Some(beside) = s.memory.beside(limit) {
+                let (limit, beside) = (bytes(limit), bytes(beside));
+                lines.push(format!(
+                    "it stays below {limit}, with scratch files of up to {beside} on the disk of the output"
+                ));
+                lines.extend(s.reads.iter().map(|line| format!("  {line}")));
+            }
+        }
+        lines.join("\n")
     }
-    lines.join("\n")
 }
 
 /// The parts of a method; for a chain, the parts of each of its methods.
@@ -145,31 +138,20 @@ fn outlined(o: &Outline, lines: &mut Vec<String>) {
 fn stages(o: &Outline) -> String {
     let heads = ["stage", "type", "in -> out", "parameters", "bytes", "MACs/sample", "gradient", "what"];
     let mut rows = vec![heads.map(str::to_owned).to_vec()];
+    let row = |names: [String; 3], [parameters, size, macs]: [usize; 3]| {
+        let [stage, kind, widths] = names;
+        vec![stage, kind, widths, number(parameters as u64), bytes(size as u64), number(macs as u64)]
+    };
+    let mut total = [0; 3];
     for s in &o.stages {
-        let gradient = format!("{:?}", s.gradient).to_lowercase();
-        rows.push(vec![
-            s.stage.clone(),
-            s.kind.clone(),
-            format!("{} -> {}", s.input, s.output),
-            number(s.parameters as u64),
-            bytes(s.parameter_bytes as u64),
-            number(s.macs_per_sample as u64),
-            gradient,
-            format!(
-                "{}{}{}",
-                s.what,
-                if s.left_out { " (no work)" } else { "" },
-                if s.wgsl { "" } else { " (CPU only: it has no WGSL)" }
-            ),
-        ]);
+        let counts = [s.parameters, s.parameter_bytes, s.macs_per_sample];
+        total = std::array::from_fn(|k| total[k] + counts[k]);
+        let mut cells = row([s.stage.clone(), s.kind.clone(), format!("{} -> {}", s.input, s.output)], counts);
+        let left_out = if s.left_out { " (no work)" } else { "" };
+        let on_cpu = if s.wgsl { "" } else { " (CPU only: it has no WGSL)" };
+        cells.extend([format!("{:?}", s.gradient).to_lowercase(), format!("{}{left_out}{on_cpu}", s.what)]);
+        rows.push(cells);
     }
-    rows.push(vec![
-        "total".into(),
-        String::new(),
-        String::new(),
-        number(o.stages.iter().map(|s| s.parameters).sum::<usize>() as u64),
-        bytes(o.stages.iter().map(|s| s.parameter_bytes).sum::<usize>() as u64),
-        number(o.stages.iter().map(|s| s.macs_per_sample).sum::<usize>() as u64),
-    ]);
+    rows.push(row(["total".into(), String::new(), String::new()], total));
     table(&rows, &[3, 4, 5])
 }

@@ -1,7 +1,6 @@
 //! Inputs of a run: the scan, held-out views, the reference volume.
 
 use crate::parse::HoldOut;
-use crate::tradeoff::calibrate::Bench;
 use crate::tradeoff::schedule::Schedule;
 use crate::{files, score};
 use conefield_core::backend::Backend;
@@ -40,12 +39,6 @@ impl Input {
             (Arc::new(scan), Some(aside))
         };
         Ok(Self { scan, aside, held, reference, peak })
-    }
-
-    /// The inputs for measuring a budget.
-    pub fn bench<'a>(&'a self, backend: &'a dyn Backend, seed: u64, cancelled: &'a dyn Fn() -> bool) -> Bench<'a> {
-        let reference = self.reference.as_ref();
-        Bench { scan: &self.scan, reference, peak: self.peak, backend, seed, volumes: &files::volume, cancelled }
     }
 
     /// The job of a method, with the limits of `schedule` in addition to `limits`.

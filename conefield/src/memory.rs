@@ -74,15 +74,9 @@ impl Memory {
 
     /// Text for people.
     pub fn line(&self) -> String {
-        let parts = [
-            ("scan", self.scan),
-            ("volume", self.volume),
-            ("reference", self.reference),
-            ("model", self.model),
-            ("optimizer", self.optimizer),
-            ("buffers", self.buffers),
-        ];
-        let parts = parts.iter().filter(|(_, n)| *n > 0).map(|(what, n)| format!("{what} {}", bytes(*n)));
+        let names = ["scan", "volume", "reference", "model", "optimizer", "buffers"];
+        let parts = [self.scan, self.volume, self.reference, self.model, self.optimizer, self.buffers];
+        let parts = names.iter().zip(parts).filter(|(_, n)| *n > 0).map(|(what, n)| format!("{what} {}", bytes(n)));
         format!("{}: {}", bytes(self.total), parts.collect::<Vec<_>>().join(", "))
     }
 
@@ -146,9 +140,7 @@ fn available(processes: u64) -> u64 {
 
 /// The rest of a limited address space. One eighth is reserved for threads and for overhead of the allocator.
 fn addresses() -> u64 {
-    let kib = |text: &str| text.trim().strip_suffix("kB").and_then(|n| n.trim().parse::<u64>().ok());
-    let used = std::fs::read_to_string("/proc/self/status").ok();
-    let used = used.and_then(|s| kib(s.lines().find_map(|l| l.strip_prefix("VmSize:"))?)).unwrap_or(0) << 10;
+    let used = status("VmSize:").unwrap_or(0);
     let limits = std::fs::read_to_string("/proc/self/limits").unwrap_or_default();
     let limit = limits.lines().find_map(|l| l.strip_prefix("Max address space"));
     let soft = limit.and_then(|l| l.split_whitespace().next()?.parse::<u64>().ok());
@@ -157,8 +149,13 @@ fn addresses() -> u64 {
 
 /// Peak memory of this process, if the system reports it.
 pub fn peak() -> Option<u64> {
+    status("VmHWM:")
+}
+
+/// Bytes that the system reports for this process under `name`.
+fn status(name: &str) -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
+    let line = status.lines().find_map(|l| l.strip_prefix(name))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|k| k << 10)
 }
 

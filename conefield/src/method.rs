@@ -97,6 +97,7 @@ mod tests {
     use crate::tradeoff::schedule::Budget;
     use crate::tradeoff::speed::pass_s;
     use conefield_backend_cpu::Cpu;
+    use conefield_core::method::Job;
     use conefield_core::scan::{Scan, Volume};
     use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of, simulate};
     use std::time::Instant;
@@ -131,15 +132,8 @@ mod tests {
     }
 
     fn bench<'a>(scan: &'a Scan, truth: &'a Volume, backend: &'a Cpu) -> Bench<'a> {
-        Bench {
-            scan,
-            reference: Some(truth),
-            peak: 1.0,
-            backend,
-            seed: 0,
-            volumes: &files::volume,
-            cancelled: &|| false,
-        }
+        let job = Job { reference: Some(truth), volumes: &files::volume, ..Job::new(scan, backend) };
+        Bench { job, cancelled: &|| false }
     }
 
     /// A front that was measured on a scan of the same size, with a chain of 10 s and FDK.

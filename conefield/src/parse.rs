@@ -102,7 +102,7 @@ pub fn i0(text: &str) -> Result<I0, String> {
 pub enum HoldOut {
     /// The views with these indices, from 0.
     Views(Vec<usize>),
-    /// Every n-th view.
+    /// One view of every n, from their middle.
     Every(usize),
 }
 

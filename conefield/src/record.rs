@@ -30,8 +30,8 @@ pub struct RunRecord {
     pub scan: Option<ScanRecord>,
     /// Indices of the held-out views.
     pub held_out_views: Vec<usize>,
-    /// Ends of training.
-    pub limits: Ends,
+    /// Ends of training; the first one reached ends it.
+    pub limits: Limits,
     /// Seconds of the budget.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub budget_s: Option<f64>,
@@ -92,24 +92,6 @@ pub struct RunRecord {
     pub best_step: Option<u64>,
     /// The data range of scores.
     pub peak: f64,
-}
-
-/// Ends of training; the first one reached ends it.
-#[derive(Debug, Clone, Serialize)]
-pub struct Ends {
-    /// Seconds of training.
-    pub seconds: Option<f64>,
-    /// Steps or passes.
-    pub steps: Option<u64>,
-    /// Upper bound of the seconds, which schedules ignore.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub at_most: Option<f64>,
-}
-
-impl From<&Limits> for Ends {
-    fn from(limits: &Limits) -> Self {
-        Self { seconds: limits.seconds, steps: limits.steps, at_most: limits.at_most }
-    }
 }
 
 /// Written files and the time for them.

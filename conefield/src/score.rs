@@ -5,18 +5,13 @@ use conefield_core::error::ensure;
 use conefield_core::scan::Volume;
 use conefield_evaluation::metrics::Scores;
 
-/// The headings of [`score_cells`].
+/// The headings of [`cells_of`].
 pub const SCORES: [&str; 4] = ["PSNR dB", "ssim_2d", "ssim_3d", "ssim_skimage"];
 
 /// PSNR and the SSIMs as table cells; undefined values are dashes.
-pub fn score_cells(psnr: f64, ssims: [Option<f64>; 3]) -> [String; 4] {
-    let [a, b, c] = ssims.map(|s| s.map_or("-".into(), |x| format!("{x:.4}")));
-    [format!("{psnr:.2}"), a, b, c]
-}
-
-/// The table cells of all scores.
 pub fn cells_of(s: &Scores) -> [String; 4] {
-    score_cells(s.psnr, [s.ssim_2d, s.ssim_3d, s.ssim_skimage])
+    let [a, b, c] = [s.ssim_2d, s.ssim_3d, s.ssim_skimage].map(|s| s.map_or("-".into(), |x| format!("{x:.4}")));
+    [format!("{:.2}", s.psnr), a, b, c]
 }
 
 /// Refuses a volume whose shape differs from the reference's.
@@ -45,14 +40,4 @@ pub fn score(place: &str, volume: &Volume, reference: &Volume, peak: f64) -> Res
         );
     }
     conefield_evaluation::metrics::evaluate(volume.data.view(), reference.data.view(), peak)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_score_that_is_not_defined_is_a_dash() {
-        assert_eq!(score_cells(f64::INFINITY, [Some(1.0), None, None]), ["inf", "1.0000", "-", "-"]);
-    }
 }

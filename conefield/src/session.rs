@@ -8,7 +8,8 @@ use crate::input::Input;
 use crate::machine::{Machine, simd_level};
 use crate::memory;
 use crate::method::{self, Planned, Read};
-use crate::record::{Ends, RunRecord, Written};
+use crate::record::{RunRecord, Written};
+use crate::tradeoff::calibrate::Bench;
 use crate::tradeoff::front::Front;
 use crate::tradeoff::schedule::{Budget, Schedule};
 use crate::{plugins, ranks, rehearsal, score, specs};
@@ -110,7 +111,7 @@ impl<'a> Session<'a> {
         if let Wish::Method(m) = &wish {
             specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held)?;
         }
-        let bench = input.bench(backend, request.seed, cancelled);
+        let bench = Bench { job: input.job(backend, request.seed, request.limits, None), cancelled };
         let budget = |seconds| Budget { begin, seconds, spent };
         let (method, schedule) = match wish {
             Wish::Method(mut method) => {
@@ -246,7 +247,7 @@ impl Run<'_> {
             seed: self.seed,
             scan: None,
             held_out_views: self.input.held.clone(),
-            limits: Ends::from(&self.limits),
+            limits: self.limits,
             budget_s: self.budget,
             plan: self.schedule.clone(),
             init: None,

@@ -50,7 +50,7 @@ pub fn prepared(volume: Volume, values: Values, size: usize) -> Result<Volume> {
 pub fn protocol(name: &str, grid: &VoxelGrid) -> Result<Protocol> {
     match name {
         "r2" => Ok(Protocol::r2(grid)),
-        path => read_protocol(Path::new(path)),
+        path => written::read(path, &read_text(Path::new(path), LONGEST)?),
     }
 }
 
@@ -68,31 +68,23 @@ pub fn changed(mut p: Protocol, changes: &Changes, place: &str) -> Result<Protoc
     if let Some(mm) = changes.offset {
         p.offset = mm.map(|x| x / p.unit.mm);
     }
-    match &changes.angles {
-        Some(AnglesOption::File(path)) => {
-            if changes.views.is_some() {
-                let expected = "--views or --angles FILE, which determines the number";
-                return Err(Error::invalid(place, "--views", "both", expected));
-            }
-            p.angles = Angles::ListDeg(read_angles(path)?);
+    p.angles = match (&changes.angles, changes.views, p.angles) {
+        (Some(AnglesOption::File(path)), None, _) => Angles::ListDeg(read_angles(path)?),
+        (Some(AnglesOption::File(_)), Some(_), _) => {
+            let expected = "--views or --angles FILE, which determines the number";
+            return Err(Error::invalid(place, "--views", "both", expected));
         }
-        Some(AnglesOption::Even { start, range }) => {
-            let views = changes.views.unwrap_or_else(|| p.angles.radians().len());
-            p.angles = Angles::Even { views, start_deg: *start, arc_deg: *range };
+        (Some(AnglesOption::Even { start, range }), views, before) => {
+            let views = views.unwrap_or_else(|| before.radians().len());
+            Angles::Even { views, start_deg: *start, arc_deg: *range }
         }
-        None => {
-            if let Some(views) = changes.views {
-                p.angles = match p.angles {
-                    Angles::Even { start_deg, arc_deg, .. } => Angles::Even { views, start_deg, arc_deg },
-                    Angles::ListDeg(_) => {
-                        let (found, expected) =
-                            (format!("--views {views}"), "--angles, or no --views: the protocol lists its angles");
-                        return Err(Error::invalid(place, "--views", found, expected));
-                    }
-                };
-            }
+        (None, Some(views), Angles::Even { start_deg, arc_deg, .. }) => Angles::Even { views, start_deg, arc_deg },
+        (None, Some(views), Angles::ListDeg(_)) => {
+            let expected = "--angles, or no --views: the protocol lists its angles";
+            return Err(Error::invalid(place, "--views", format!("--views {views}"), expected));
         }
-    }
+        (None, None, before) => before,
+    };
     Ok(p)
 }
 
@@ -146,11 +138,6 @@ pub fn check_memory(volume: &Volume, g: &Geometry) -> Result<()> {
         let detector = detector.map(|k| format!("a detector of {}x{}", g.detector[0] >> k, g.detector[1] >> k));
         views.into_iter().chain(detector).collect()
     })
-}
-
-fn read_protocol(path: &Path) -> Result<Protocol> {
-    let text = read_text(path, LONGEST)?;
-    written::read(&path.display().to_string(), &text)
 }
 
 fn read_angles(path: &Path) -> Result<Vec<f64>> {

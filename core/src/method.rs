@@ -62,18 +62,21 @@ impl<'a> Job<'a> {
 }
 
 /// Limits of a run; the first one reached stops it.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Limits {
-    /// Steps (iterations).
-    pub steps: Option<u64>,
     /// Seconds of training.
     pub seconds: Option<f64>,
+    /// Steps (iterations).
+    pub steps: Option<u64>,
     /// Upper bound of the training seconds. Schedules that depend on the end of the run, such as learning rates, ignore
     /// it.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub at_most: Option<f64>,
     /// Wall-clock end of training. Methods that can stop only at certain points stop before they would pass it.
+    #[serde(skip)]
     pub deadline: Option<Instant>,
     /// The same for the later methods of a chain.
+    #[serde(skip)]
     pub then: Option<Instant>,
 }
 

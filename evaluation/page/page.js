@@ -21,7 +21,10 @@
     const size = Math.abs(x);
     return x === 0 ? "0" : size >= 1e6 || size < 1e-3 ? x.toExponential(digits - 1) : String(Number(x.toPrecision(digits)));
   };
-  const seconds = (s) => (s < 60 ? `${s.toFixed(1)} s` : s < 3600 ? `${Math.floor(s / 60)} min ${String(Math.round(s % 60)).padStart(2, "0")} s` : `${(s / 3600).toFixed(2)} h`);
+  const seconds = (s) => {
+    const whole = Math.round(s);
+    return whole < 60 ? `${s.toFixed(1)} s` : whole < 3600 ? `${Math.floor(whole / 60)} min ${String(whole % 60).padStart(2, "0")} s` : `${(s / 3600).toFixed(2)} h`;
+  };
   const bytes = (n) => (n >= 2 ** 30 ? `${(n / 2 ** 30).toFixed(2)} GiB` : n >= 2 ** 20 ? `${(n / 2 ** 20).toFixed(1)} MiB` : `${(n / 1024).toFixed(0)} KiB`);
 
   // The head, warnings and tables need no library: they come first and stay, whatever fails later.
@@ -65,7 +68,7 @@
     spreads.append(row("th", ["mean ± standard deviation", "seeds", ...shown_figures.map(([, name]) => name)]));
     for (const { name, figures } of page.spreads) {
       const show = (s, digits) => (Number.isFinite(s?.mean) ? s.mean.toFixed(digits) + (s.sd === null ? "" : ` ± ${s.sd.toFixed(digits)}`) : "-");
-      spreads.append(row("th", [name, figure(String(Math.max(...Object.values(figures).map((s) => s.n)))), ...shown_figures.map(([key, , digits]) => figure(show(figures[key], digits)))]));
+      spreads.append(row("th", [name, figure(String(Math.max(0, ...Object.values(figures).map((s) => s.n)))), ...shown_figures.map(([key, , digits]) => figure(show(figures[key], digits)))]));
     }
   }
   for (const run of runs) {

@@ -8,7 +8,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parallel;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Unit};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, written};
 use conefield_scans::diagnosis::quantiles::median;
 use ndarray::{Array3, ArrayViewMut3};
 use serde::{Deserialize, Serialize};
@@ -146,12 +146,10 @@ impl FromStr for KnownValue {
                 _ => Err("expected sphere:X,Y,Z,R with a radius above 0, in mm".into()),
             },
             Some(("box", list)) => match numbers(list).as_deref() {
-                Some(&[a, b, c, d, e, f]) => {
-                    let corners = [[a, d], [b, e], [c, f]];
-                    let [low, high] =
-                        [f64::min as fn(f64, f64) -> f64, f64::max].map(|pick| corners.map(|[p, q]| pick(p, q)));
-                    Ok(Self::Median(Region::Box { low, high }))
-                }
+                Some(&[a, b, c, d, e, f]) => Ok(Self::Median(Region::Box {
+                    low: [a.min(d), b.min(e), c.min(f)],
+                    high: [a.max(d), b.max(e), c.max(f)],
+                })),
                 _ => Err("expected box:X,Y,Z,X,Y,Z, two corners in mm".into()),
             },
             _ => Err(wrong()),
@@ -203,18 +201,10 @@ impl Region {
     }
 }
 
-/// The planes of voxels along z.
-fn planes(grid: &VoxelGrid) -> impl Iterator<Item = Part> + use<> {
-    let [x, y, z] = grid.shape;
-    (0..z).map(move |z| [0..x, 0..y, z..z + 1])
-}
-
-fn voxels_of(part: &Part) -> impl Iterator<Item = [usize; 3]> + use<> {
-    let [xs, ys, zs] = part.clone();
-    xs.flat_map(move |x| {
-        let zs = zs.clone();
-        ys.clone().flat_map(move |y| zs.clone().map(move |z| [x, y, z]))
-    })
+/// The voxels of a plane across z.
+fn plane(grid: &VoxelGrid, z: usize) -> impl Iterator<Item = [usize; 3]> + use<> {
+    let [nx, ny, _] = grid.shape;
+    (0..nx).flat_map(move |x| (0..ny).map(move |y| [x, y, z]))
 }
 
 impl How {
@@ -247,7 +237,8 @@ impl How {
                 Some([water, 0.0].map(KnownValue::Given))
             }
             Self::File(path) => {
-                let CalibrationFile { water, air, energy_kev } = read(path)?;
+                let text = conefield_core::files::read_text(path, LONGEST)?;
+                let CalibrationFile { water, air, energy_kev } = written::read(&path.display().to_string(), &text)?;
                 remark = energy_kev.map_or(String::new(), |e| format!(" at {e} keV"));
                 Some([water, air].map(KnownValue::Given))
             }
@@ -262,7 +253,8 @@ impl How {
                     ensure(relative.is_none(), place, "unit", format!("\"{found}\""), expected)?;
                 }
                 KnownValue::Median(region) => {
-                    let some = planes(grid).flat_map(|p| voxels_of(&p)).any(|v| region.holds(at(grid, affine, v)));
+                    let mut all = (0..grid.shape[2]).flat_map(|z| plane(grid, z));
+                    let some = all.any(|v| region.holds(at(grid, affine, v)));
                     let last = grid.shape.map(|n| n - 1);
                     let [a, b] = [[0; 3], last].map(|v| at(grid, affine, v));
                     let expected = format!("a region with voxels, whose centres lie from {a:.3?} to {b:.3?} mm");
@@ -272,11 +264,6 @@ impl How {
         }
         Ok(Calibration { levels, unit: unit.cloned(), place: place.to_owned(), remark })
     }
-}
-
-fn read(path: &Path) -> Result<CalibrationFile> {
-    let text = conefield_core::files::read_text(path, LONGEST)?;
-    conefield_core::written::read(&path.display().to_string(), &text)
 }
 
 impl Calibration {
@@ -309,17 +296,16 @@ impl Calibration {
 /// The median of the voxels in `region`, one plane at a time: a streak or a bubble does not shift it as it does a mean.
 fn median_in(voxels: &mut dyn Voxels, region: &Region) -> Result<f64> {
     let (grid, affine) = (voxels.grid(), voxels.affine());
-    let [nx, ny, _] = grid.shape;
-    let mut plane = Array3::zeros([nx, ny, 1]);
+    let [nx, ny, nz] = grid.shape;
+    let mut read = Array3::zeros([nx, ny, 1]);
     let mut values = vec![];
-    for part in planes(&grid) {
-        let inside: Vec<[usize; 3]> =
-            voxels_of(&part).filter(|v| region.holds(at(&grid, affine.as_ref(), *v))).collect();
-        if inside.is_empty() {
-            continue;
+    for z in 0..nz {
+        let inside = plane(&grid, z).filter(|v| region.holds(at(&grid, affine.as_ref(), *v)));
+        let inside: Vec<[usize; 3]> = inside.collect();
+        if !inside.is_empty() {
+            voxels.fill(&[0..nx, 0..ny, z..z + 1], read.view_mut())?;
+            values.extend(inside.iter().map(|[x, y, _]| read[[*x, *y, 0]]));
         }
-        voxels.fill(&part, plane.view_mut())?;
-        values.extend(inside.iter().map(|[x, y, _]| plane[[*x, *y, 0]]));
     }
     Ok(median(&mut values).map_or(f64::NAN, f64::from))
 }

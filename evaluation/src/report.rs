@@ -25,9 +25,6 @@ mod survey;
 mod table;
 pub mod text;
 
-#[cfg(all(test, feature = "plots"))]
-mod testing;
-
 #[cfg(feature = "plots")]
 pub use curves::{Band, CurveOptions, Panel, curves_png, panels_png};
 pub use middle::MiddleSlices;

@@ -44,7 +44,7 @@ def project(volume: Any, like: _native.Geometry | Scan, *, projector: Any = "jos
     if residual:
         raise invalid("arguments", "residual", "a geometry, in which nothing was measured", "a scan")
     values = volume.data if isinstance(volume, Volume) else volume
-    return _native.project(like, encoded(projector), _real(values, "volume"))
+    return _native.apply(like, encoded(projector), _real(values, "volume"), False)
 
 
 def backproject(projections: Any, geometry: _native.Geometry, *, projector: Any = "joseph") -> np.ndarray:
@@ -52,7 +52,7 @@ def backproject(projections: Any, geometry: _native.Geometry, *, projector: Any 
 
     It is unfiltered; for filtered back-projection use the spec ``fdk``. ``float64`` is computed in double precision.
     """
-    return _native.backproject(geometry, encoded(projector), _real(projections, "projections"))
+    return _native.apply(geometry, encoded(projector), _real(projections, "projections"), True)
 
 
 class Operator:
@@ -119,8 +119,7 @@ class Operator:
         if not flat and x.shape != self.input_shape:
             expected = f"{self.input_shape}, or a vector of {self.shape[1]}"
             raise invalid("operator", "shape", x.shape, expected)
-        apply = _native.backproject if self._transposed else _native.project
-        y = apply(self.geometry, self._projector, x.reshape(self.input_shape))
+        y = _native.apply(self.geometry, self._projector, x.reshape(self.input_shape), self._transposed)
         return y.reshape((self.shape[0],) + x.shape[1:]) if flat else y
 
     __call__ = __matmul__

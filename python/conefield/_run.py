@@ -197,7 +197,7 @@ def reconstruct(
     peak
         The data range for PSNR and SSIM: 1 for a reference in [0, 1] that exceeds 0.5, else its range.
     hold_out
-        Views to hold out and predict: their indices, or a string such as ``"every:10"``.
+        Views to hold out and predict: their indices, or a string such as ``"every:10"`` for views 5, 15, 25, ….
     steps, seconds, at_most
         When training ends: a number of steps, a time that learning-rate schedules aim for, and a time limit that they
         ignore.

@@ -3,7 +3,7 @@
 use crate::errors::raised;
 use conefield::backend::BackendChoice;
 use conefield::parse::{self, HoldOut};
-use conefield_core::{Error, Result};
+use conefield_core::error::{Error, Result, ensure};
 use pyo3::prelude::*;
 use serde::de::DeserializeOwned;
 
@@ -32,6 +32,13 @@ pub fn backend(text: &str) -> Result<BackendChoice> {
 /// Seconds.
 pub fn seconds(name: &str, text: Option<&String>) -> Result<Option<f64>> {
     optional(name, text, parse::seconds)
+}
+
+/// A data range.
+pub fn peak(peak: Option<f64>) -> Result<Option<f64>> {
+    let good = peak.is_none_or(|p| p > 0.0 && p.is_finite());
+    ensure(good, "arguments", "peak", peak.unwrap_or(0.0), "a number above 0")?;
+    Ok(peak)
 }
 
 /// Indices of the held-out views, of `n`.

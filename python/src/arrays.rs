@@ -1,8 +1,8 @@
 //! Conversion between NumPy arrays and ndarray. Inputs are copied, as Python may change an array while the work runs
 //! without the GIL. Outputs are moved.
 
-use ndarray::{Array, Array3, Dimension};
-use numpy::{Element, IntoPyArray, PyArray, PyArray3, PyReadonlyArray};
+use ndarray::{Array, Dimension};
+use numpy::{Element, IntoPyArray, PyArray, PyReadonlyArray};
 use pyo3::prelude::*;
 use serde::Serialize;
 
@@ -12,12 +12,7 @@ pub fn owned<T: Element + Clone, D: Dimension>(array: &PyReadonlyArray<'_, T, D>
 }
 
 /// Passes the array to Python without a copy.
-pub fn given<T: Element>(py: Python<'_>, array: Array3<T>) -> Bound<'_, PyArray3<T>> {
-    array.into_pyarray(py)
-}
-
-/// As [`given`], for any number of axes.
-pub fn given_any<T: Element, D: Dimension>(py: Python<'_>, array: Array<T, D>) -> Bound<'_, PyArray<T, D>> {
+pub fn given<T: Element, D: Dimension>(py: Python<'_>, array: Array<T, D>) -> Bound<'_, PyArray<T, D>> {
     array.into_pyarray(py)
 }
 

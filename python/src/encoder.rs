@@ -3,26 +3,24 @@
 //! The GIL is acquired once per batch of rows, and batches are processed one at a time: this is for prototyping, not
 //! for speed.
 
-use crate::stages::{Raised, words};
+use crate::errors::{broken, raised};
+use crate::stages::{StageObject, array, optional};
 use conefield_core::error::ensure;
 use conefield_core::simd::Real;
 use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
 use conefield_core::{Error, Result};
 use ndarray::{Array1, Array2, ArrayD};
-use numpy::{Element, IntoPyArray, PyReadonlyArrayDyn};
+use numpy::{Element, IntoPyArray};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 /// Number of coordinates of a point.
 const INPUT: usize = 3;
 
 /// State shared by all encoders of one object.
 struct Shared {
-    name: &'static str,
-    object: Py<PyAny>,
-    /// One call at a time: the parameters are set on the object before it. Acquired before the GIL, never after.
-    turn: Mutex<()>,
+    of: StageObject,
     blocks: Vec<Parameter>,
     /// Initial parameters.
     first: Vec<f32>,
@@ -32,7 +30,6 @@ struct Shared {
     double: bool,
     coarse_to_fine: bool,
     resolutions: Option<Vec<f64>>,
-    raised: Arc<Raised>,
 }
 
 /// An encoder of a Python object, possibly without some of its channels.
@@ -40,28 +37,24 @@ pub struct PythonEncoder {
     shared: Arc<Shared>,
     /// Output channels of the object that are used.
     outputs: Vec<usize>,
-    fault: Mutex<Option<Error>>,
 }
 
 impl PythonEncoder {
     /// Calls the object on a few points to find its widths. The outer error is an exception of the object.
-    pub fn new(py: Python<'_>, name: &'static str, object: Py<PyAny>, raised: Arc<Raised>) -> PyResult<Result<Self>> {
-        let own = object.bind(py);
+    pub fn new(py: Python<'_>, of: StageObject) -> PyResult<Result<Self>> {
+        let own = &of.object.bind(py).clone();
         let mut shared = Shared {
-            name,
-            object: own.clone().unbind(),
-            turn: Mutex::new(()),
+            of,
             blocks: vec![],
             first: vec![],
             width: 0,
             double: false,
             coarse_to_fine: optional(own, "coarse_to_fine")?.unwrap_or(false),
             resolutions: optional(own, "resolutions")?,
-            raised,
         };
         if let Some(params) = optional::<Bound<'_, PyDict>>(own, "params")? {
             for (key, value) in params.iter() {
-                let value = array::<f32>(py, &value)?;
+                let value = array::<f32>(&value)?;
                 let (name, start) = (key.extract()?, shared.first.len());
                 shared.blocks.push(Parameter { name, shape: value.shape().to_vec(), start });
                 shared.first.extend(value.iter());
@@ -92,51 +85,14 @@ impl PythonEncoder {
         shared.width = width;
         shared.double = y.getattr("dtype")?.getattr("name")?.extract::<String>()? == "float64";
         let outputs = (0..width).collect();
-        Ok(Ok(Self { shared: Arc::new(shared), outputs, fault: Mutex::new(None) }))
+        Ok(Ok(Self { shared: Arc::new(shared), outputs }))
     }
-
-    /// Runs `call` with the GIL, one at a time; `None` if it or another stage has failed.
-    fn call<T>(&self, call: impl FnOnce(Python<'_>) -> PyResult<T>) -> Option<T> {
-        if self.shared.raised.any() {
-            return None;
-        }
-        let _turn = self.shared.turn.lock().unwrap_or_else(PoisonError::into_inner);
-        Python::attach(|py| match call(py) {
-            Ok(found) => Some(found),
-            Err(e) => {
-                let what = Error::unsupported(self.shared.name, words(py, &e));
-                self.fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(what);
-                self.shared.raised.note(e);
-                None
-            }
-        })
-    }
-}
-
-/// An attribute that may be missing or None.
-fn optional<'py, T>(object: &Bound<'py, PyAny>, name: &str) -> PyResult<Option<T>>
-where
-    T: for<'a> FromPyObject<'a, 'py, Error: Into<PyErr>>,
-{
-    match object.getattr_opt(name)? {
-        Some(value) if !value.is_none() => value.extract().map(Some).map_err(Into::into),
-        _ => Ok(None),
-    }
-}
-
-/// `value` as an array of this number type.
-fn array<'py, R: Real + Element>(py: Python<'py>, value: &Bound<'py, PyAny>) -> PyResult<ArrayD<R>> {
-    let arguments = PyDict::new(py);
-    arguments.set_item("dtype", numpy::dtype::<R>(py))?;
-    let made = py.import("numpy")?.call_method("asarray", (value,), Some(&arguments))?;
-    let read: PyReadonlyArrayDyn<'_, R> = made.extract()?;
-    Ok(read.as_array().as_standard_layout().into_owned())
 }
 
 /// Channels of rows in Python's layout: `[row, channel]`.
 fn rows<'py, R: Real + Element>(py: Python<'py>, tile: Tile<'_, R>) -> PyResult<Bound<'py, PyAny>> {
     let channels = Array2::from_shape_vec((tile.width(), tile.rows), tile.data.to_vec());
-    let channels = channels.map_err(|e| crate::errors::broken(py, &e.to_string()))?;
+    let channels = channels.map_err(|e| broken(py, &e.to_string()))?;
     Ok(channels.reversed_axes().as_standard_layout().into_owned().into_pyarray(py).into_any())
 }
 
@@ -156,7 +112,7 @@ impl Shared {
             let flat = Array1::from(params[block.range()].to_vec()).into_pyarray(py);
             all.set_item(&block.name, flat.call_method1("reshape", (PyTuple::new(py, &block.shape)?,))?)?;
         }
-        self.object.setattr(py, "params", all)
+        self.of.object.setattr(py, "params", all)
     }
 
     fn forward_as_is<'py, R: Real + Element>(
@@ -166,13 +122,13 @@ impl Shared {
         x: Tile<'_, R>,
     ) -> PyResult<Bound<'py, PyAny>> {
         self.set(py, params)?;
-        self.object.bind(py).call_method1("forward", (rows(py, x)?,))
+        self.of.object.bind(py).call_method1("forward", (rows(py, x)?,))
     }
 
     /// `[row, channel]` for all of the object's channels.
     fn forward<R: Real + Element>(&self, py: Python<'_>, params: &[R], x: Tile<'_, R>) -> PyResult<Array2<R>> {
         let y = self.forward_as_is(py, params, x)?;
-        self.shaped(py, array(py, &y)?, [x.rows, self.width], "forward")
+        self.of.shaped(&y, &[x.rows, self.width], "forward")
     }
 
     /// `∂L/∂x`, `[row, 3]`, and the gradients of all parameters, concatenated.
@@ -185,38 +141,28 @@ impl Shared {
     ) -> PyResult<(Array2<R>, Vec<R>)> {
         self.set(py, params)?;
         let dy = dy.into_pyarray(py);
-        let found = self.object.bind(py).call_method1("backward", (rows(py, x)?, dy))?;
+        let found = self.of.object.bind(py).call_method1("backward", (rows(py, x)?, dy))?;
         let (dx, grads): (Bound<'_, PyAny>, Bound<'_, PyAny>) = found.extract()?;
-        let dx = self.shaped(py, array(py, &dx)?, [x.rows, INPUT], "backward")?;
+        let dx = self.of.shaped(&dx, &[x.rows, INPUT], "backward")?;
         let mut all = vec![];
         for block in &self.blocks {
-            let grad: ArrayD<R> = array(py, &grads.get_item(&block.name)?)?;
+            let grad: ArrayD<R> = array(&grads.get_item(&block.name)?)?;
             if grad.shape() != block.shape {
                 let what = format!("gradients of {} of shape {:?}", block.name, grad.shape());
-                return Err(self.wrong(py, "backward", what, format!("{:?}", block.shape)));
+                let wrong = Error::invalid(self.of.name, "backward", what, format!("{:?}", block.shape));
+                return Err(raised(py, &wrong));
             }
             all.extend(grad);
         }
         Ok((dx, all))
     }
-
-    fn shaped<R>(&self, py: Python<'_>, found: ArrayD<R>, want: [usize; 2], call: &str) -> PyResult<Array2<R>> {
-        let shape = found.shape().to_vec();
-        let fits = shape == want;
-        match found.into_dimensionality() {
-            Ok(array) if fits => Ok(array),
-            _ => Err(self.wrong(py, call, format!("an array of shape {shape:?}"), format!("{want:?}"))),
-        }
-    }
-
-    fn wrong(&self, py: Python<'_>, call: &str, found: String, expected: String) -> PyErr {
-        crate::errors::raised(py, &Error::invalid(self.name, call, found, expected))
-    }
 }
 
 impl<R: Real + Element> Kernel<R> for PythonEncoder {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        let Some(found) = self.call(|py| self.shared.forward(py, params, x)) else { return y.data.fill(R::ZERO) };
+        let Some(found) = self.shared.of.call(|py, _| self.shared.forward(py, params, x)) else {
+            return y.data.fill(R::ZERO);
+        };
         for (c, &place) in self.outputs.iter().enumerate() {
             let channel = &mut y.data[c * x.rows..(c + 1) * x.rows];
             channel.iter_mut().zip(found.column(place)).for_each(|(y, found)| *y = *found);
@@ -236,7 +182,7 @@ impl<R: Real + Element> Kernel<R> for PythonEncoder {
         for (c, &place) in self.outputs.iter().enumerate() {
             whole.column_mut(place).iter_mut().zip(dy.channel(c)).for_each(|(to, d)| *to = *d);
         }
-        let Some((found, all)) = self.call(|py| self.shared.backward(py, params, x, whole)) else {
+        let Some((found, all)) = self.shared.of.call(|py, _| self.shared.backward(py, params, x, whole)) else {
             return dx.into_iter().for_each(|dx| dx.data.fill(R::ZERO));
         };
         grads.values.iter_mut().zip(&all[grads.range]).for_each(|(sum, g)| *sum += *g);
@@ -274,20 +220,20 @@ impl Stage for PythonEncoder {
     }
 
     fn fault(&self) -> Result<()> {
-        self.fault.lock().unwrap_or_else(PoisonError::into_inner).take().map_or(Ok(()), Err)
+        self.shared.of.fault()
     }
 
     fn describe(&self) -> String {
         let (kept, all) = (self.outputs.len(), self.shared.width);
         let of = if kept == all { String::new() } else { format!(" of {all}") };
-        format!("{}: written in Python, {kept}{of} channels", self.shared.name)
+        format!("{}: written in Python, {kept}{of} channels", self.shared.of.name)
     }
 }
 
 impl Encoder for PythonEncoder {
     fn keep_outputs(&self, keep: &[usize]) -> Result<Reduced<dyn Encoder>> {
         let outputs = keep.iter().map(|&c| self.outputs[c]).collect();
-        let stage = Self { shared: self.shared.clone(), outputs, fault: Mutex::new(None) };
+        let stage = Self { shared: self.shared.clone(), outputs };
         Ok(Reduced { stage: Box::new(stage), params: vec![0..self.shared.first.len()], channels: (0..INPUT).collect() })
     }
 

@@ -1,6 +1,6 @@
 //! Positions of source, detector and voxels.
 
-use crate::arrays::{given_any, owned};
+use crate::arrays::{given, owned};
 use crate::errors::{OrRaise, raised};
 use conefield_core::Error;
 use conefield_core::error::ensure;
@@ -22,12 +22,6 @@ impl Geometry {
     fn checked(py: Python<'_>, geometry: geometry::Geometry) -> PyResult<Self> {
         geometry.validate("geometry").or_raise(py)?;
         Ok(Self(geometry))
-    }
-
-    fn array<'py>(&self, py: Python<'py>, of: impl Fn(&View) -> Vec<f64>) -> Bound<'py, PyArray2<f64>> {
-        let rows: Vec<Vec<f64>> = self.0.views.iter().map(of).collect();
-        let width = rows.first().map_or(0, Vec::len);
-        given_any(py, Array2::from_shape_fn((rows.len(), width), |(i, k)| rows[i][k]))
     }
 }
 
@@ -107,7 +101,8 @@ impl Geometry {
 
     #[getter]
     fn vectors<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
-        self.array(py, |v| [v.source, v.detector, v.u, v.v].concat())
+        let at = |v: &View, k: usize| [v.source, v.detector, v.u, v.v][k / 3][k % 3];
+        given(py, Array2::from_shape_fn((self.0.views.len(), VECTOR), |(i, k)| at(&self.0.views[i], k)))
     }
 
     #[getter]

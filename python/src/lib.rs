@@ -38,7 +38,7 @@ mod _native {
     #[pymodule_export]
     use crate::geometry::Geometry;
     #[pymodule_export]
-    use crate::operator::{backproject, project, project_scan};
+    use crate::operator::{apply, project_scan};
     #[pymodule_export]
     use crate::run::{evaluate, plan, pretrain, reconstruct};
     #[pymodule_export]

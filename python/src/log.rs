@@ -11,12 +11,10 @@ use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
 /// Forwards messages from the first call on. A program that already has a logger keeps it.
 pub fn start() {
     static ONCE: Once = Once::new();
-    ONCE.call_once(forward);
-}
-
-fn forward() {
-    let log = tracing_subscriber::registry().with(ToPython.with_filter(LevelFilter::INFO));
-    let _ = tracing::subscriber::set_global_default(log);
+    ONCE.call_once(|| {
+        let log = tracing_subscriber::registry().with(ToPython.with_filter(LevelFilter::INFO));
+        let _ = tracing::subscriber::set_global_default(log);
+    });
 }
 
 struct ToPython;

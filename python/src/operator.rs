@@ -5,7 +5,7 @@ use crate::arrays::{given, owned};
 use crate::geometry::Geometry;
 use crate::scan::Scan;
 use crate::volume::taken;
-use crate::work::without_lock;
+use crate::work::{Watch, without_lock};
 use conefield::memory::Memory;
 use conefield::projection;
 use conefield_core::error::ensure;
@@ -15,85 +15,52 @@ use conefield_core::voxel::{VoxelOperator, VoxelProjector};
 use conefield_core::{Error, Result};
 use conefield_evaluation::metrics;
 use ndarray::Array3;
-use numpy::{Element, PyArray3, PyReadonlyArray3};
+use numpy::{PyArray3, PyReadonlyArray3};
 use pyo3::prelude::*;
 use serde_json::Value;
 
-/// The direction.
-#[derive(Clone, Copy)]
-enum Way {
-    Forward,
-    Adjoint,
-}
-
-fn apply<R: Real>(
-    way: Way,
+/// `A·x`, or with `adjoint` `Aᵀ·x`.
+fn applied<R: Real>(
+    adjoint: bool,
     operator: &dyn VoxelOperator<R>,
     g: &geometry::Geometry,
     x: Array3<R>,
 ) -> Result<Array3<R>> {
     let [rows, columns] = g.detector;
     let (volume, views) = (g.volume.shape, [g.views.len(), rows, columns]);
-    let (from, to, what) = match way {
-        Way::Forward => (volume, views, "volume"),
-        Way::Adjoint => (views, volume, "projections"),
-    };
+    let (from, to, what) = if adjoint { (views, volume, "projections") } else { (volume, views, "volume") };
     let found = format!("{:?}", x.shape());
     ensure(x.shape() == from, what, "shape", found, format!("{from:?}, as the geometry has it"))?;
     let all: Vec<usize> = (0..g.views.len()).collect();
     let mut out = Array3::from_elem(to, R::ZERO);
-    match way {
-        Way::Forward => operator.forward(g, &all, x.view(), out.view_mut()),
-        Way::Adjoint => operator.adjoint(g, &all, x.view(), out.view_mut()),
+    if adjoint {
+        operator.adjoint(g, &all, x.view(), out.view_mut());
+    } else {
+        operator.forward(g, &all, x.view(), out.view_mut());
     }
     operator.fault()?;
     Ok(out)
 }
 
-fn run<'py>(
+/// `A·x`, or with `adjoint` `Aᵀ·x`, in the precision of `array`.
+#[pyfunction]
+pub fn apply<'py>(
     py: Python<'py>,
-    way: Way,
     geometry: &Bound<'py, Geometry>,
     projector: &str,
     array: &Bound<'py, PyAny>,
+    adjoint: bool,
 ) -> PyResult<Bound<'py, PyAny>> {
-    fn of<'py, R: Real + Element>(
-        py: Python<'py>,
-        x: &PyReadonlyArray3<'py, R>,
-        work: impl FnOnce(Array3<R>) -> Result<Array3<R>> + Send,
-    ) -> PyResult<Bound<'py, PyAny>> {
-        let x = owned(x);
-        Ok(given(py, without_lock(py, |_| work(x))?).into_any())
-    }
     let projector: Value = arguments::read(py, projector)?;
     let g = &geometry.get().0;
     if let Ok(double) = array.extract::<PyReadonlyArray3<'_, f64>>() {
-        return of(py, &double, |x| apply(way, projection::projector(projector)?.reference(), g, x));
+        let x = owned(&double);
+        let work = |_: &Watch| applied(adjoint, projection::projector(projector)?.reference(), g, x);
+        return Ok(given(py, without_lock(py, work)?).into_any());
     }
-    let single: PyReadonlyArray3<'_, f32> = array.extract()?;
-    of(py, &single, |x| apply(way, projection::projector(projector)?.operator(), g, x))
-}
-
-/// `A·x`, in the precision of `volume`.
-#[pyfunction]
-pub fn project<'py>(
-    py: Python<'py>,
-    geometry: &Bound<'py, Geometry>,
-    projector: &str,
-    volume: &Bound<'py, PyAny>,
-) -> PyResult<Bound<'py, PyAny>> {
-    run(py, Way::Forward, geometry, projector, volume)
-}
-
-/// `Aᵀ·y`, in the precision of `projections`.
-#[pyfunction]
-pub fn backproject<'py>(
-    py: Python<'py>,
-    geometry: &Bound<'py, Geometry>,
-    projector: &str,
-    projections: &Bound<'py, PyAny>,
-) -> PyResult<Bound<'py, PyAny>> {
-    run(py, Way::Adjoint, geometry, projector, projections)
+    let x = owned(&array.extract::<PyReadonlyArray3<'_, f32>>()?);
+    let work = |_: &Watch| applied(adjoint, projection::projector(projector)?.operator(), g, x);
+    Ok(given(py, without_lock(py, work)?).into_any())
 }
 
 /// Predicted views of `scan` for a volume in 1/unit of the scan; with `residual` measured minus predicted ones. An array

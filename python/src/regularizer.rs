@@ -1,25 +1,20 @@
 //! A regularizer implemented by a Python object: a proximal map, or a denoiser in its place.
 
-use crate::stages::Raised;
+use crate::stages::{StageObject, optional};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::regularizer::{Penalty, Regularizer, Weight};
 use conefield_core::space::Space;
 use conefield_core::{Error, Result};
 use ndarray::{Array3, ArrayView3};
-use numpy::{IntoPyArray, PyReadonlyArray3};
+use numpy::IntoPyArray;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 struct Shared {
-    name: &'static str,
-    object: Py<PyAny>,
-    /// One call at a time: the spacing is set on the object before it. Acquired before the GIL, never after.
-    turn: Mutex<()>,
+    of: StageObject,
     weight: Weight,
     /// Whether the object can evaluate its penalty.
     has_value: bool,
-    raised: Arc<Raised>,
 }
 
 /// A regularizer of a Python object.
@@ -27,12 +22,9 @@ pub struct PythonRegularizer(Arc<Shared>);
 
 impl PythonRegularizer {
     /// The outer error is an exception of the object.
-    pub fn new(py: Python<'_>, name: &'static str, object: Py<PyAny>, raised: Arc<Raised>) -> PyResult<Result<Self>> {
-        let own = object.bind(py);
-        let number = |key: &str| -> PyResult<Option<f64>> {
-            own.getattr_opt(key)?.filter(|v| !v.is_none()).map(|v| v.extract()).transpose()
-        };
-        let weight = match (number("weight")?, number("noise_weight")?) {
+    pub fn new(py: Python<'_>, of: StageObject) -> PyResult<Result<Self>> {
+        let own = of.object.bind(py);
+        let weight = match (optional(own, "weight")?, optional(own, "noise_weight")?) {
             (Some(_), Some(_)) => {
                 let expected = "one of them: weight is λ itself, noise_weight counts in the scan's noise";
                 return Ok(Err(Error::invalid("spec", "weight", "noise_weight beside it", expected)));
@@ -47,7 +39,7 @@ impl PythonRegularizer {
             return Ok(Err(Error::invalid("spec", "prox", "no such method", "prox(v, tau), an array like v")));
         }
         let has_value = own.hasattr("value")?;
-        Ok(Ok(Self(Arc::new(Shared { name, object, turn: Mutex::new(()), weight, has_value, raised }))))
+        Ok(Ok(Self(Arc::new(Shared { of, weight, has_value }))))
     }
 }
 
@@ -64,7 +56,7 @@ impl Regularizer for PythonRegularizer {
 
     fn describe(&self) -> String {
         let kind = if self.0.has_value { "a proximal map" } else { "a denoiser" };
-        format!("{}: {kind} written in Python, weight {}", self.0.name, self.0.weight)
+        format!("{}: {kind} written in Python, weight {}", self.0.of.name, self.0.weight)
     }
 }
 
@@ -77,14 +69,9 @@ struct On {
 impl On {
     /// Runs `call` with the GIL, one at a time; `None` if it or another stage has failed.
     fn call<T>(&self, call: impl FnOnce(Python<'_>, &Bound<'_, PyAny>) -> PyResult<T>) -> Option<T> {
-        if self.shared.raised.any() {
-            return None;
-        }
-        let _turn = self.shared.turn.lock().unwrap_or_else(PoisonError::into_inner);
-        Python::attach(|py| {
-            let object = self.shared.object.bind(py);
-            let called = object.setattr("spacing", self.grid.spacing).and_then(|()| call(py, object));
-            called.map_err(|e| self.shared.raised.note(e)).ok()
+        self.shared.of.call(|py, object| {
+            object.setattr("spacing", self.grid.spacing)?;
+            call(py, object)
         })
     }
 
@@ -93,16 +80,7 @@ impl On {
         let v = v.iter().map(|&v| if v == f32::MIN { 0.0 } else { v }).collect();
         let v = Array3::from_shape_vec(self.grid.shape, v).map_err(|e| crate::errors::broken(py, &e.to_string()))?;
         let found = object.call_method1("prox", (v.into_pyarray(py), tau))?;
-        let arguments = PyDict::new(py);
-        arguments.set_item("dtype", numpy::dtype::<f32>(py))?;
-        let found = py.import("numpy")?.call_method("asarray", (found,), Some(&arguments))?;
-        let shape: Vec<usize> = found.getattr("shape")?.extract()?;
-        if shape != self.grid.shape {
-            let (found, expected) = (format!("an array of shape {shape:?}"), format!("{:?}", self.grid.shape));
-            return Err(crate::errors::raised(py, &Error::invalid(self.shared.name, "prox", found, expected)));
-        }
-        let found: PyReadonlyArray3<'_, f32> = found.extract()?;
-        Ok(found.as_array().as_standard_layout().into_owned())
+        self.shared.of.shaped(&found, &self.grid.shape, "prox")
     }
 }
 

@@ -5,7 +5,7 @@ use crate::arrays::plain;
 use crate::field::{Field, collect};
 use crate::scan::Scan;
 use crate::specs::SpecArgument;
-use crate::volume::{made, taken, taken_if};
+use crate::volume::{made, taken};
 use crate::work::{Callback, Progress, Watch, without_lock};
 use conefield::explain::Explanation;
 use conefield::input::{self, Input};
@@ -74,13 +74,7 @@ impl Wanted {
         watch: &Watch,
         begin: Instant,
     ) -> Result<Run<'a>> {
-        ensure(
-            self.peak.is_none_or(|p| p > 0.0 && p.is_finite()),
-            "arguments",
-            "peak",
-            self.peak.unwrap_or(0.0),
-            "a number above 0",
-        )?;
+        let peak = arguments::peak(self.peak)?;
         let held = arguments::held_out(self.hold_out.as_ref(), scan.geometry.views.len())?;
         if let Some(reference) = &reference {
             input::check_reference("reference", reference, &scan)?;
@@ -98,7 +92,7 @@ impl Wanted {
             seed: self.seed,
         };
         let session = Session::open(request, backend, memory, begin)?;
-        let mut run = session.plan(Input::new(scan, held, reference, self.peak)?, 0.0, &|| watch.cancelled())?;
+        let mut run = session.plan(Input::new(scan, held, reference, peak)?, 0.0, &|| watch.cancelled())?;
         let plan = run.method.plan.as_mut();
         let starts = match plan.links() {
             [first, ..] => first.starts_from_volume(),
@@ -107,11 +101,6 @@ impl Wanted {
         let name = format!("a volume for {}, which starts from none", run.method.loaded.spec.name);
         ensure(start.is_none() || starts, "arguments", "init", name, "a method that starts from a volume")?;
         Ok(run)
-    }
-
-    /// The reference of a run on `scan`.
-    fn reference(&self, scan: &Scan, given: Option<Volume>) -> Result<Option<Volume>> {
-        if self.truth { scan.reference().map(Some) } else { Ok(given) }
     }
 }
 
@@ -178,12 +167,13 @@ pub fn reconstruct<'py>(
 ) -> PyResult<Reconstructed<'py>> {
     let begin = Instant::now();
     let wanted: Wanted = arguments::read(py, wanted)?;
-    let (start, reference, function) = (taken_if(start)?, taken_if(reference)?, callback(function));
+    let [start, reference] = [start, reference].map(|v| v.map(taken).transpose());
+    let (start, reference, function) = (start?, reference?, callback(function));
     let scan = scan.get();
     let (volume, record, field) = without_lock(py, |watch| {
         let backend =
             arguments::backend(&wanted.backend)?.open_for_run(arguments::seconds("budget", wanted.budget.as_ref())?)?;
-        let reference = wanted.reference(scan, reference)?;
+        let reference = if wanted.truth { Some(scan.reference()?) } else { reference };
         let given = reference.as_ref().map(|_| wanted.truth);
         let mut run = wanted.planned(scan.scan.clone(), reference, start.as_ref(), backend.as_ref(), watch, begin)?;
         let mut progress = Progress::new(watch, function);
@@ -267,14 +257,7 @@ pub fn evaluate<'py>(
             let [a, b] = [label_map(a.0, a.1.data.view())?, label_map(b.0, b.1.data.view())?];
             return Ok(json!({ "dice": dice(a.view(), b.view())? }));
         }
-        ensure(
-            peak.is_none_or(|p| p > 0.0 && p.is_finite()),
-            "arguments",
-            "peak",
-            peak.unwrap_or(0.0),
-            "a number above 0",
-        )?;
-        let peak = score::peak(peak, &reference);
+        let peak = score::peak(arguments::peak(peak)?, &reference);
         let mut all = json!(score::score("the volume", &volume, &reference, peak)?);
         all["peak"] = peak.into();
         Ok(all)

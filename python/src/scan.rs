@@ -6,7 +6,7 @@ use crate::geometry::Geometry;
 use crate::volume::{made, taken};
 use crate::work::without_lock;
 use conefield::memory::Memory;
-use conefield::parse::{self, AnglesOption};
+use conefield::parse;
 use conefield::simulation::{self, Changes};
 use conefield::{files, input};
 use conefield_core::error::ensure;
@@ -24,8 +24,16 @@ pub struct Scan {
     pub scan: Arc<scan::Scan>,
     /// The path it was read from.
     pub path: Option<PathBuf>,
-    /// The volume it was simulated from.
-    truth: Option<Volume>,
+    truth: Truth,
+}
+
+/// The volume that a scan was simulated from.
+#[derive(Clone)]
+enum Truth {
+    Unknown,
+    Known(Arc<Volume>),
+    /// That of the scan at this path, if it has one.
+    Of(PathBuf),
 }
 
 impl Scan {
@@ -36,10 +44,10 @@ impl Scan {
 
     /// The volume it was simulated from, if known; read from the scan's files if necessary.
     pub fn truth(&self) -> conefield_core::Result<Option<Volume>> {
-        match (&self.truth, &self.path) {
-            (Some(truth), _) => Ok(Some(truth.clone())),
-            (None, Some(path)) => conefield_io::read_truth(path),
-            (None, None) => Ok(None),
+        match &self.truth {
+            Truth::Known(truth) => Ok(Some(Volume::clone(truth))),
+            Truth::Of(path) => conefield_io::read_truth(path),
+            Truth::Unknown => Ok(None),
         }
     }
 
@@ -68,7 +76,7 @@ impl Scan {
         let provenance = serde_json::json!({ "made": "in Python" });
         let scan = scan::Scan { geometry, projections, unit: Unit { name, mm }, provenance };
         without_lock(py, |_| scan.validate("scan"))?;
-        Ok(Self { scan: Arc::new(scan), path: None, truth: None })
+        Ok(Self { scan: Arc::new(scan), path: None, truth: Truth::Unknown })
     }
 
     /// The line integrals, without copying.
@@ -129,7 +137,7 @@ pub fn read_scan(py: Python<'_>, path: PathBuf) -> PyResult<Scan> {
         Memory::of_views(&conefield_io::scan_size(&path)?).check(|_| vec![])?;
         files::scan(&path)
     })?;
-    Ok(Scan { scan: Arc::new(scan), path: Some(path), truth: None })
+    Ok(Scan { scan: Arc::new(scan), path: Some(path.clone()), truth: Truth::Of(path) })
 }
 
 /// Writes a scan to a folder in conefield's own format.
@@ -185,7 +193,7 @@ pub fn simulate(
             views: wanted.views,
             detector: wanted.detector,
             offset: wanted.offset,
-            angles: angles as Option<AnglesOption>,
+            angles,
             noise,
             seed: wanted.seed,
         };
@@ -194,5 +202,6 @@ pub fn simulate(
         let (scan, truth) = simulation::scan(volume, values, &protocol, &wanted.source)?;
         Ok((scan, Some(truth)))
     })?;
+    let truth = truth.map_or(Truth::Unknown, |truth| Truth::Known(Arc::new(truth)));
     Ok(Scan { scan: Arc::new(scan), path: None, truth })
 }

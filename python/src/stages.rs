@@ -1,6 +1,7 @@
 //! Stages written in Python: registered under a name, built if a spec names them, tested by the conformance kit.
 
 use crate::arguments;
+use crate::arrays::owned;
 use crate::encoder::PythonEncoder;
 use crate::errors::{OrRaise, raised as exception};
 use crate::regularizer::PythonRegularizer;
@@ -11,6 +12,8 @@ use conefield_core::regularizer::{Regularizer, RegularizerSpec};
 use conefield_core::settings::EncoderSpec;
 use conefield_core::stage::Encoder;
 use conefield_core::{Error, Result};
+use ndarray::{Array, ArrayD, Dimension};
+use numpy::{Element, PyReadonlyArrayDyn};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::{Value, json};
@@ -61,6 +64,79 @@ pub fn within<T>(raised: &Arc<Raised>, work: impl FnOnce() -> T) -> T {
     let done = work();
     CURRENT.set(before);
     done
+}
+
+/// The object of a stage, under the name of its type.
+pub struct StageObject {
+    pub name: &'static str,
+    pub object: Py<PyAny>,
+    /// One call at a time: attributes are set on the object before it. Acquired before the GIL, never after.
+    turn: Mutex<()>,
+    raised: Arc<Raised>,
+}
+
+impl StageObject {
+    /// An object whose exceptions are those of the current thread's work.
+    fn new(name: &'static str, object: Py<PyAny>) -> Self {
+        Self { name, object, turn: Mutex::new(()), raised: CURRENT.with_borrow(Arc::clone) }
+    }
+
+    /// Runs `call` with the GIL, one at a time; `None` if it or another stage has failed.
+    pub fn call<T>(&self, call: impl FnOnce(Python<'_>, &Bound<'_, PyAny>) -> PyResult<T>) -> Option<T> {
+        if self.raised.any() {
+            return None;
+        }
+        let _turn = locked(&self.turn);
+        Python::attach(|py| call(py, self.object.bind(py)).map_err(|e| self.raised.note(e)).ok())
+    }
+
+    /// The exception of a failed call as an error.
+    pub fn fault(&self) -> Result<()> {
+        if !self.raised.any() {
+            return Ok(());
+        }
+        Python::attach(|py| match &*locked(&self.raised.0) {
+            Some(e) => Err(Error::unsupported(self.name, words(py, e))),
+            None => Ok(()),
+        })
+    }
+
+    /// The array that `call` has returned. Refuses a shape other than `want`.
+    pub fn shaped<R: Element + Clone, D: Dimension>(
+        &self,
+        found: &Bound<'_, PyAny>,
+        want: &[usize],
+        call: &str,
+    ) -> PyResult<Array<R, D>> {
+        let found = array::<R>(found)?;
+        let shape = found.shape().to_vec();
+        match found.into_dimensionality() {
+            Ok(array) if shape == want => Ok(array),
+            _ => {
+                let (found, expected) = (format!("an array of shape {shape:?}"), format!("{want:?}"));
+                Python::attach(|py| Err(exception(py, &Error::invalid(self.name, call, found, expected))))
+            }
+        }
+    }
+}
+
+/// An attribute that may be missing or None.
+pub fn optional<'py, T>(object: &Bound<'py, PyAny>, name: &str) -> PyResult<Option<T>>
+where
+    T: for<'a> FromPyObject<'a, 'py, Error: Into<PyErr>>,
+{
+    match object.getattr_opt(name)? {
+        Some(value) if !value.is_none() => value.extract().map(Some).map_err(Into::into),
+        _ => Ok(None),
+    }
+}
+
+/// `value` as an array of this number type.
+pub fn array<R: Element + Clone>(value: &Bound<'_, PyAny>) -> PyResult<ArrayD<R>> {
+    let (py, arguments) = (value.py(), PyDict::new(value.py()));
+    arguments.set_item("dtype", numpy::dtype::<R>(py))?;
+    let made = py.import("numpy")?.call_method("asarray", (value,), Some(&arguments))?;
+    Ok(owned(&made.extract::<PyReadonlyArrayDyn<'_, R>>()?))
 }
 
 /// The kind of a stage.
@@ -143,8 +219,8 @@ impl Registered for Written {
 
 impl EncoderSpec for Written {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        let object = self.object(Kind::Encoder)?;
-        Python::attach(|py| match PythonEncoder::new(py, self.name, object, CURRENT.with_borrow(Arc::clone)) {
+        let of = StageObject::new(self.name, self.object(Kind::Encoder)?);
+        Python::attach(|py| match PythonEncoder::new(py, of) {
             Ok(encoder) => Ok(Box::new(encoder?) as Box<dyn Encoder>),
             Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
         })
@@ -153,8 +229,8 @@ impl EncoderSpec for Written {
 
 impl RegularizerSpec for Written {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
-        let object = self.object(Kind::Regularizer)?;
-        Python::attach(|py| match PythonRegularizer::new(py, self.name, object, CURRENT.with_borrow(Arc::clone)) {
+        let of = StageObject::new(self.name, self.object(Kind::Regularizer)?);
+        Python::attach(|py| match PythonRegularizer::new(py, of) {
             Ok(regularizer) => Ok(Box::new(regularizer?) as Box<dyn Regularizer>),
             Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
         })

@@ -27,11 +27,6 @@ pub fn taken(volume: &Bound<'_, PyAny>) -> PyResult<Volume> {
     Ok(Volume { data: owned(&data), grid, affine })
 }
 
-/// As [`taken`], for an optional argument.
-pub fn taken_if(volume: Option<&Bound<'_, PyAny>>) -> PyResult<Option<Volume>> {
-    volume.map(taken).transpose()
-}
-
 /// Converts to a `conefield.Volume`.
 pub fn made<'py>(py: Python<'py>, volume: Volume) -> PyResult<Bound<'py, PyAny>> {
     let Volume { data, grid, affine } = volume;

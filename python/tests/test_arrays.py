@@ -93,6 +93,8 @@ def test_scans_are_read_only_and_come_back(scan, tmp_path):
     np.testing.assert_array_equal(made.projections, kept)
     one, two = made.split([1, 5])
     assert (len(one), len(two)) == (14, 2)
+    for part in back.split([1, 5]):
+        np.testing.assert_array_equal(part.truth.data, scan.truth.data)
 
 
 def test_a_scan_outlives_its_name():

@@ -86,7 +86,7 @@ impl ReportArgs {
         }
         page.volumes = results.into_iter().flatten().chain(named(references)).collect();
         if let [_] = &page.runs[..] {
-            page.beside = (1..page.volumes.len()).find(|i| page.volumes[*i].is_reference());
+            page.beside = (1..page.volumes.len()).find(|i| page.volumes[*i].reference);
         }
         page.spreads = runs::spreads(&self.runs)?;
         page.title = runs::title(&page);
@@ -107,7 +107,7 @@ impl ReportArgs {
     fn summarize(&self, page: &Page, coarser: usize, bytes: u64) -> Result<()> {
         let views: Vec<usize> = page.scans.iter().flat_map(|s| s.views.iter().map(|v| v.view)).collect();
         if self.json {
-            let volumes = page.volumes.iter().map(|v| json!({ "name": v.name(), "shape": v.shape() }));
+            let volumes = page.volumes.iter().map(|v| json!({ "name": v.name, "shape": v.shape }));
             return out::json(&json!({
                 "page": self.output.display().to_string(), "bytes": bytes, "runs": page.runs.iter().map(|r| &r.name).collect::<Vec<_>>(),
                 "volumes": volumes.collect::<Vec<_>>(), "coarser": coarser, "views": views,
@@ -154,9 +154,11 @@ pub fn standing(folder: &Path, seconds: u64) -> Result<String> {
 /// References with names that distinguish them.
 fn named(references: Vec<(PathBuf, PageVolume)>) -> impl Iterator<Item = PageVolume> {
     let several = references.len() > 1;
-    references.into_iter().map(move |(path, r)| match several {
-        true => r.named(&format!("{} {}", scans::REFERENCE, path.display())),
-        false => r,
+    references.into_iter().map(move |(path, mut reference)| {
+        if several {
+            reference.name = format!("{} {}", scans::REFERENCE, path.display());
+        }
+        reference
     })
 }
 

@@ -352,7 +352,7 @@ impl Work<'_> {
     }
 
     /// The outcomes of all runs, after all have ended; draws the pictures.
-    fn report(&self) -> Result<StudyReport> {
+    fn report(&self) -> Result<StudyReport<'_>> {
         let outcome = |c: &Cell| match self.failure(c) {
             Some(error) => Ok((*c, Outcome::failed(error))),
             None => Outcome::of_run(&self.run(c)).map(|o| (*c, o)),
@@ -369,7 +369,7 @@ impl Work<'_> {
             cases.push(CaseRecord::new(&c.name, &c.source, &input));
             self.draw(case, &input, &outcomes)?;
         }
-        StudyReport::new(self.study, &self.layout, cases, outcomes)
+        Ok(StudyReport::new(self.study, &self.layout, cases, outcomes))
     }
 
     /// Draws the results on a case: slices with the first seed, curves of all.

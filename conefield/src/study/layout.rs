@@ -74,12 +74,11 @@ impl Layout<'_> {
 
     /// Refuses a folder with files that no study writes. Returns whether it contains a study.
     pub fn look(&self) -> Result<bool> {
-        let place = self.0.display().to_string();
         // Unfinished files do not count.
         let counts = |path: &PathBuf| !path.file_name().is_some_and(conefield_io::is_unfinished);
         let any = CONTENTS.entries(self.0)?.iter().any(counts);
         // Only a folder with a study's file may be removed with its content.
-        let marked = !any || self.study().is_file();
+        let (marked, place) = (!any || self.study().is_file(), self.0.display().to_string());
         ensure(marked, &place, "output", format!("a folder without {STUDY}"), "a new or empty folder, or a study's")?;
         Ok(any)
     }

@@ -6,21 +6,26 @@ use conefield_core::error::ensure;
 use conefield_core::method::Plan;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
+use serde::Serialize;
 use std::path::Path;
 
 /// A spec with changed settings.
+#[derive(Serialize)]
 pub struct Method {
     /// Its name.
     pub name: String,
     /// Value of `--spec`.
     pub spec: String,
     /// Values of `--set`.
+    #[serde(rename = "set")]
     pub sets: Vec<String>,
     /// Value of `--init`.
     pub init: Option<String>,
     /// The parsed spec.
+    #[serde(skip)]
     pub loaded: Loaded,
     /// The plan.
+    #[serde(skip)]
     pub plan: Box<dyn Plan>,
 }
 

@@ -1,24 +1,27 @@
 //! The outcome of a run, and its table columns.
 
-use crate::score::{SCORES, score_cells};
+use crate::score::SCORES;
+use crate::tradeoff::json::read_json;
 use crate::tradeoff::trial::Figures;
 use conefield_core::Result;
 use conefield_evaluation::report::text::{bytes, number};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// How a run ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Status {
     /// With a result.
     Done,
+    /// In a search: the budget was too short to do anything.
+    TooShort,
     /// Without a result.
     Failed,
 }
 
 /// The outcome of a run.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Outcome {
     /// How it ended.
     pub status: Status,
@@ -32,7 +35,8 @@ pub struct Outcome {
 impl Outcome {
     /// The outcome of the finished run in `folder`.
     pub fn of_run(folder: &Path) -> Result<Self> {
-        Ok(Self { status: Status::Done, error: None, figures: Some(Figures::of_run(folder)?) })
+        let figures = read_json(&folder.join("record.json"))?;
+        Ok(Self { status: Status::Done, error: None, figures: Some(figures) })
     }
 
     /// The outcome of a failed run.
@@ -41,58 +45,75 @@ impl Outcome {
     }
 }
 
-/// Table columns for the quality of a result: scores if there is a reference, else the error of held-out views, else
-/// the loss, which is the least informative.
-#[derive(Debug, Clone, Copy)]
-pub struct Columns {
-    /// Whether there is a reference.
-    pub scores: bool,
-    /// Whether there are held-out views.
-    pub held_out: bool,
-    /// Whether the loss is the only measure.
-    pub loss: bool,
+/// A column of tables: a figure of runs.
+pub(super) struct Column {
+    /// The figure's name in `record.json`.
+    pub key: &'static str,
+    pub head: &'static str,
+    /// The figure of a run.
+    pub of: fn(&Figures) -> Option<f64>,
+    pub shown: fn(f64) -> String,
 }
+
+/// Quality, then time and memory.
+pub(super) const COLUMNS: [Column; 10] = [
+    Column { key: "psnr", head: SCORES[0], of: Figures::psnr, shown: two },
+    Column { key: "ssim_2d", head: SCORES[1], of: |f| f.score("ssim_2d"), shown: four },
+    Column { key: "ssim_3d", head: SCORES[2], of: |f| f.score("ssim_3d"), shown: four },
+    Column { key: "ssim_skimage", head: SCORES[3], of: |f| f.score("ssim_skimage"), shown: four },
+    Column { key: "held_out", head: "held-out error", of: |f| f.held_out, shown: |x| format!("{x:.3e}") },
+    Column { key: "loss", head: "loss", of: |f| f.loss, shown: |x| format!("{x:.3e}") },
+    Column { key: "steps", head: "steps or passes", of: |f| Some(f.steps as f64), shown: |x| number(x.round() as u64) },
+    Column { key: "train_s", head: "solve time, s", of: |f| Some(f.train_s), shown: two },
+    Column { key: "total_s", head: "total time, s", of: |f| Some(f.total_s), shown: two },
+    Column {
+        key: "peak_bytes",
+        head: "peak memory",
+        of: |f| f.peak_bytes.map(|b| b as f64),
+        shown: |x| bytes(x as u64),
+    },
+];
+
+fn two(x: f64) -> String {
+    format!("{x:.2}")
+}
+
+fn four(x: f64) -> String {
+    format!("{x:.4}")
+}
+
+/// The columns of a table of runs: scores if there is a reference, else the error of held-out views, else the loss, which
+/// is the least informative; then time and memory.
+pub struct Columns(Vec<&'static Column>);
 
 impl Columns {
     /// The columns for runs with a reference, or with held-out views.
     pub fn of(scores: bool, held_out: bool) -> Self {
-        Self { scores, held_out, loss: !scores && !held_out }
+        let wanted = |c: &&Column| match c.key {
+            "held_out" => held_out,
+            "loss" => !scores && !held_out,
+            "steps" | "train_s" | "total_s" | "peak_bytes" => true,
+            _ => scores,
+        };
+        Self(COLUMNS.iter().filter(wanted).collect())
     }
 
-    /// The headings: quality, then time and memory.
+    /// The headings.
     pub fn heads(&self) -> Vec<&'static str> {
-        let mut heads = vec![];
-        heads.extend(SCORES.iter().filter(|_| self.scores));
-        heads.extend(self.held_out.then_some("held-out error"));
-        heads.extend(self.loss.then_some("loss"));
-        heads.extend(["steps or passes", "solve time, s", "total time, s", "peak memory"]);
-        heads
+        self.0.iter().map(|c| c.head).collect()
     }
 
     /// The cells below the headings; mostly empty for a failed run.
     pub fn cells(&self, outcome: &Outcome) -> Vec<String> {
         let Some(figures) = &outcome.figures else {
-            return (0..self.heads().len()).map(|c| if c == 0 { "failed" } else { "-" }.to_owned()).collect();
+            return (0..self.0.len()).map(|c| if c == 0 { "failed" } else { "-" }.to_owned()).collect();
         };
-        let mut cells = vec![];
-        if self.scores {
-            let ssims = ["ssim_2d", "ssim_3d", "ssim_skimage"].map(|name| figures.score(name));
-            cells.extend(match figures.psnr() {
-                Some(psnr) => score_cells(psnr, ssims),
-                None => std::array::from_fn(|_| "-".to_owned()),
-            });
-        }
-        cells.extend(self.held_out.then(|| figure(figures.held_out)));
-        cells.extend(self.loss.then(|| figure(figures.loss)));
-        cells.push(number(figures.steps));
-        cells.extend([figures.train_s, figures.total_s].map(|s| format!("{s:.2}")));
-        cells.push(figures.peak_bytes.map_or("-".into(), bytes));
-        cells
+        let shown = |c: &Column, x: f64| match c.key {
+            "held_out" | "loss" => format!("{x:.4e}"),
+            _ => (c.shown)(x),
+        };
+        self.0.iter().map(|c| (c.of)(figures).map_or("-".into(), |x| shown(c, x))).collect()
     }
-}
-
-fn figure(x: Option<f64>) -> String {
-    x.map_or("-".into(), |x| format!("{x:.4e}"))
 }
 
 #[cfg(test)]
@@ -102,20 +123,7 @@ mod tests {
     #[test]
     fn an_equal_result_has_no_number_for_its_psnr() {
         let scores = serde_json::json!({ "psnr": null, "ssim_2d": 1.0, "ssim_3d": null, "ssim_skimage": 1.0 });
-        let figures = Figures {
-            steps: 1,
-            train_s: 1.0,
-            export_s: 0.5,
-            total_s: 2.0,
-            peak_bytes: None,
-            threads: 2,
-            parameters: 0,
-            samples: 0,
-            samples_per_s: None,
-            loss: None,
-            held_out: None,
-            scores: Some(scores),
-        };
+        let figures = Figures { steps: 1, train_s: 1.0, total_s: 2.0, scores: Some(scores), ..Figures::default() };
         let outcome = Outcome { status: Status::Done, error: None, figures: Some(figures) };
         let shown = Columns::of(true, true).cells(&outcome);
         assert_eq!(shown, ["inf", "1.0000", "-", "1.0000", "-", "1", "1.00", "2.00", "-"]);

@@ -45,7 +45,7 @@ pub fn slices(
             return Ok(false);
         }
         (Some(r), _) => compare_png(path, ("reference", r), &panels, window.unwrap_or_else(|| r.window()))?,
-        (None, Some((_, first))) => slices_png(path, &panels, window.unwrap_or_else(|| first.window()), None)?,
+        (None, Some((_, first))) => slices_png(path, &panels, window.unwrap_or_else(|| first.window()))?,
     }
     Ok(true)
 }

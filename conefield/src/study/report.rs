@@ -3,45 +3,37 @@
 use crate::machine::Machine;
 use crate::study::definition::{Cell, Protocol, Source, Study};
 use crate::study::layout::{Layout, group};
-use crate::study::outcome::{Columns, Outcome};
+use crate::study::method::Method;
+use crate::study::outcome::{COLUMNS, Column, Columns, Outcome};
 use crate::study::spread::Spread;
-use crate::tradeoff::json::{read_json, to_json};
+use crate::tradeoff::json::to_json;
 use crate::tradeoff::statistics::mean;
-use crate::tradeoff::trial::{Figures, TrialInput};
+use crate::tradeoff::trial::TrialInput;
 use conefield_core::Result;
 use conefield_evaluation::report::Table;
-use conefield_evaluation::report::text::{bytes, number};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The content of `table.json`.
 #[derive(Serialize)]
-pub struct StudyReport {
+pub struct StudyReport<'a> {
     version: &'static str,
     /// The commit of the build, if the builder set it.
     commit: Option<&'static str>,
-    name: String,
-    description: String,
+    name: &'a str,
+    description: &'a str,
     /// The complete study file.
-    study: String,
-    seeds: Vec<u64>,
-    protocol: Protocol,
-    baseline: Option<String>,
-    methods: Vec<MethodRecord>,
+    study: &'a str,
+    seeds: &'a [u64],
+    protocol: &'a Protocol,
+    baseline: Option<&'a str>,
+    methods: &'a [Method],
     cases: Vec<CaseRecord>,
     /// All runs.
     runs: Vec<RunLine>,
     /// Statistics over the seeds for each case and method.
     summary: Vec<Line>,
-}
-
-#[derive(Serialize)]
-struct MethodRecord {
-    name: String,
-    spec: String,
-    set: Vec<String>,
-    init: Option<String>,
 }
 
 /// The data of a comparison.
@@ -128,97 +120,30 @@ struct Line {
 /// Name of the mean over all cases.
 const ALL: &str = "all";
 
-/// A figure of a run.
-type Figure = fn(&Figures) -> Option<f64>;
-
-/// The figures that are averaged.
-const FIGURES: [(&str, Figure); 10] = [
-    ("psnr", Figures::psnr),
-    ("ssim_2d", |f| f.score("ssim_2d")),
-    ("ssim_3d", |f| f.score("ssim_3d")),
-    ("ssim_skimage", |f| f.score("ssim_skimage")),
-    ("held_out", |f| f.held_out),
-    ("loss", |f| f.loss),
-    ("steps", |f| Some(f.steps as f64)),
-    ("train_s", |f| Some(f.train_s)),
-    ("total_s", |f| Some(f.total_s)),
-    ("peak_bytes", |f| f.peak_bytes.map(|b| b as f64)),
-];
-
-/// A column of the Markdown table.
-struct Column {
-    key: &'static str,
-    head: &'static str,
-    shown: fn(f64) -> String,
-}
-
-const COLUMNS: [Column; 10] = [
-    Column { key: "psnr", head: "PSNR dB", shown: two },
-    Column { key: "ssim_2d", head: "ssim_2d", shown: four },
-    Column { key: "ssim_3d", head: "ssim_3d", shown: four },
-    Column { key: "ssim_skimage", head: "ssim_skimage", shown: four },
-    Column { key: "held_out", head: "held-out error", shown: |x| format!("{x:.3e}") },
-    Column { key: "loss", head: "loss", shown: |x| format!("{x:.3e}") },
-    Column { key: "steps", head: "steps or passes", shown: |x| number(x.round() as u64) },
-    Column { key: "train_s", head: "solve time, s", shown: two },
-    Column { key: "total_s", head: "total time, s", shown: two },
-    Column { key: "peak_bytes", head: "peak memory", shown: |x| bytes(x as u64) },
-];
-
-fn two(x: f64) -> String {
-    format!("{x:.2}")
-}
-
-fn four(x: f64) -> String {
-    format!("{x:.4}")
-}
-
-/// The machine of a run, from its record.
-fn machine(run: &Path) -> Result<Option<Machine>> {
-    #[derive(Deserialize)]
-    struct Known {
-        #[serde(default)]
-        machine: Option<Machine>,
-    }
-    read_json::<Known>(&run.join("record.json")).map(|k| k.machine)
-}
-
-impl StudyReport {
+impl<'a> StudyReport<'a> {
     /// The report on the runs in `layout`, which have all ended; `outcomes` are their outcomes.
-    pub fn new(
-        study: &Study,
-        layout: &Layout<'_>,
-        cases: Vec<CaseRecord>,
-        outcomes: Vec<(Cell, Outcome)>,
-    ) -> Result<Self> {
+    pub fn new(study: &'a Study, layout: &Layout<'_>, cases: Vec<CaseRecord>, outcomes: Vec<(Cell, Outcome)>) -> Self {
         let summary = Summary { study, outcomes: &outcomes }.lines();
-        let mut runs = vec![];
-        for (cell, outcome) in outcomes {
+        let line = |(cell, outcome): (Cell, Outcome)| {
             let (case, method) = (study.cases[cell.case].name.clone(), study.methods[cell.method].name.clone());
             let run = layout.run(&case, cell.seed, &method);
-            let machine = if outcome.figures.is_some() { machine(&run)? } else { None };
-            runs.push(RunLine { case, seed: cell.seed, method, run, machine, outcome });
-        }
-        let methods = study.methods.iter().map(|m| MethodRecord {
-            name: m.name.clone(),
-            spec: m.spec.clone(),
-            set: m.sets.clone(),
-            init: m.init.clone(),
-        });
-        Ok(Self {
+            let machine = outcome.figures.as_ref().and_then(|f| f.machine.clone());
+            RunLine { case, seed: cell.seed, method, run, machine, outcome }
+        };
+        Self {
             version: env!("CARGO_PKG_VERSION"),
             commit: option_env!("CONEFIELD_COMMIT"),
-            name: study.name.clone(),
-            description: study.description.clone(),
-            study: study.text.clone(),
-            seeds: study.seeds.clone(),
-            protocol: study.protocol.clone(),
-            baseline: study.baseline.map(|b| study.methods[b].name.clone()),
-            methods: methods.collect(),
+            name: &study.name,
+            description: &study.description,
+            study: &study.text,
+            seeds: &study.seeds,
+            protocol: &study.protocol,
+            baseline: study.baseline.map(|b| &study.methods[b].name[..]),
+            methods: &study.methods,
             cases,
-            runs,
+            runs: outcomes.into_iter().map(line).collect(),
             summary,
-        })
+        }
     }
 
     /// Writes both tables.
@@ -300,7 +225,7 @@ impl StudyReport {
                 key => any(key),
             })
             .collect();
-        let against = self.baseline.as_deref();
+        let against = self.baseline;
         let compared = columns.iter().filter(|c| match c.key {
             "psnr" | "ssim_2d" | "total_s" => true,
             key => key == "held_out" && !scores,
@@ -363,13 +288,13 @@ impl Summary<'_> {
         let here = |c: &Cell| c.method == method && case.is_none_or(|case| case == c.case);
         let runs: Vec<&Outcome> = self.outcomes.iter().filter(|(c, _)| here(c)).map(|(_, o)| o).collect();
         let done = runs.iter().filter(|o| o.figures.is_some()).count();
-        let values = |method, figure| self.values(case, method, figure);
-        let spread = |of: &dyn Fn(Figure) -> Vec<f64>| {
-            FIGURES.iter().filter_map(|(key, figure)| Some((*key, Spread::of(&of(*figure))?))).collect()
+        let values = |method: usize, column: &Column| self.values(case, method, column);
+        let spread = |of: &dyn Fn(&Column) -> Vec<f64>| {
+            COLUMNS.iter().filter_map(|column| Some((column.key, Spread::of(&of(column))?))).collect()
         };
         let difference = self.study.baseline.filter(|b| *b != method).map(|baseline| {
-            spread(&|figure| {
-                let pairs = values(method, figure).into_iter().zip(values(baseline, figure));
+            spread(&|column| {
+                let pairs = values(method, column).into_iter().zip(values(baseline, column));
                 // If both results equal the reference, there is no difference.
                 pairs.filter_map(|(a, b)| Some(a? - b?)).filter(|d| !d.is_nan()).collect()
             })
@@ -379,17 +304,17 @@ impl Summary<'_> {
             method: self.study.methods[method].name.clone(),
             done,
             failed: runs.len() - done,
-            figures: spread(&|figure| values(method, figure).into_iter().flatten().collect()),
+            figures: spread(&|column| values(method, column).into_iter().flatten().collect()),
             difference,
         }
     }
 
     /// A figure for every seed: of one case, or its mean over all cases if none is missing.
-    fn values(&self, case: Option<usize>, method: usize, figure: Figure) -> Vec<Option<f64>> {
+    fn values(&self, case: Option<usize>, method: usize, column: &Column) -> Vec<Option<f64>> {
         let of = |case: usize, seed: u64| {
             let cell = Cell { case, seed, method };
             let outcome = self.outcomes.iter().find(|(c, _)| *c == cell)?;
-            outcome.1.figures.as_ref().and_then(figure)
+            outcome.1.figures.as_ref().and_then(column.of)
         };
         let seeds = self.study.seeds.iter();
         match case {
@@ -403,6 +328,7 @@ impl Summary<'_> {
 mod tests {
     use super::*;
     use crate::study::outcome::Status;
+    use crate::tradeoff::trial::Figures;
     use serde_json::json;
 
     fn study(text: &str) -> Study {
@@ -414,20 +340,7 @@ mod tests {
 
     fn reached(psnr: f64, total_s: f64) -> Outcome {
         let scores = json!({ "psnr": psnr, "ssim_2d": psnr / 100.0, "ssim_3d": null, "ssim_skimage": null });
-        let figures = Figures {
-            steps: 3,
-            train_s: 1.0,
-            export_s: 0.5,
-            total_s,
-            peak_bytes: Some(1 << 20),
-            threads: 2,
-            parameters: 0,
-            samples: 0,
-            samples_per_s: None,
-            loss: None,
-            held_out: None,
-            scores: Some(scores),
-        };
+        let figures = Figures { total_s, scores: Some(scores), ..Figures::default() };
         Outcome { status: Status::Done, error: None, figures: Some(figures) }
     }
 

@@ -58,7 +58,7 @@ pub struct Written {
 }
 
 /// A volume to simulate.
-#[derive(Deserialize, JsonSchema)]
+#[derive(Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WrittenVolume {
     /// A file, or phantom:head, phantom:abdomen or phantom:random:SEED, each optionally with :SIZE.
@@ -74,7 +74,7 @@ pub struct WrittenVolume {
 }
 
 /// An existing scan.
-#[derive(Deserialize, JsonSchema)]
+#[derive(Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WrittenScan {
     /// The file or folder.
@@ -88,7 +88,7 @@ pub struct WrittenScan {
 }
 
 /// A method.
-#[derive(Deserialize, JsonSchema)]
+#[derive(Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WrittenSpec {
     /// A shipped spec, a method type or a file.
@@ -190,40 +190,34 @@ impl Protocol {
 #[derive(Debug)]
 pub struct Entry<T>(pub T);
 
-/// Conversion from the short form.
-pub trait Named {
-    /// The table whose first key is `name`.
-    fn named(name: String) -> Self;
-}
-
-impl Named for WrittenVolume {
-    fn named(volume: String) -> Self {
-        Self { volume, name: None, values: None, downsample: None, window: None }
+impl From<String> for WrittenVolume {
+    fn from(volume: String) -> Self {
+        Self { volume, ..Self::default() }
     }
 }
 
-impl Named for WrittenScan {
-    fn named(scan: String) -> Self {
-        Self { scan, name: None, reference: None, window: None }
+impl From<String> for WrittenScan {
+    fn from(scan: String) -> Self {
+        Self { scan, ..Self::default() }
     }
 }
 
-impl Named for WrittenSpec {
-    fn named(spec: String) -> Self {
-        Self { spec, name: None, set: vec![], init: None }
+impl From<String> for WrittenSpec {
+    fn from(spec: String) -> Self {
+        Self { spec, ..Self::default() }
     }
 }
 
-impl<'de, T: Deserialize<'de> + Named> Deserialize<'de> for Entry<T> {
+impl<'de, T: Deserialize<'de> + From<String>> Deserialize<'de> for Entry<T> {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
         struct Either<T>(PhantomData<T>);
-        impl<'de, T: Deserialize<'de> + Named> Visitor<'de> for Either<T> {
+        impl<'de, T: Deserialize<'de> + From<String>> Visitor<'de> for Either<T> {
             type Value = Entry<T>;
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 f.write_str("a text or a table")
             }
             fn visit_str<E: Error>(self, text: &str) -> Result<Self::Value, E> {
-                Ok(Entry(T::named(text.into())))
+                Ok(Entry(T::from(text.into())))
             }
             fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<Self::Value, A::Error> {
                 T::deserialize(MapAccessDeserializer::new(map)).map(Entry)
@@ -285,36 +279,24 @@ fn said<'de, D: Deserializer<'de>, T>(
     })
 }
 
-fn seconds<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
-    said(from, parse::seconds)
+/// Functions that deserialize a setting which is written as on the command line.
+macro_rules! settings {
+    ($($name:ident: $type:ty = $parse:path;)*) => {$(
+        fn $name<'de, D: Deserializer<'de>>(from: D) -> Result<Option<$type>, D::Error> {
+            said(from, $parse)
+        }
+    )*};
 }
 
-fn above_zero<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
-    said(from, parse::above_zero)
-}
-
-fn hold_out<'de, D: Deserializer<'de>>(from: D) -> Result<Option<HoldOut>, D::Error> {
-    said(from, parse::hold_out)
-}
-
-fn backend<'de, D: Deserializer<'de>>(from: D) -> Result<Option<BackendChoice>, D::Error> {
-    said(from, BackendChoice::from_str)
-}
-
-fn detector<'de, D: Deserializer<'de>>(from: D) -> Result<Option<[usize; 2]>, D::Error> {
-    said(from, parse::detector)
-}
-
-fn offset<'de, D: Deserializer<'de>>(from: D) -> Result<Option<[f64; 2]>, D::Error> {
-    said(from, parse::offset)
-}
-
-fn angles<'de, D: Deserializer<'de>>(from: D) -> Result<Option<AnglesOption>, D::Error> {
-    said(from, parse::angles)
-}
-
-fn noise<'de, D: Deserializer<'de>>(from: D) -> Result<Option<DetectorNoise>, D::Error> {
-    said(from, parse::noise)
+settings! {
+    seconds: f64 = parse::seconds;
+    above_zero: f64 = parse::above_zero;
+    hold_out: HoldOut = parse::hold_out;
+    backend: BackendChoice = BackendChoice::from_str;
+    detector: [usize; 2] = parse::detector;
+    offset: [f64; 2] = parse::offset;
+    angles: AnglesOption = parse::angles;
+    noise: DetectorNoise = parse::noise;
 }
 
 fn shown<S: Serializer>(held: &Option<HoldOut>, to: S) -> Result<S::Ok, S::Error> {

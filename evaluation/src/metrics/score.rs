@@ -2,7 +2,7 @@
 
 use crate::metrics::check;
 use crate::metrics::error::{SquaredError, WorstSlice, decibels};
-use crate::metrics::ssim::{gaussian_slices, gaussian_volume, uniform_slices};
+use crate::metrics::ssim;
 use conefield_core::Result;
 use ndarray::ArrayView3;
 use serde::Serialize;
@@ -15,11 +15,11 @@ pub struct Scores {
     pub psnr: f64,
     /// Root mean square error.
     pub rmse: f64,
-    /// See [`crate::metrics::ssim_2d`].
+    /// SSIM as reported by R2-Gaussian; the [module](crate::metrics) compares all three.
     pub ssim_2d: Option<f64>,
-    /// See [`crate::metrics::ssim_3d`].
+    /// SSIM as reported by NI-NeRF.
     pub ssim_3d: Option<f64>,
-    /// See [`crate::metrics::ssim_skimage`].
+    /// SSIM by scikit-image's default per slice.
     pub ssim_skimage: Option<f64>,
     /// The slice with the largest error along x, y and z.
     pub worst_slices: [WorstSlice; 3],
@@ -43,9 +43,9 @@ pub fn evaluate(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) 
             None
         }
     };
-    let ssim_2d = known("ssim_2d", gaussian_slices(result, reference, peak));
-    let ssim_3d = known("ssim_3d", gaussian_volume(result, reference, peak));
-    let ssim_skimage = known("ssim_skimage", uniform_slices(result, reference, peak));
+    let ssim_2d = known("ssim_2d", ssim::ssim_2d(result, reference, peak));
+    let ssim_3d = known("ssim_3d", ssim::ssim_3d(result, reference, peak));
+    let ssim_skimage = known("ssim_skimage", ssim::ssim_skimage(result, reference, peak));
     Ok(Scores {
         psnr: decibels(error.mean(), peak),
         rmse: error.mean().sqrt(),

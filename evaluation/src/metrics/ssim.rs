@@ -1,12 +1,4 @@
-//! The three common definitions of SSIM.
-//!
-//! All use K1 = 0.01, K2 = 0.03 and the given peak as data range. They differ in window, border and covariance:
-//!
-//! | function | window | border | covariance | mean over |
-//! |---|---|---|---|---|
-//! | [`ssim_2d`] | Gaussian 11×11, σ 1.5, per slice | zero padding | biased | positive-reference slices, then axes |
-//! | [`ssim_3d`] | Gaussian 11×11×11, σ 1.5 | valid positions only | biased | all window positions |
-//! | [`ssim_skimage`] | uniform 7×7 per slice | valid positions only | sample (N − 1) | slices, then axes |
+//! The three common definitions of SSIM, of checked pairs.
 
 use crate::metrics::check;
 use crate::metrics::window::{FIELDS, SsimWindow, products};
@@ -16,28 +8,7 @@ use ndarray::{Array3, ArrayView2, ArrayView3, Axis, Slice, s};
 
 /// SSIM as reported by R2-Gaussian: per slice, 11×11 Gaussian, zero padding; slices without a positive reference value
 /// are skipped; mean over slices, then over the three axes. Refuses a reference without a positive value.
-pub fn ssim_2d(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
-    check::pair(result, reference, peak)?;
-    gaussian_slices(result, reference, peak)
-}
-
-/// SSIM as reported by NI-NeRF: one map over the volume, 11×11×11 Gaussian, valid positions only. Refuses volumes
-/// smaller than the window.
-pub fn ssim_3d(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
-    check::pair(result, reference, peak)?;
-    gaussian_volume(result, reference, peak)
-}
-
-/// SSIM by scikit-image's default per slice (7×7 uniform, sample covariance, without the border of 3 pixels), mean over
-/// slices, then over the three axes. NAF's published code passes whole volumes to the same function: a window of 7×7×7,
-/// and a data range of 2. Refuses volumes smaller than the window.
-pub fn ssim_skimage(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
-    check::pair(result, reference, peak)?;
-    uniform_slices(result, reference, peak)
-}
-
-/// [`ssim_2d`] of a checked pair.
-pub(crate) fn gaussian_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
+pub(crate) fn ssim_2d(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::reach("ssim_2d", result, reference, peak)?;
     let window = SsimWindow::gaussian();
     let mean = over_axes(result, reference, |x, y| {
@@ -47,8 +18,10 @@ pub(crate) fn gaussian_slices(result: ArrayView3<f32>, reference: ArrayView3<f32
     Ok(mean.unwrap_or(0.0))
 }
 
-/// [`ssim_skimage`] of a checked pair.
-pub(crate) fn uniform_slices(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
+/// SSIM by scikit-image's default per slice (7×7 uniform, sample covariance, without the border of 3 pixels), mean over
+/// slices, then over the three axes. NAF's published code passes whole volumes to the same function: a window of 7×7×7,
+/// and a data range of 2. Refuses volumes smaller than the window.
+pub(crate) fn ssim_skimage(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::reach("ssim_skimage", result, reference, peak)?;
     let window = SsimWindow::uniform();
     check::window("ssim_skimage", result.shape(), window.len())?;
@@ -127,8 +100,9 @@ fn slice_ssim(x: ArrayView2<f32>, y: ArrayView2<f32>, window: &SsimWindow, pad: 
     sum / ((high - border) * out) as f64
 }
 
-/// [`ssim_3d`] of a checked pair.
-pub(crate) fn gaussian_volume(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
+/// SSIM as reported by NI-NeRF: one map over the volume, 11×11×11 Gaussian, valid positions only. Refuses volumes
+/// smaller than the window.
+pub(crate) fn ssim_3d(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::reach("ssim_3d", result, reference, peak)?;
     // A tile keeps a ring of 11 windowed planes of `TILE[1] × nz`: a few megabytes, however large the volume is.
     const TILE: [usize; 2] = [64, 64];

@@ -3,6 +3,7 @@
 use crate::report::canvas::{number, write_png};
 use crate::report::pixels::{Pixels, Rgb};
 use conefield_core::{Error, Result};
+use plotters::coord::Shift;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
@@ -100,55 +101,45 @@ pub fn panels_png(path: impl AsRef<Path>, panels: &[Panel<'_>]) -> Result<()> {
     write_png(path, &picture)
 }
 
-impl Panel<'_> {
-    fn draw(&self, place: &str, area: &DrawingArea<BitMapBackend, plotters::coord::Shift>) -> Result<()> {
-        let Self { title, labels, series, options } = *self;
+type Area<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
+type Chart<'a, 'b, X, Y> = ChartContext<'a, BitMapBackend<'b>, Cartesian2d<X, Y>>;
+/// Drawing; an error is text.
+pub(crate) type Drawn = Result<(), String>;
+
+pub(crate) fn text_of<E: std::error::Error + Send + Sync>(e: DrawingAreaErrorKind<E>) -> String {
+    e.to_string()
+}
+
+impl CurveOptions {
+    /// Whether the axes can show the point.
+    fn shows(&self, p: &(f64, f64)) -> bool {
         let fits = |v: f64, log: bool| v.abs() < 1e100 && (!log || v > 1e-100);
-        let shown = |p: &(f64, f64)| fits(p.0, options.log_x) && fits(p.1, options.log_y);
-        let all: Vec<(f64, f64)> = series.iter().flat_map(|(_, s)| s).copied().filter(|p| shown(p)).collect();
+        fits(p.0, self.log_x) && fits(p.1, self.log_y)
+    }
+}
+
+impl Panel<'_> {
+    fn draw(&self, place: &str, area: &Area<'_>) -> Result<()> {
+        let Self { series, options, .. } = *self;
+        let all: Vec<(f64, f64)> = series.iter().flat_map(|(_, s)| s).copied().filter(|p| options.shows(p)).collect();
         if all.is_empty() {
             let expected = "at least one finite point (above zero on a logarithmic axis)";
             return Err(Error::invalid(place, "series", format!("{} without a point to draw", series.len()), expected));
         }
         let x = range(all.iter().map(|p| p.0), options.log_x, options.x_margin);
         let edges = options.bands.iter().flat_map(|(_, b)| b).flat_map(|(x, ys)| ys.map(|y| (*x, y)));
-        let y = range(all.iter().copied().chain(edges.filter(|p| shown(p))).map(|p| p.1), options.log_y, 0.05);
-        let plot = Plot { title, labels, series, options, shown: &shown };
+        let y = range(all.iter().copied().chain(edges.filter(|p| options.shows(p))).map(|p| p.1), options.log_y, 0.05);
         let corner = emptiest(&all, &x, &y, options);
         let drawn = match (options.log_x, options.log_y) {
-            (false, false) => plot.draw(area, x, y, corner),
-            (true, false) => plot.draw(area, x.log_scale(), y, corner),
-            (false, true) => plot.draw(area, x, y.log_scale(), corner),
-            (true, true) => plot.draw(area, x.log_scale(), y.log_scale(), corner),
+            (false, false) => self.draw_on(area, x, y, corner),
+            (true, false) => self.draw_on(area, x.log_scale(), y, corner),
+            (false, true) => self.draw_on(area, x, y.log_scale(), corner),
+            (true, true) => self.draw_on(area, x.log_scale(), y.log_scale(), corner),
         };
         drawn.map_err(|e| Error::invalid(place, "plot", e, "a series that can be drawn"))
     }
-}
 
-struct Plot<'a> {
-    title: &'a str,
-    labels: [&'a str; 2],
-    series: &'a [(String, Vec<(f64, f64)>)],
-    options: &'a CurveOptions,
-    shown: &'a dyn Fn(&(f64, f64)) -> bool,
-}
-
-type Area<'a> = BitMapBackend<'a>;
-type Chart<'a, 'b, X, Y> = ChartContext<'a, Area<'b>, Cartesian2d<X, Y>>;
-type Drawn = Result<(), String>;
-
-fn text(e: DrawingAreaErrorKind<<Area<'_> as DrawingBackend>::ErrorType>) -> String {
-    e.to_string()
-}
-
-impl Plot<'_> {
-    fn draw<X, Y>(
-        &self,
-        area: &DrawingArea<BitMapBackend, plotters::coord::Shift>,
-        x: X,
-        y: Y,
-        corner: SeriesLabelPosition,
-    ) -> Drawn
+    fn draw_on<X, Y>(&self, area: &Area<'_>, x: X, y: Y, corner: SeriesLabelPosition) -> Drawn
     where
         X: AsRangedCoord<Value = f64>,
         Y: AsRangedCoord<Value = f64>,
@@ -156,19 +147,41 @@ impl Plot<'_> {
         Y::CoordDescType: ValueFormatter<f64>,
     {
         let em = self.em();
-        area.fill(&WHITE).map_err(text)?;
+        area.fill(&WHITE).map_err(text_of)?;
         let mut chart = ChartBuilder::on(area)
             .caption(self.title, (FONT, em * 1.3))
             .margin(em)
             .x_label_area_size(em * 3.0)
             .y_label_area_size(em * 4.6)
             .build_cartesian_2d(x, y)
-            .map_err(text)?;
-        self.mesh(&mut chart)?;
+            .map_err(text_of)?;
+        chart
+            .configure_mesh()
+            .x_desc(self.labels[0])
+            .y_desc(self.labels[1])
+            .axis_desc_style((FONT, em))
+            .label_style((FONT, em * 0.85))
+            .x_label_formatter(&|v| number(*v))
+            .y_label_formatter(&|v| number(*v))
+            .x_labels(9)
+            .y_labels(9)
+            .bold_line_style(BLACK.mix(0.15))
+            .light_line_style(BLACK.mix(0.04))
+            .draw()
+            .map_err(text_of)?;
         self.bands(&mut chart)?;
         self.lines(&mut chart)?;
-        self.legend(&mut chart, corner)?;
-        area.present().map_err(text)
+        chart
+            .configure_series_labels()
+            .position(corner)
+            .margin((em * 0.8) as u32)
+            .legend_area_size((em * 2.0) as u32)
+            .label_font((FONT, em * 0.9))
+            .background_style(WHITE.mix(0.85))
+            .border_style(BLACK.mix(0.4))
+            .draw()
+            .map_err(text_of)?;
+        area.present().map_err(text_of)
     }
 
     /// The font's size in pixels.
@@ -187,44 +200,19 @@ impl Plot<'_> {
         COLOURS[names.iter().position(|n| *n == name).unwrap_or(0) % COLOURS.len()]
     }
 
-    fn mesh<X, Y>(&self, chart: &mut Chart<'_, '_, X, Y>) -> Drawn
-    where
-        X: Ranged<ValueType = f64> + ValueFormatter<f64>,
-        Y: Ranged<ValueType = f64> + ValueFormatter<f64>,
-    {
-        let em = self.em();
-        chart
-            .configure_mesh()
-            .x_desc(self.labels[0])
-            .y_desc(self.labels[1])
-            .axis_desc_style((FONT, em))
-            .label_style((FONT, em * 0.85))
-            .x_label_formatter(&|v| number(*v))
-            .y_label_formatter(&|v| number(*v))
-            .x_labels(9)
-            .y_labels(9)
-            .bold_line_style(BLACK.mix(0.15))
-            .light_line_style(BLACK.mix(0.04))
-            .draw()
-            .map_err(text)
-    }
-
     fn bands<X: Ranged<ValueType = f64>, Y: Ranged<ValueType = f64>>(&self, chart: &mut Chart<'_, '_, X, Y>) -> Drawn {
         for (name, band) in &self.options.bands {
-            for part in band.split(|(x, ys)| !ys.iter().all(|y| (self.shown)(&(*x, *y)))).filter(|b| b.len() > 1) {
+            for part in band.split(|(x, ys)| !ys.iter().all(|y| self.options.shows(&(*x, *y)))).filter(|b| b.len() > 1)
+            {
                 let above = part.iter().map(|(x, ys)| (*x, ys[1]));
                 let outline: Vec<(f64, f64)> = part.iter().map(|(x, ys)| (*x, ys[0])).chain(above.rev()).collect();
-                chart.draw_series([Polygon::new(outline, self.colour(name).mix(0.18))]).map_err(text)?;
+                chart.draw_series([Polygon::new(outline, self.colour(name).mix(0.18))]).map_err(text_of)?;
             }
         }
         Ok(())
     }
 
-    fn lines<X, Y>(&self, chart: &mut Chart<'_, '_, X, Y>) -> Drawn
-    where
-        X: Ranged<ValueType = f64>,
-        Y: Ranged<ValueType = f64>,
-    {
+    fn lines<X: Ranged<ValueType = f64>, Y: Ranged<ValueType = f64>>(&self, chart: &mut Chart<'_, '_, X, Y>) -> Drawn {
         let em = self.em();
         let (stroke, length) = (((em / 8.0).round() as u32).max(2), (em * 1.6) as i32);
         let mut seen: Vec<&str> = vec![];
@@ -233,12 +221,12 @@ impl Plot<'_> {
             let style = colour.stroke_width(stroke);
             let mut named = seen.contains(&&name[..]);
             seen.push(name);
-            for part in points.split(|p| !(self.shown)(p)).filter(|p| !p.is_empty()) {
+            for part in points.split(|p| !self.options.shows(p)).filter(|p| !p.is_empty()) {
                 // A line through a single point would be invisible.
                 if let [p] = part {
-                    chart.draw_series([Circle::new(*p, stroke as i32 + 1, colour.filled())]).map_err(text)?;
+                    chart.draw_series([Circle::new(*p, stroke as i32 + 1, colour.filled())]).map_err(text_of)?;
                 }
-                let drawn = chart.draw_series(LineSeries::new(part.iter().copied(), style)).map_err(text)?;
+                let drawn = chart.draw_series(LineSeries::new(part.iter().copied(), style)).map_err(text_of)?;
                 if !named {
                     drawn.label(name).legend(move |(x, y)| PathElement::new([(x, y), (x + length, y)], style));
                     named = true;
@@ -246,24 +234,6 @@ impl Plot<'_> {
             }
         }
         Ok(())
-    }
-
-    fn legend<'a, X, Y>(&self, chart: &mut Chart<'a, 'a, X, Y>, corner: SeriesLabelPosition) -> Drawn
-    where
-        X: Ranged<ValueType = f64>,
-        Y: Ranged<ValueType = f64>,
-    {
-        let em = self.em();
-        chart
-            .configure_series_labels()
-            .position(corner)
-            .margin((em * 0.8) as u32)
-            .legend_area_size((em * 2.0) as u32)
-            .label_font((FONT, em * 0.9))
-            .background_style(WHITE.mix(0.85))
-            .border_style(BLACK.mix(0.4))
-            .draw()
-            .map_err(text)
     }
 }
 
@@ -316,7 +286,6 @@ pub(crate) fn register() {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::testing::folder;
 
     fn series() -> Vec<(String, Vec<(f64, f64)>)> {
         let curve = |top: f64, slow: f64| {
@@ -335,7 +304,8 @@ mod tests {
 
     #[test]
     fn curves_are_drawn_on_either_axis() {
-        let (_dir, folder) = folder();
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path();
         let path = folder.join("curves.png");
         curves_png(&path, "Engine, 50 views", ["time (s)", "PSNR (dB)"], &series(), &CurveOptions::default()).unwrap();
         let image = Pixels::open(&path).unwrap();
@@ -352,8 +322,25 @@ mod tests {
     }
 
     #[test]
+    fn x_grows_to_the_right_and_y_upwards() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("line.png");
+        // Along the bottom, then up on the right.
+        let line = vec![("line".to_string(), vec![(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])];
+        curves_png(&path, "", ["", ""], &line, &CurveOptions::default()).unwrap();
+        let image = Pixels::open(&path).unwrap();
+        let drawn: Vec<usize> =
+            (0..).zip(image.colours()).filter(|(_, p)| p.0 == [0, 114, 178]).map(|(i, _)| i).collect();
+        let width = image.width as usize;
+        let mean = |of: &dyn Fn(usize) -> usize| drawn.iter().map(|i| of(*i)).sum::<usize>() / drawn.len();
+        let (x, y) = (mean(&|i| i % width), mean(&|i| i / width));
+        assert!(x > width / 2 && y > image.height as usize / 2, "{x} {y}");
+    }
+
+    #[test]
     fn panels_stand_side_by_side() {
-        let (_dir, folder) = folder();
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path();
         let path = folder.join("panels.png");
         let (series, options) = (series(), CurveOptions { size: [600, 400], ..Default::default() });
         let panel = |title| Panel { title, labels: ["x", "y"], series: &series, options: &options };
@@ -371,7 +358,8 @@ mod tests {
 
     #[test]
     fn a_band_is_drawn_around_its_series_in_its_colour() {
-        let (_dir, folder) = folder();
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path();
         let line = |y: f64| (0..10).map(|i| (1.0 + i as f64, y)).collect::<Vec<_>>();
         let series = vec![("low".to_string(), line(10.0)), ("high".to_string(), line(20.0))];
         let band: Vec<Band> = (0..10).map(|i| (1.0 + i as f64, [18.0, 22.0])).collect();

@@ -28,6 +28,7 @@ struct Plane {
 const AXIAL: Plane = Plane { name: "axial", axes: "x → y ↑", cut: 2, seen: [0, 1] };
 const CORONAL: Plane = Plane { name: "coronal", axes: "x → z ↑", cut: 1, seen: [0, 2] };
 const SAGITTAL: Plane = Plane { name: "sagittal", axes: "y → z ↑", cut: 0, seen: [1, 2] };
+const PLANES: [Plane; 3] = [AXIAL, CORONAL, SAGITTAL];
 
 /// One picture of the grid.
 enum Cell<'a> {
@@ -48,54 +49,27 @@ struct Row<'a> {
     cells: Vec<Cell<'a>>,
 }
 
-/// Draws the middle slices of a result: side by side, or with those of `reference` and their difference in rows.
+/// Draws the middle slices of a result: side by side, or with those of `reference` and their difference in rows. A
+/// difference is blue below and red above, on a scale that the picture shows.
 pub fn result_png(path: impl AsRef<Path>, reference: Option<&MiddleSlices>, result: &MiddleSlices) -> Result<()> {
-    match reference {
-        Some(r) => slices_png(path, &[("reference", r), ("result", result)], r.window(), Some(0)),
-        None => {
-            let planes = [AXIAL, CORONAL, SAGITTAL];
-            let captions = planes.map(|p| format!("{}  {}", p.name, p.axes));
-            let cells = planes.map(|p| Cell::Slice(p, result)).into();
-            let row = Row { plane: Plane { name: "", axes: "", ..AXIAL }, note: "", cells };
-            draw(path.as_ref(), &captions, &[row], result.window())
-        }
+    let path = path.as_ref();
+    if let Some(r) = reference {
+        let cells = || vec![Cell::Values(r), Cell::Values(result), Cell::Difference(result, r)];
+        let rows = PLANES.map(|plane| Row { plane, note: "", cells: cells() });
+        return draw(path, &["reference", "result", "result − reference"], &rows, r.window());
     }
+    let captions = PLANES.map(|p| format!("{}  {}", p.name, p.axes));
+    let cells = PLANES.map(|p| Cell::Slice(p, result)).into();
+    let row = Row { plane: Plane { name: "", axes: "", ..AXIAL }, note: "", cells };
+    draw(path, &captions.each_ref().map(String::as_str), &[row], result.window())
 }
 
 /// Draws the three middle slices (axial, coronal, sagittal) of every panel side by side, grey from `window[0]` to
 /// `window[1]`.
-///
-/// With `difference_to`, the index of a panel, every other panel gets an additional column: its values minus those of
-/// that panel, blue below and red above, on a common scale that the picture shows.
-pub fn slices_png(
-    path: impl AsRef<Path>,
-    panels: &[(&str, &MiddleSlices)],
-    window: [f32; 2],
-    difference_to: Option<usize>,
-) -> Result<()> {
-    let path = path.as_ref();
-    let place = path.display().to_string();
-    let reference = match difference_to {
-        Some(i) if i >= panels.len() => {
-            let expected = format!("an index below {}, the number of panels", panels.len());
-            return Err(Error::invalid(place, "difference_to", i, expected));
-        }
-        other => other,
-    };
-    let mut captions: Vec<String> = panels.iter().map(|(n, _)| n.to_string()).collect();
-    if let Some(r) = reference {
-        let others = || panels.iter().enumerate().filter(|(i, _)| *i != r);
-        captions.extend(others().map(|(_, (n, _))| format!("{n} − {}", panels[r].0)));
-    }
-    let rows = [AXIAL, CORONAL, SAGITTAL].map(|plane| {
-        let mut cells: Vec<Cell> = panels.iter().map(|(_, v)| Cell::Values(v)).collect();
-        if let Some(r) = reference {
-            let others = panels.iter().enumerate().filter(|(i, _)| *i != r);
-            cells.extend(others.map(|(_, (_, v))| Cell::Difference(v, panels[r].1)));
-        }
-        Row { plane, note: "", cells }
-    });
-    draw(path, &captions, &rows, window)
+pub fn slices_png(path: impl AsRef<Path>, panels: &[(&str, &MiddleSlices)], window: [f32; 2]) -> Result<()> {
+    let (captions, volumes): (Vec<&str>, Vec<&MiddleSlices>) = panels.iter().copied().unzip();
+    let rows = PLANES.map(|plane| Row { plane, note: "", cells: volumes.iter().map(|v| Cell::Values(v)).collect() });
+    draw(path.as_ref(), &captions, &rows, window)
 }
 
 /// Draws results next to a reference, each under its caption (e.g. `NAF 28.1 dB`): axial and coronal middle slices, and
@@ -106,12 +80,11 @@ pub fn compare_png(
     results: &[(&str, &MiddleSlices)],
     window: [f32; 2],
 ) -> Result<()> {
-    let captions: Vec<String> = [reference].iter().chain(results).map(|(n, _)| n.to_string()).collect();
+    let (captions, volumes): (Vec<&str>, Vec<&MiddleSlices>) = [reference].iter().chain(results).copied().unzip();
     let mut rows = Vec::new();
     for plane in [AXIAL, CORONAL] {
-        let values = [reference].iter().chain(results).map(|(_, v)| Cell::Values(v)).collect();
-        rows.push(Row { plane, note: "", cells: values });
-        let differences = results.iter().map(|(_, v)| Cell::Difference(v, reference.1));
+        rows.push(Row { plane, note: "", cells: volumes.iter().map(|v| Cell::Values(v)).collect() });
+        let differences = volumes[1..].iter().map(|v| Cell::Difference(v, reference.1));
         rows.push(Row { plane, note: "difference", cells: [Cell::Empty].into_iter().chain(differences).collect() });
     }
     draw(path.as_ref(), &captions, &rows, window)
@@ -121,8 +94,8 @@ pub fn compare_png(
 /// is nothing to show.
 pub fn features_png(path: impl AsRef<Path>, attenuation: &MiddleSlices, colours: [&MiddleSlices; 3]) -> Result<()> {
     let cells = || vec![Cell::Values(attenuation), Cell::Colours(colours)];
-    let rows = [AXIAL, CORONAL, SAGITTAL].map(|plane| Row { plane, note: "", cells: cells() });
-    draw(path.as_ref(), &["attenuation".into(), "features".into()], &rows, attenuation.window())
+    let rows = PLANES.map(|plane| Row { plane, note: "", cells: cells() });
+    draw(path.as_ref(), &["attenuation", "features"], &rows, attenuation.window())
 }
 
 /// Bands of columns of nearly equal length, at most [`COLUMNS`] each.
@@ -132,7 +105,7 @@ fn bands(columns: usize) -> Vec<Range<usize>> {
     (0..columns).step_by(wide).map(|from| from..(from + wide).min(columns)).collect()
 }
 
-fn draw(path: &Path, captions: &[String], rows: &[Row], window: [f32; 2]) -> Result<()> {
+fn draw(path: &Path, captions: &[&str], rows: &[Row], window: [f32; 2]) -> Result<()> {
     let place = path.display().to_string();
     if captions.is_empty() {
         return Err(Error::invalid(place, "panels", "none", "at least one volume"));
@@ -177,7 +150,7 @@ fn draw(path: &Path, captions: &[String], rows: &[Row], window: [f32; 2]) -> Res
         let mut x = left;
         for (c, &wide) in columns.zip(&widths) {
             let at = (x as f32 + wide as f32 / 2.0, first as f32 + text * 0.35);
-            let shown = canvas.shortened(&captions[c], text, wide as f32);
+            let shown = canvas.shortened(captions[c], text, wide as f32);
             canvas.text(at, Align::Middle, text, INK, &shown);
             let mut y = first + top;
             for (row, &height) in rows.iter().zip(&heights) {
@@ -327,7 +300,6 @@ fn draw_bar(
 mod tests {
     use super::*;
     use crate::report::pixels::Pixels;
-    use crate::report::testing::{data, folder};
     use conefield_core::scan::Volume;
     use ndarray::Array3;
     use ndarray::s;
@@ -347,11 +319,12 @@ mod tests {
 
     #[test]
     fn small_volumes_make_a_wide_picture_with_the_right_aspect() {
-        let (_dir, folder) = folder();
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path();
         let path = folder.join("slices.png");
         // Thick slices: half as many voxels along z for the same ball.
         let (a, b) = (ball([48, 48, 24], [1.0, 1.0, 2.0], 0.3), ball([48, 48, 24], [1.0, 1.0, 2.0], 1.5));
-        slices_png(&path, &[("reference", &a), ("result 31.2 dB", &b)], [0.0, 1.0], Some(0)).unwrap();
+        result_png(&path, Some(&a), &b).unwrap();
         let image = Pixels::open(&path).unwrap();
         assert!(image.width >= 900, "{}", image.width);
         // Equal sides in mm are equal sides in pixels: three square rows.
@@ -363,7 +336,8 @@ mod tests {
 
     #[test]
     fn the_planes_of_a_result_alone_stand_side_by_side() {
-        let (_dir, folder) = folder();
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path();
         let path = folder.join("alone.png");
         result_png(&path, None, &ball([40, 40, 20], [1.0; 3], 0.5)).unwrap();
         let image = Pixels::open(&path).unwrap();
@@ -375,21 +349,12 @@ mod tests {
     }
 
     #[test]
-    fn results_stand_beside_their_reference() {
-        let (_dir, folder) = folder();
-        let path = folder.join("compare.png");
-        let (a, b, c) = (ball([40; 3], [1.3; 3], 0.3), ball([40; 3], [1.3; 3], 1.0), ball([40; 3], [1.3; 3], 2.5));
-        let results = [("NAF 28.1 dB", &b), ("FDK 21.0 dB, a caption that is too long for its column", &c)];
-        compare_png(&path, ("reference", &a), &results, [0.0, 1.0]).unwrap();
-        assert!(Pixels::open(&path).unwrap().width >= 900);
-    }
-
-    #[test]
     fn many_results_stand_in_bands_of_legible_columns() {
         assert_eq!(bands(5), [0..5]);
         assert_eq!(bands(6), [0..3, 3..6]);
         assert_eq!(bands(9), [0..5, 5..9]);
-        let (_dir, folder) = folder();
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path();
         let blurred: Vec<MiddleSlices> = (0..8).map(|i| ball([24; 3], [2.0; 3], 0.5 + 0.4 * f64::from(i))).collect();
         let names: Vec<String> = (0..8).map(|i| format!("method {i} 2{i}.00 dB")).collect();
         let results: Vec<(&str, &MiddleSlices)> = names.iter().map(|n| &n[..]).zip(&blurred).collect();
@@ -403,37 +368,42 @@ mod tests {
         assert_eq!((sizes[1].0, sizes[1].1), (sizes[0].0, 2 * sizes[0].1));
         assert!(sizes[0].0 >= 1000, "{sizes:?}");
         let path = folder.join("slices8.png");
-        slices_png(&path, &results, [0.0, 1.0], None).unwrap();
+        slices_png(&path, &results, [0.0, 1.0]).unwrap();
         assert!(Pixels::open(&path).unwrap().width >= 1000);
     }
 
+    /// Each axis has a colour, dark in its lower half and bright in its upper one: a corner of a slice tells where it lies.
     #[test]
-    fn a_clinical_volume_is_drawn() {
-        let Some(path) = data("clinical/abdomen_ct_hu.nii.gz") else { return };
-        let (_dir, folder) = folder();
-        let v = conefield_io::read_volume(path).unwrap();
-        let noisy = MiddleSlices::of(&v.clone().mapped(|x| x * 0.95 + 20.0));
-        let v = MiddleSlices::of(&v);
-        slices_png(folder.join("abdomen.png"), &[("CT (HU)", &v), ("changed", &noisy)], [-200.0, 300.0], Some(0))
-            .unwrap();
-        slices_png(folder.join("abdomen_one.png"), &[("CT (HU)", &v)], [-200.0, 300.0], None).unwrap();
-    }
-
-    #[test]
-    fn features_are_drawn_in_colours_beside_the_attenuation() {
-        let (_dir, folder) = folder();
-        let path = folder.join("features.png");
-        let values = |f: fn(usize, usize, usize) -> f32| {
-            MiddleSlices::of(&Volume::centered(Array3::from_shape_fn((8, 8, 8), |(x, y, z)| f(x, y, z)), [1.0; 3]))
+    fn features_are_drawn_in_colours_beside_the_attenuation_axes_to_the_right_and_up() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("features.png");
+        let values = |f: &dyn Fn([usize; 3]) -> f32| {
+            MiddleSlices::of(&Volume::centered(Array3::from_shape_fn((8, 8, 8), |(x, y, z)| f([x, y, z])), [1.0; 3]))
         };
-        let red = values(|x, _, _| if x == 7 { f32::NAN } else { f32::from(u8::from(x < 4)) });
-        let (green, blue) = (values(|_, y, _| f32::from(u8::from(y < 4))), values(|_, _, _| 0.5));
-        features_png(&path, &values(|x, y, z| (x + y + z) as f32), [&red, &green, &blue]).unwrap();
+        let along = |axis: usize, ends: [f32; 2]| values(&|at| ends[usize::from(at[axis] >= 4)]);
+        let (red, green, blue) = (along(0, [0.2, 0.8]), along(1, [0.2, 0.8]), along(2, [0.4, 0.6]));
+        features_png(&path, &values(&|at| at.iter().sum::<usize>() as f32), [&red, &green, &blue]).unwrap();
         let image = Pixels::open(&path).unwrap();
-        let count = |c: [u8; 3]| image.colours().filter(|p| p.0 == c).count();
-        for colour in [[255, 255, 128], [255, 0, 128], [0, 255, 128], [0, 0, 128]] {
-            assert!(count(colour) > 1000, "{colour:?}");
+        let (dark, bright, low, high) = (51, 204, 102, 153);
+        let coloured = |x: u32, y: u32| matches!(image.get(x, y).0, [51 | 204, 51 | 204, 102 | 153]);
+        let rows: Vec<u32> = (0..image.height).filter(|y| (0..image.width).any(|x| coloured(x, *y))).collect();
+        let cells: Vec<&[u32]> = rows.chunk_by(|a, b| a + 1 == *b).collect();
+        assert_eq!(cells.len(), 3);
+        // Each slice lies in the upper half of the axis that it cuts. From the upper left corner to the lower right one.
+        let axial = [[dark, bright, high], [bright, bright, high], [dark, dark, high], [bright, dark, high]];
+        let coronal = [[dark, bright, high], [bright, bright, high], [dark, bright, low], [bright, bright, low]];
+        let sagittal = [[bright, dark, high], [bright, bright, high], [bright, dark, low], [bright, bright, low]];
+        for (rows, want) in cells.into_iter().zip([axial, coronal, sagittal]) {
+            let (top, bottom) = (rows[0], rows[rows.len() - 1]);
+            let columns: Vec<u32> = (0..image.width).filter(|x| coloured(*x, top)).collect();
+            let (left, right) = (columns[0], columns[columns.len() - 1]);
+            let found = [(left, top), (right, top), (left, bottom), (right, bottom)].map(|(x, y)| image.get(x, y).0);
+            assert_eq!(found, want);
         }
+        // Paper where a colour is not known.
+        let nothing = values(&|_| f32::NAN);
+        features_png(&path, &red, [&nothing, &green, &blue]).unwrap();
+        assert!(!Pixels::open(&path).unwrap().colours().any(|c| matches!(c.0, [_, 51 | 204, 102 | 153])));
         let other = MiddleSlices::of(&Volume::centered(Array3::zeros((8, 8, 9)), [1.0; 3]));
         let e = features_png(&path, &red, [&red, &other, &blue]).unwrap_err().to_string();
         assert!(e.contains("[8, 8, 9]"), "{e}");
@@ -461,13 +431,12 @@ mod tests {
             let e = r.unwrap_err().to_string();
             assert!(e.contains("a.png") && e.contains(word), "{e}");
         };
-        refused(slices_png(&path, &[], [0.0, 1.0], None), "panels");
-        refused(slices_png(&path, &[("a", &a)], [1.0, 1.0], None), "window");
-        refused(slices_png(&path, &[("a", &a)], [0.0, 1.0], Some(1)), "difference_to");
-        refused(slices_png(&path, &[("a", &a), ("b", &b)], [0.0, 1.0], Some(0)), "shape of a result");
+        refused(slices_png(&path, &[], [0.0, 1.0]), "panels");
+        refused(slices_png(&path, &[("a", &a)], [1.0, 1.0]), "window");
+        refused(result_png(&path, Some(&a), &b), "shape of a result");
         // A single voxel and a zero difference are handled.
         let dot = MiddleSlices::of(&Volume::centered(Array3::zeros((1, 1, 1)), [1.0; 3]));
         assert_eq!(dot.window(), [0.0, 1.0]);
-        slices_png(&path, &[("a", &dot), ("b", &dot)], [0.0, 1.0], Some(0)).unwrap();
+        result_png(&path, Some(&dot), &dot).unwrap();
     }
 }

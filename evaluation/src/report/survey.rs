@@ -1,7 +1,7 @@
 //! A picture of a scan's geometry: source path, detector, volume, and the part of it seen by the views.
 
 use crate::report::canvas::{number, sequential, write_png};
-use crate::report::curves::{FONT, register};
+use crate::report::curves::{Drawn, FONT, register, text_of};
 use crate::report::pixels::{Pixels, Rgb};
 use conefield_core::geometry::{Geometry, Vec3, View};
 use conefield_core::{Error, Result};
@@ -32,11 +32,6 @@ type Chart<'a, 'b> = ChartContext<
     BitMapBackend<'b>,
     Cartesian2d<plotters::coord::types::RangedCoordf64, plotters::coord::types::RangedCoordf64>,
 >;
-type Drawn = Result<(), String>;
-
-fn text_of<E: std::error::Error + Send + Sync>(e: DrawingAreaErrorKind<E>) -> String {
-    e.to_string()
-}
 
 /// Draws `geometry` from above (x to the right, y up) and from the side of its first view. Beside them it maps the
 /// share of views that see each point of the volume's central slices x–y and x–z.

@@ -7,10 +7,9 @@
 //!
 //! `benches/contact.sh` puts this program, the `conefield` command, parity tests and scans into one folder.
 
-mod device;
 mod speed;
 
-use conefield_backend_wgpu::{Adapter, adapters};
+use conefield_backend_wgpu::{Adapter, Wgpu, adapters};
 use serde_json::{Value, json};
 use std::error::Error;
 use std::fs::File;
@@ -47,8 +46,8 @@ const fn program(name: &'static str, limit_s: u64, program: &'static str, argume
 
 /// The most informative stages come first, because the machine may be available for a few minutes only.
 const STAGES: [Stage; 11] = [
-    own("adapter", 20, device::adapter),
-    own("limits", 60, device::limits),
+    own("adapter", 20, adapter),
+    own("limits", 60, limits),
     own("compile", 60, speed::compile),
     own("quick-parity", 90, speed::quick_parity),
     own("kernels", 120, speed::kernels),
@@ -138,6 +137,18 @@ fn choose(all: &[Adapter], index: Option<usize>, software: bool) -> Result<Adapt
         return Err(format!("found only a software device: {chosen}; --software accepts it").into());
     }
     Ok(chosen.clone())
+}
+
+/// Every adapter with its limits and features, and which one is used.
+fn adapter(asked: &Asked) -> Result<()> {
+    adapters().iter().for_each(|a| say(&json!({ "adapter": a, "used": a.index == asked.adapter })));
+    Ok(())
+}
+
+/// Rates of the device, by micro-benchmarks.
+fn limits(asked: &Asked) -> Result<()> {
+    say(&json!({ "limits": Wgpu::open(Some(asked.adapter))?.ceiling()? }));
+    Ok(())
 }
 
 /// Runs a stage and writes its findings; whether it passed.

@@ -3,37 +3,18 @@
 use crate::{Asked, Result, file, say};
 use conefield_backend_cpu::Cpu;
 use conefield_backend_wgpu::{Limits, Wgpu};
-use conefield_benches::{rays, spread};
-use conefield_core::backend::{Adam, Backend, Executable, TrainRay, Work};
+use conefield_benches::{SAMPLES, Training, points, published, rays, spread};
+use conefield_core::backend::Backend;
 use conefield_core::method::{Context, Job, Method, Silent};
-use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::place::{Array, ViewRays};
-use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
-use conefield_encoders::hash_grid::HashGrid;
-use conefield_fields::mlp::Mlp;
-use conefield_fields::normalizers::layer_norm::LayerNorm;
-use conefield_projectors::ray_march::{RayMarch, Sampling};
 use conefield_projectors::simulate::{Protocol, phantom, simulate};
 use conefield_projectors::voxel::Joseph;
 use conefield_solvers::fdk::Fdk;
-use conefield_solvers::losses::L1;
 use ndarray::Array3;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::process::Command;
 use std::time::Instant;
-
-/// Samples of a ray in the published configuration.
-const SAMPLES: usize = 320;
-
-/// The published configuration: a hash grid of 10 levels of 2 features with tables of 2^19 entries, LayerNorm, an MLP.
-fn pipeline(samples: usize) -> Result<Pipeline> {
-    let encoder = HashGrid::default().build()?;
-    let width = encoder.info().output;
-    let march = RayMarch { samples: Some(samples), sampling: Sampling::Uniform, ..RayMarch::default() };
-    let norm = LayerNorm::default().build(width)?;
-    Ok(Pipeline::new(encoder, vec![norm], Mlp::default().build(width)?, march.build()?)?)
-}
 
 fn open(asked: &Asked, limits: Limits) -> Result<Wgpu> {
     Ok(Wgpu::with_limits(Some(asked.adapter), limits)?)
@@ -49,11 +30,11 @@ pub fn compile(asked: &Asked) -> Result<()> {
     let mut notes = vec![];
     for _ in 0..2 {
         let started = Instant::now();
-        notes = backend.compile(&pipeline(SAMPLES)?)?.1.notes;
+        notes = backend.compile(&published(SAMPLES)?)?.1.notes;
         seconds.push(started.elapsed().as_secs_f64());
     }
     let rays = rays(16);
-    let mut training = Training::new(&backend)?;
+    let mut training = training_on(&backend)?;
     let started = Instant::now();
     training.step(&rays, 1)?;
     say(&json!({ "open_s": opened, "compile_s": seconds[0], "again_s": seconds[1],
@@ -64,13 +45,11 @@ pub fn compile(asked: &Asked) -> Result<()> {
 /// Gradients of one step of the published configuration beside the CPU's.
 pub fn quick_parity(asked: &Asked) -> Result<()> {
     let rays = rays(if asked.software { 16 } else { 64 });
-    let work = Work { step: 1, seed: 0, loss: &L1 {}, rays: &rays, points: &[], priors: &[] };
     let gradients = |backend: &dyn Backend| -> Result<(f64, Vec<f32>)> {
-        let mut model = Model::random(pipeline(64)?, 1);
-        let mut exe = backend.compile(&model.pipeline)?.0;
-        let loss = exe.step(&mut model, &work)?.loss;
-        exe.fetch(&mut model)?;
-        Ok((loss, model.arena.grads.to_vec()))
+        let mut training = Training::new(backend, published(64)?)?;
+        let loss = training.gradients(&rays, 1)?.loss;
+        training.exe.fetch(&mut training.model)?;
+        Ok((loss, training.model.arena.grads.to_vec()))
     };
     let (cpu_loss, cpu) = gradients(&Cpu::new())?;
     let top = cpu.iter().fold(0.0f32, |m, g| m.max(g.abs()));
@@ -89,48 +68,32 @@ pub fn quick_parity(asked: &Asked) -> Result<()> {
     Ok(())
 }
 
-/// A model on a device.
-struct Training {
-    model: Model,
-    exe: Box<dyn Executable>,
+/// A model of the published configuration on a device.
+fn training_on(backend: &Wgpu) -> Result<Training> {
+    Ok(Training::new(backend, published(SAMPLES)?)?)
 }
 
-impl Training {
-    fn new(backend: &Wgpu) -> Result<Self> {
-        let pipeline = pipeline(SAMPLES)?;
-        let (exe, _) = backend.compile(&pipeline)?;
-        Ok(Self { model: Model::random(pipeline, 1), exe })
-    }
-
-    fn step(&mut self, rays: &[TrainRay], step: u64) -> Result<()> {
-        let work = Work { step, seed: 0, loss: &L1 {}, rays, points: &[], priors: &[] };
-        self.exe.step(&mut self.model, &work)?;
-        Ok(self.exe.update(&mut self.model, &Adam { lr: 1e-3, beta1: 0.9, beta2: 0.999, eps: 1e-8, step })?)
-    }
-
-    /// Seconds of a step with `count` rays: lowest, median, highest, over two seconds or 100 steps. What was timed before is
-    /// forgotten.
-    fn steps(&mut self, count: usize) -> Result<([f64; 3], usize)> {
-        let rays = rays(count);
-        let mut times = vec![];
-        let mut begin = Instant::now();
-        for step in 1..=103 {
-            if step == 4 {
-                self.exe.profile();
-                begin = Instant::now();
-            }
-            let start = Instant::now();
-            self.step(&rays, step)?;
-            if step > 3 {
-                times.push(start.elapsed().as_secs_f64());
-                if begin.elapsed().as_secs_f64() > 2.0 {
-                    break;
-                }
+/// Seconds of a step with `count` rays: lowest, median, highest, over two seconds or 100 steps. What was timed before is
+/// forgotten.
+fn steps(training: &mut Training, count: usize) -> Result<([f64; 3], usize)> {
+    let rays = rays(count);
+    let mut times = vec![];
+    let mut begin = Instant::now();
+    for step in 1..=103 {
+        if step == 4 {
+            training.exe.profile();
+            begin = Instant::now();
+        }
+        let seconds = training.step(&rays, step)?;
+        if step > 3 {
+            times.push(seconds);
+            if begin.elapsed().as_secs_f64() > 2.0 {
+                break;
             }
         }
-        let steps = times.len();
-        Ok((spread(&mut times), steps))
     }
+    let steps = times.len();
+    Ok((spread(&mut times), steps))
 }
 
 /// `n` things in each of these times: median, lowest and highest rate.
@@ -146,7 +109,7 @@ pub fn kernels(asked: &Asked) -> Result<()> {
     let ceiling = backend.ceiling()?;
     // Multiply-adds: forward, forward once more on the way back, and two products backward. Table accesses: 8 corners of 10 levels,
     // read and then updated.
-    let (macs, reads) = (4.0 * pipeline(SAMPLES)?.macs() as f64, 2.0 * 8.0 * 10.0);
+    let (macs, reads) = (4.0 * published(SAMPLES)?.macs() as f64, 2.0 * 8.0 * 10.0);
     say(&json!({ "bound_samples_per_s": {
         "by_multiply_adds": ceiling.multiply_adds / macs, "by_random_reads": ceiling.random_reads / reads,
     } }));
@@ -155,24 +118,22 @@ pub fn kernels(asked: &Asked) -> Result<()> {
         variants.push(("no subgroups", Limits { no_subgroups: true, ..Limits::default() }));
     }
     for (name, limits) in variants {
-        let mut training = Training::new(&open(asked, limits)?)?;
-        let mut timed = Training::new(&open(asked, Limits { profile: true, ..limits })?)?;
+        let mut training = training_on(&open(asked, limits)?)?;
+        let mut timed = training_on(&open(asked, Limits { profile: true, ..limits })?)?;
         for &count in counts {
             let samples = (count * SAMPLES) as f64;
-            let (time, _) = training.steps(count)?;
-            let (_, steps) = timed.steps(count)?;
+            let (time, _) = steps(&mut training, count)?;
+            let (_, counted) = steps(&mut timed, count)?;
             let kernels = timed.exe.profile();
-            let on_device: f64 = kernels.iter().map(|(_, s)| s).sum::<f64>() / steps as f64;
-            let each: Value = kernels.iter().map(|(k, s)| (k.clone(), json!(1e3 * s / steps as f64))).collect();
+            let on_device: f64 = kernels.iter().map(|(_, s)| s).sum::<f64>() / counted as f64;
+            let each: Value = kernels.iter().map(|(k, s)| (k.clone(), json!(1e3 * s / counted as f64))).collect();
             let cpu = (on_device > 0.0).then(|| 1.0 - on_device / time[1]);
             say(&json!({ "variant": name, "rays": count, "samples_per_s": rates(samples, time),
                 "kernels_ms": each, "share_outside_kernels": cpu }));
         }
     }
-    let mut training = Training::new(&backend)?;
-    let points: Vec<[f32; 3]> = (0..side * side * side)
-        .map(|i| [i / (side * side), i / side % side, i % side].map(|k| (k as f32 + 0.5) / side as f32))
-        .collect();
+    let mut training = training_on(&backend)?;
+    let points = points(side);
     let mut out = vec![0.0; points.len()];
     let time = repeated(|| Ok(training.exe.evaluate(&training.model, &points, &mut out)?))?;
     say(&json!({ "export_points_per_s": rates(points.len() as f64, time) }));
@@ -282,7 +243,8 @@ pub fn training(asked: &Asked) -> Result<()> {
         return Err(String::from_utf8_lossy(&done.stderr).into());
     }
     let records: Vec<Value> = metrics?.lines().map(serde_json::from_str).collect::<std::result::Result<_, _>>()?;
-    let points: Vec<(f64, f64)> = records.iter().filter_map(conefield_benches::quality).collect();
+    let points: Vec<(f64, f64)> =
+        records.iter().filter_map(|r| r["seconds"].as_f64().zip(r["psnr"].as_f64())).collect();
     let reached = |mark: f64| points.iter().find(|(_, psnr)| *psnr >= mark).map(|(seconds, _)| *seconds);
     let marks: Value =
         [25, 30, 32, 34, 35, 36, 37].map(|mark| (mark.to_string(), json!(reached(mark.into())))).into_iter().collect();

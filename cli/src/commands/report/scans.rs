@@ -137,8 +137,9 @@ impl Group {
             let Some(path) = found[i].volume().filter(|_| voxels.is_some()) else { continue };
             let volume = conefield_io::read_volume(&path)?;
             let own = own_grid(&volume, grid.as_ref());
-            let result = PageVolume::new(&page.runs[i].name, false, &volume, &own, coarser)?;
-            results[i] = Some(in_unit(result, scan.as_ref().map(|s| &s.unit)));
+            let mut result = PageVolume::new(&page.runs[i].name, false, &volume, &own, coarser)?;
+            set_unit(&mut result, scan.as_ref().map(|s| &s.unit));
+            results[i] = Some(result);
             if let Some(shown) = &mut shown {
                 page.runs[i].scan = Some(at);
                 page.runs[i].views = Some(shown.predict(&volume, own, options)?);
@@ -152,8 +153,8 @@ impl Group {
                 // The truth in this scan is not the one of the run.
                 _ => continue,
             };
-            let reference = PageVolume::new(REFERENCE, true, &volume, &own_grid(&volume, grid.as_ref()), coarser)?;
-            let reference = in_unit(reference, scan.as_ref().map(|s| &s.unit));
+            let mut reference = PageVolume::new(REFERENCE, true, &volume, &own_grid(&volume, grid.as_ref()), coarser)?;
+            set_unit(&mut reference, scan.as_ref().map(|s| &s.unit));
             // The scans of several seeds have the same truth.
             let listed = references.iter().position(|(_, r)| r.same_as(&reference));
             let at = listed.unwrap_or_else(|| {
@@ -164,7 +165,7 @@ impl Group {
         }
         if let Some(at) = window_from {
             for (i, _) in &self.runs {
-                results[*i] = results[*i].take().map(|r| r.in_window_of(&references[at].1));
+                results[*i].iter_mut().for_each(|r| r.window = references[at].1.window);
             }
         }
         if let (Some(scan), Some(shown), Some(place)) = (&scan, shown, &self.scan) {
@@ -214,14 +215,10 @@ fn own_grid(volume: &Volume, grid: Option<&VoxelGrid>) -> VoxelGrid {
 
 /// Sets the unit of attenuation and the value of water: about 0.02/mm at CT energies, or the value to which HU from
 /// −1000 to 2000 are mapped in volumes from 0 to 1.
-fn in_unit(volume: PageVolume, unit: Option<&Unit>) -> PageVolume {
-    match unit {
-        None => volume,
-        Some(unit) if ["mm", "cm", "m"].contains(&&unit.name[..]) => {
-            volume.in_unit(&format!("1/{}", unit.name), 0.02 * unit.mm)
-        }
-        Some(unit) => volume.in_unit(&format!("1/{}", unit.name), 1.0 / 3.0),
-    }
+fn set_unit(volume: &mut PageVolume, unit: Option<&Unit>) {
+    let Some(unit) = unit else { return };
+    let length = ["mm", "cm", "m"].contains(&&unit.name[..]);
+    (volume.unit, volume.water) = (format!("1/{}", unit.name), if length { 0.02 * unit.mm } else { 1.0 / 3.0 });
 }
 
 /// Some views of a scan, with what is needed after the runs' predictions.

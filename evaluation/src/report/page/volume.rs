@@ -20,21 +20,26 @@ const NO_NUMBER: i16 = i16::MIN;
 /// A volume with metadata for the viewer.
 #[derive(Debug, Serialize)]
 pub struct PageVolume {
-    name: String,
-    reference: bool,
-    shape: [usize; 3],
+    /// Its display name.
+    pub name: String,
+    /// Whether it is a reference.
+    pub reference: bool,
+    /// Voxels of the page along x, y and z.
+    pub shape: [usize; 3],
     /// mm.
     spacing: [f64; 3],
     center: [f64; 3],
-    unit: String,
+    /// Of its values.
+    pub unit: String,
     /// The attenuation of water, as an initial guess.
-    water: f64,
+    pub water: f64,
     /// A value is `stored · slope + offset`.
     slope: f64,
     offset: f64,
     low: f64,
     high: f64,
-    window: [f32; 2],
+    /// The automatic grey window.
+    pub window: [f32; 2],
     coarser: usize,
     note: String,
     #[serde(skip)]
@@ -86,40 +91,10 @@ impl PageVolume {
         })
     }
 
-    /// Sets the unit of its values, and the attenuation of water in it.
-    pub fn in_unit(self, unit: &str, water: f64) -> Self {
-        Self { unit: unit.to_owned(), water, ..self }
-    }
-
-    /// Sets its display name.
-    pub fn named(self, name: &str) -> Self {
-        Self { name: name.to_owned(), ..self }
-    }
-
-    /// Sets its automatic grey window to that of `other`, so that both are shown alike.
-    pub fn in_window_of(self, other: &Self) -> Self {
-        Self { window: other.window, ..self }
-    }
-
     /// Whether both have the same voxels on the same grid.
     pub fn same_as(&self, other: &Self) -> bool {
         (&self.packed, self.slope, self.offset) == (&other.packed, other.slope, other.offset)
             && (self.shape, self.spacing, self.center) == (other.shape, other.spacing, other.center)
-    }
-
-    /// Its display name.
-    pub fn name(&self) -> &str {
-        &self.name
-    }
-
-    /// Whether it is a reference.
-    pub fn is_reference(&self) -> bool {
-        self.reference
-    }
-
-    /// Voxels of the page along x, y and z.
-    pub fn shape(&self) -> [usize; 3] {
-        self.shape
     }
 
     /// The stored numbers, x fastest: all high bytes, then all low bytes, gzip, base64.
