@@ -15,8 +15,7 @@ pub use conefield_io::read_weights;
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
 use conefield_scans::diagnosis::{Survey, survey};
 use std::collections::BTreeMap;
-use std::io::ErrorKind;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// The volume named `name`: `phantom:KIND[:SIZE]` or a file.
 pub fn volume(name: &str) -> Result<Volume> {
@@ -46,22 +45,6 @@ fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
         Ok(size @ 8..=1024) => Ok(Some((kind, size))),
         _ => Err(Error::invalid(name, "size", size, "a number of voxels from 8 to 1024")),
     }
-}
-
-/// The content of an output folder, nothing if there is none. Refuses a folder with anything that is not `known` to be what a
-/// command writes.
-pub fn written_by(folder: &Path, known: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {
-    let entries = match std::fs::read_dir(folder) {
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
-        entries => entries.and_then(|all| all.map(|e| Ok(e?.path())).collect::<std::io::Result<Vec<_>>>()),
-    };
-    let mut entries = entries.map_err(|e| Error::io(folder, e))?;
-    entries.sort();
-    if let Some(other) = entries.iter().find(|path| !known(path)) {
-        let found = format!("a folder with {} in it", other.file_name().unwrap_or_default().to_string_lossy());
-        return Err(Error::invalid(folder.display().to_string(), "output", found, "a new or empty folder"));
-    }
-    Ok(entries)
 }
 
 /// Reads a scan and logs warnings about problems for a reconstruction.

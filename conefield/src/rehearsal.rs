@@ -78,13 +78,13 @@ mod tests {
             let sets: Vec<_> = sets.iter().map(|set| set.to_string()).collect();
             let loaded = Draft::find(spec, &sets, SHIPPED).unwrap().finish().unwrap();
             rehearse(&loaded, &backend, &AtomicBool::new(false)).unwrap();
-            let rehearsed = backend.shared().kernels.labels();
+            let rehearsed = backend.kernels();
             assert!(rehearsed.len() > 2, "{spec}: {rehearsed:?}");
             let scan = speed::scan(6, 24, 20);
             let limits = Limits { steps: Some(2), ..Limits::default() };
             let mut plan = method::plan(&loaded, &backend).unwrap();
             plan.run(&Job { limits, ..Job::new(&scan, &backend) }, &mut Silent).unwrap();
-            assert_eq!(backend.shared().kernels.labels(), rehearsed, "{spec}");
+            assert_eq!(backend.kernels(), rehearsed, "{spec}");
         }
     }
 }

@@ -91,6 +91,11 @@ impl Wgpu {
     pub fn adapter(&self) -> &Adapter {
         &self.shared.gpu.adapter
     }
+
+    /// Labels of the kernels compiled so far, in alphabetical order.
+    pub fn kernels(&self) -> Vec<String> {
+        self.shared.kernels.labels()
+    }
 }
 
 impl Backend for Wgpu {

@@ -1,7 +1,6 @@
 //! The search: every candidate under the smallest budget, the best share of them under the next one, and so on. The
 //! state is kept in the search's folder, from which it can be resumed.
 
-use crate::files;
 use crate::record::ScanRecord;
 use crate::study::outcome::{Outcome, Status};
 use crate::tradeoff::front::Unknowns;

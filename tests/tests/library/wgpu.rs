@@ -14,7 +14,7 @@ use conefield_core::method::{Job, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::prior::Prior;
 use conefield_core::random::mix;
-use conefield_core::runner::Runner;
+use conefield_core::scene::Scene;
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
 use conefield_core::stage::{
     Encoder, Field, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Samples, Scope, Stage, UnitRay,
@@ -103,7 +103,7 @@ fn rays_that_miss_the_scene_are_zero() {
     let scan = scan();
     let scene = Scene::new(&scan, &conefield_core::scene::SceneSettings::default()).unwrap();
     for (name, backend) in crate::device::backends("rays beside the scene") {
-        let mut model = Model::random(crate::common::pipeline(&spec(&settings()).unwrap()), 3);
+        let mut model = Model::random(pipeline(&settings()), 3);
         let ray = UnitRay { inside: [0.0; 2], ..scene.pixel_ray(&scan.geometry, 0, 8, 8) };
         assert_eq!(model.pipeline.projector.max_samples(&ray), 0);
         let mut exe = backend.compile(&model.pipeline).unwrap().0;
