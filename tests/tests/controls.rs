@@ -784,11 +784,11 @@ fn wgsl_with_another_derivative_fails() {
     for [cpu, device] in
         [[LossFault::None; 2], [LossFault::None, LossFault::Derivative], [LossFault::Derivative, LossFault::None]]
     {
-        let report = check_loss_wgsl(&ToyLoss { on_device: device, ..ToyLoss::new(cpu) }, &*shared);
+        let report = check_loss_wgsl(&ToyLoss { on_device: device, ..ToyLoss::new(cpu) }, shared);
         assert_eq!(report.passed(), cpu == device, "{report}");
     }
     for on_device in [PriorFault::None, PriorFault::Forgotten] {
-        let report = check_prior_wgsl(&ToyPrior { on_device, ..ToyPrior::new(PriorFault::None) }, &*shared);
+        let report = check_prior_wgsl(&ToyPrior { on_device, ..ToyPrior::new(PriorFault::None) }, shared);
         assert_eq!(report.passed(), on_device == PriorFault::None, "{report}");
     }
 }

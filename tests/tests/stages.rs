@@ -274,7 +274,7 @@ fn opened() {
         let opened = Opened::new(Arc::from(stage), channels).unwrap();
         expect(check_encoder(&opened, &options));
         if let Some(shared) = device::shared("the WGSL of a stage") {
-            expect(check_wgsl(&opened, &options, &*shared));
+            expect(check_wgsl(&opened, &options, shared));
         }
     }
     let of = |settings| serde_json::from_value::<Box<dyn EncoderSpec>>(settings).unwrap().build().unwrap();
