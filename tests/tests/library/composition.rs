@@ -143,7 +143,8 @@ fn what_does_not_fit_is_refused_in_words() {
         let known = if key == "type" { "neural-field".to_owned() } else { format!("{key} type") };
         refused(&spec, &[key, "nothing", &known]);
     }
-    let changes: [(fn(&mut Value), &[&str]); 8] = [
+    type Change = fn(&mut Value);
+    let changes: [(Change, &[&str]); 8] = [
         (|v| v["field"]["skips"] = json!([3]), &["field.skips", "3", "1 to 2"]),
         (|v| v["field"]["skips"] = json!([0]), &["field.skips", "0", "1 to 2"]),
         (|v| v["encoder"] = json!({"type": "dense-grid", "levels": 0}), &["encoder.levels", "found 0", "1 to 32"]),
