@@ -5,11 +5,12 @@
 # and with LayerNorm (LN), MCI weights and the FFT mask. MCI weights come from 600 steps on abdomen_128, for the abdomen from chest_128;
 # +LN+MCI@VOLUME,VOLUME:STEPS[:RATE] takes others. Each has STEPS (900) of 1024 rays with 192 samples inside the volume. Each of SEEDS
 # ("0 1 2") is another noise and another start. OUT_FOLDER/ablation.md has PSNR by steps, mean and half the range over SEEDS; VOLUME.png
-# has the curves, drawn by PYTHON with matplotlib. Steps are counted, not timed: other work on the machine changes nothing. BACKEND "wgpu" trains on a GPU.
-# What is there is not run again.
+# has the curves; the variable PYTHON (python3) names a Python with matplotlib. Steps are counted, not timed: other work on the machine
+# changes nothing. BACKEND "wgpu" trains on a GPU. What is there is not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
+"${PYTHON:-python3}" -c "import matplotlib" # Before hours of work.
 steps=${3:-900}
 seeds=${4:-0 1 2}
 volumes=${5:-chest_128 head_256 engine_256}

@@ -3,7 +3,8 @@
 data=$1
 out=$2
 mkdir -p "$out"
-cargo build --release --quiet --bin conefield
+# Where there is no cargo, the program is there.
+if command -v cargo >/dev/null; then cargo build --release --quiet --bin conefield; fi
 bin=${CARGO_TARGET_DIR:-target}/release/conefield
 
 # The scan that published figures are of, 50 noisy views of a volume of DATA_FOLDER, unless it is there already:

@@ -4,11 +4,12 @@
 # DATA_FOLDER holds volumes/*.nii.gz. MCI weights come from abdomen alone, for each way with normalizers of its own. Steps
 # (1000) end a run, so that the load of the machine does not matter. The learning rate stays as it is, or its fall would
 # look like stability; it is five times the published one. Tables, rays and samples are few, so that a run takes a minute.
-# Leaves OUT_FOLDER/VOLUME-drift.png (drift against epochs) and VOLUME-psnr.png, drawn by PYTHON with matplotlib; finished runs
-# are not run again.
+# Leaves OUT_FOLDER/VOLUME-drift.png (drift against epochs) and VOLUME-psnr.png; the variable PYTHON (python3) names a Python with
+# matplotlib. Finished runs are not run again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
+"${PYTHON:-python3}" -c "import matplotlib" # Before hours of work.
 steps=${3:-1000}
 volume=${4:-chest_128}
 scan=$out/$volume

@@ -3,11 +3,12 @@
 #   bash benches/views.sh DATA_FOLDER OUT_FOLDER [SECONDS [VIEWS [VOLUME [DOWNSAMPLE [DETECTOR]]]]]
 # DATA_FOLDER holds volumes/*.nii.gz. Every neural method trains for SECONDS (300), its learning rate aiming at that end;
 # classical ones end by themselves. VIEWS ("10 25 50 75 100") are spread over the full circle, with the published noise.
-# DOWNSAMPLE (1) and DETECTOR (512x512) make it small. PYTHON has matplotlib. Leaves OUT_FOLDER/psnr.png, ssim.png (ssim_2d)
+# DOWNSAMPLE (1) and DETECTOR (512x512) make it small. The variable PYTHON (python3) names a Python with matplotlib. Leaves OUT_FOLDER/psnr.png, ssim.png (ssim_2d)
 # and views.md; an interrupted run goes on where it was.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source benches/common.sh
+"${PYTHON:-python3}" -c "import matplotlib" # Before hours of work.
 seconds=${3:-300}
 views=${4:-10 25 50 75 100}
 volume=${5:-abdomen_128}
@@ -40,7 +41,7 @@ for comparison in comparisons:
     n, folder = comparison.split("=", 1)
     views += [] if int(n) in views else [int(n)]
     for method in json.load(open(f"{folder}/table.json"))["methods"]:
-        found.setdefault(method["name"], {})[int(n)] = method["scores"]
+        found.setdefault(method["name"], {})[int(n)] = method.get("scores")
 views.sort()
 for key, picture, label in [("psnr", "psnr.png", "PSNR, dB"), ("ssim_2d", "ssim.png", "ssim_2d")]:
     figure, panel = plt.subplots(figsize=(12, 8))
@@ -50,7 +51,7 @@ for key, picture, label in [("psnr", "psnr.png", "PSNR, dB"), ("ssim_2d", "ssim.
     panel.set(title=title, xlabel="views", ylabel=label)
     panel.legend()
     figure.savefig(f"{out}/{picture}")
-print("| method | " + " | ".join(f"{n} views" for n in views) + " |\n| --- |" + " ---: |" * len(views))
+print("PSNR in dB / ssim_2d\n\n| method | " + " | ".join(f"{n} views" for n in views) + " |\n| --- |" + " ---: |" * len(views))
 for name, by_views in found.items():
     cells = (by_views.get(n) for n in views)
     print(f"| {name} | " + " | ".join(f"{s['psnr']:.2f} / {s['ssim_2d']:.4f}" if s else "-" for s in cells) + " |")

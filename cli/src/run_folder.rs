@@ -69,7 +69,7 @@ impl RunFolder {
         let place = self.0.path().display().to_string();
         CONTENTS.entries(self.0.path())?;
         // A spec without a record beside it is the user's.
-        let has = |name: &str| self.file(name).exists();
+        let has = |name: &str| self.file(name).symlink_metadata().is_ok();
         let own = has("spec.toml") && !has("metrics.jsonl");
         ensure(!own, &place, "output", "a folder with spec.toml in it", "a new or empty folder")?;
         let expected = "a new or empty folder, or --force to replace the run";

@@ -2,10 +2,10 @@
 
 use crate::method;
 use crate::tradeoff::speed;
-use conefield_core::Result;
 use conefield_core::backend::Backend;
 use conefield_core::method::{Job, Limits, Observer, Record};
 use conefield_core::spec::load::Loaded;
+use conefield_core::{Error, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 use tracing::debug;
@@ -26,8 +26,16 @@ impl Observer for Curtain<'_> {
     }
 }
 
+/// Falls also where reading panics.
+impl Drop for Curtain<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
 /// Runs `read`. Meanwhile a backend with a device runs a step of the method of `loaded` on a tiny scan, which compiles the
-/// kernels that the run needs: their text does not depend on sizes. If this fails, the run says why.
+/// kernels that the run needs: their text does not depend on sizes. The later methods of a chain go on until the inputs are
+/// read. If this fails, the run says why.
 pub fn meanwhile<T>(loaded: &Loaded, backend: &dyn Backend, read: impl FnOnce() -> Result<T>) -> Result<T> {
     if backend.device().is_none() {
         return read();
@@ -36,12 +44,12 @@ pub fn meanwhile<T>(loaded: &Loaded, backend: &dyn Backend, read: impl FnOnce() 
     std::thread::scope(|threads| {
         let begin = Instant::now();
         let rehearsal = threads.spawn(|| with_default(NoSubscriber::default(), || rehearse(loaded, backend, &done)));
+        let curtain = Curtain(&done);
         let found = read();
-        done.store(true, Ordering::Relaxed);
+        drop(curtain);
         let read_s = begin.elapsed().as_secs_f64();
-        let compiled = matches!(rehearsal.join(), Ok(Ok(())));
-        let (all, s) = (if compiled { "all" } else { "some" }, begin.elapsed().as_secs_f64());
-        debug!("inputs read after {read_s:.2} s, {all} kernels compiled after {s:.2} s");
+        let all = if matches!(rehearsal.join(), Ok(Ok(()))) { "all" } else { "not all" };
+        debug!("inputs read after {read_s:.2} s, {all} kernels compiled after {:.2} s", begin.elapsed().as_secs_f64());
         found
     })
 }
@@ -49,6 +57,9 @@ pub fn meanwhile<T>(loaded: &Loaded, backend: &dyn Backend, read: impl FnOnce() 
 /// One step of the method, unless `done`.
 fn rehearse(loaded: &Loaded, backend: &dyn Backend, done: &AtomicBool) -> Result<()> {
     let mut plan = method::plan_without_files(loaded, backend)?;
+    if done.load(Ordering::Relaxed) {
+        return Err(Error::Interrupted { step: 0 });
+    }
     let scan = speed::scan(4, 16, 16);
     let limits = Limits { steps: Some(1), ..Limits::default() };
     plan.run(&Job { limits, ..Job::new(&scan, backend) }, &mut Curtain(done)).map(drop)
@@ -64,7 +75,8 @@ mod tests {
 
     #[test]
     fn a_run_finds_its_kernels_compiled() {
-        let all: [(&str, &[&str]); 7] = [
+        let all: [(&str, &[&str]); 8] = [
+            ("smooth-tv", &[]),
             ("fdk", &[]),
             ("fista-tv", &[]),
             ("sart", &[]),
@@ -86,5 +98,13 @@ mod tests {
             plan.run(&Job { limits, ..Job::new(&scan, &backend) }, &mut Silent).unwrap();
             assert_eq!(backend.kernels(), rehearsed, "{spec}");
         }
+    }
+
+    #[test]
+    fn an_error_of_reading_ends_a_rehearsal() {
+        let Ok(backend) = Wgpu::open(None) else { return eprintln!("SKIPPED: no adapter for rehearsals") };
+        let loaded = Draft::find("smooth-tv", &[], SHIPPED).unwrap().finish().unwrap();
+        let found = meanwhile(&loaded, &backend, || Err::<(), _>(Error::unsupported("scan", "it ends too early")));
+        assert!(found.unwrap_err().to_string().contains("it ends too early"));
     }
 }

@@ -97,10 +97,11 @@ impl<'a> Session<'a> {
 
     /// Reads the inputs by `read`. A device meanwhile compiles the kernels of the requested method.
     pub fn reading<T>(&self, read: impl FnOnce() -> Result<T>) -> Result<T> {
-        match self.requested() {
-            Some(loaded) => rehearsal::meanwhile(loaded, self.backend, read),
-            None => read(),
-        }
+        let Wish::Method(Planned { loaded, plan, .. }) = &self.wish else { return read() };
+        // The method's parameters are then there beside what reading takes.
+        let needs = plan.needs(&self.run.scan.header());
+        let both = self.run.reading().total + needs.model + needs.optimizer + needs.backend;
+        if both > memory::limit() { read() } else { rehearsal::meanwhile(loaded, self.backend, read) }
     }
 
     /// Plans the run on `input`. Within a budget this measures the machine for a few seconds. `spent` are the seconds of

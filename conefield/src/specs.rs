@@ -90,6 +90,19 @@ mod tests {
         }
     }
 
+    #[test]
+    fn a_key_below_a_word_and_a_bare_type_are_as_good_as_a_table() {
+        let tree = |sets: &[&str]| {
+            read("balanced", &sets.iter().map(|s| s.to_string()).collect::<Vec<_>>()).unwrap().tree.clone()
+        };
+        let [table, key] = ["scene.support={cylinder={radius=35}}", "scene.support.cylinder.radius=35"];
+        assert_eq!(tree(&[key])["scene"], tree(&[table])["scene"]);
+        assert_eq!(tree(&["encoder.levels=5", "encoder=dense-grid"])["encoder"]["levels"], 5);
+        // The last of two names of a stage counts.
+        let last = tree(&["encoder=hash-grid", "encoder=dense-grid"]);
+        assert_eq!(last["encoder"]["type"], "dense-grid");
+    }
+
     /// A chain cannot contain a chain, so `smooth-gaussians` repeats the methods of `smooth-tv`, and `smooth-patches` all but
     /// two priors.
     #[test]

@@ -315,11 +315,13 @@ impl Geometry {
 }
 
 /// Scalar product.
+#[inline]
 pub fn dot(a: Vec3, b: Vec3) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 /// Vector product.
+#[inline]
 pub fn cross(a: Vec3, b: Vec3) -> Vec3 {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
@@ -332,11 +334,13 @@ fn turned(a: Vec3, axis: Vec3, Radians(angle): Radians) -> Vec3 {
 }
 
 /// Difference `a − b`.
+#[inline]
 pub fn sub(a: Vec3, b: Vec3) -> Vec3 {
     std::array::from_fn(|k| a[k] - b[k])
 }
 
 /// Euclidean length.
+#[inline]
 pub fn norm(a: Vec3) -> f64 {
     dot(a, a).sqrt()
 }

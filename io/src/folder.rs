@@ -46,7 +46,7 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
 /// No name of a file in a description holds a colon.
 pub(crate) fn split(name: &str) -> (&str, Option<&str>) {
     match name.split_once(':') {
-        Some((file, part)) if Path::new(file).extension().is_some() => (file, Some(part)),
+        Some((file, part)) if file.contains('.') => (file, Some(part)),
         _ => (name, None),
     }
 }
@@ -109,7 +109,10 @@ pub(crate) fn names(folder: &Path, ends: &[&str]) -> Result<Vec<String>> {
 /// slashes, in the order of [`names`]. Links to folders are not followed.
 pub(crate) fn below(folder: &Path, depth: usize, ends: &[&str]) -> Result<Vec<String>> {
     let mut found = names(folder, ends)?;
-    for entry in entries(folder)?.iter().filter(|e| depth > 0 && e.file_type().is_ok_and(|t| t.is_dir())) {
+    if depth == 0 {
+        return Ok(found);
+    }
+    for entry in entries(folder)?.iter().filter(|e| e.file_type().is_ok_and(|t| t.is_dir())) {
         if let Ok(name) = entry.file_name().into_string() {
             found.extend(below(&entry.path(), depth - 1, ends)?.into_iter().map(|n| format!("{name}/{n}")));
         }

@@ -76,8 +76,8 @@ pub(crate) fn shape(path: &Path, name: Option<&str>, part: ScanPart) -> Result<V
     Ok(shape)
 }
 
-/// Reads all of the data set `name`, or `part` of the scan in the group `name` (or in the file if there is no name), and
-/// whether it is such a scan, whose first axis is the views.
+/// Reads all of the data set `name`, or `part` of the scan in the group `name` (or in the file if there is no name). Also
+/// returns whether the first axis is the views: it is in a scan, not in a plain data set.
 ///
 /// Accepts two or three axes of integers of 1 to 8 bytes or floats of 4 or 8; the axes keep the file's order. Refuses
 /// other types, sizes that the file cannot hold, missing chunks and values that are not finite.

@@ -2,8 +2,8 @@
 //!
 //! - Volumes: [`read_volume`], [`write_volume`], [`write_voxels`] (NIfTI, MetaImage, NRRD, NumPy, TIFF stacks,
 //!   OME-Zarr, a DICOM series).
-//! - Scans: [`read_scan`], [`read_truth`]; [`read_data_set`] also reads test views. [`write_scan`] (conefield's own
-//!   folder), [`write_r2`] (R2-Gaussian's folder), [`write_naf`] (NAF's file), [`write_rtk`] (for RTK).
+//! - Scans: [`read_scan`], [`read_truth`], [`read_data_set`], which also reads test views (conefield's own folder,
+//!   R2-Gaussian's folder, NAF's file); [`write_scan`], [`write_r2`], [`write_naf`], [`write_rtk`] (for RTK).
 //! - Projections from scanners: [`read_scanner`] (a description in TOML; TIFF, NumPy, HDF5, RTK's XML geometry; the
 //!   files of vendors), as [`Stored`]: line integrals or counts.
 //! - Sizes, before memory is allocated: [`scan_size`], [`scanner_size`], [`volume_voxels`].

@@ -242,7 +242,10 @@ fn sources(folder: &Path, place: &str, field: &str, names: &Names) -> Result<(Ve
 /// Adds the files that `name` stands for to `all`; what is odd about them.
 fn source(folder: &Path, place: &str, field: &str, name: &str, all: &mut Vec<StackFile>) -> Result<Option<String>> {
     let (file, array) = folder::split(name);
-    let path = folder::within(folder, place, field, file)?;
+    let path = match array {
+        Some(_) => folder::inside(folder, place, field, file)?,
+        None => folder::within(folder, place, field, file)?,
+    };
     if array.is_some() || path.is_file() {
         all.push(StackFile { path, array: array.map(str::to_owned) });
         return Ok(None);

@@ -171,5 +171,9 @@ mod tests {
         let numbers = [0.0f64; 3].map(f64::to_le_bytes).concat();
         refused("a.npy", &npy_bytes("<f8", false, "(3,)", &numbers), 12, &["shape", "[3]", "[views, 12]"]);
         refused("a.npy:x", &npy_bytes("<f8", false, "(3,)", &numbers), 1, &["array", "\"x\"", ".npz"]);
+        for name in ["../a.csv", "none.csv"] {
+            let found = read(Path::new("."), "s.toml", "circle.angles_deg", name, 1);
+            says(found, &["s.toml: circle.angles_deg", name]);
+        }
     }
 }

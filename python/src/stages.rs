@@ -90,14 +90,15 @@ impl StageObject {
         Python::attach(|py| call(py, self.object.bind(py)).map_err(|e| self.raised.note(e)).ok())
     }
 
-    /// The exception of a failed call as an error.
+    /// The exception of a failed call as an error. It stays until the work ends, whose caller raises it.
     pub fn fault(&self) -> Result<()> {
         if !self.raised.any() {
             return Ok(());
         }
-        Python::attach(|py| match &*locked(&self.raised.0) {
-            Some(e) => Err(Error::unsupported(self.name, words(py, e))),
-            None => Ok(()),
+        Python::attach(|py| {
+            // The lock is free while the exception is put into words, which may run Python.
+            let raised = locked(&self.raised.0).as_ref().map(|e| e.clone_ref(py));
+            raised.map_or(Ok(()), |e| Err(Error::unsupported(self.name, words(py, &e))))
         })
     }
 

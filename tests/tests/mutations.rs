@@ -4,7 +4,7 @@ use conefield_tests::hostile::watch::{Bounds, Meter, ReaderFault};
 use conefield_tests::hostile::{PARSERS, Parser, find};
 use peak_alloc::PeakAlloc;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::time::Duration;
 
 #[global_allocator]
@@ -49,13 +49,11 @@ fn parts() {
     let part = |k: usize| {
         let mut program = Command::new(std::env::current_exe().unwrap());
         program.arg("--nocapture").env("CONEFIELD_PART", k.to_string());
-        program.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+        program.spawn().unwrap()
     };
-    for part in (0..PARTS).map(part).collect::<Vec<_>>() {
-        let ended = part.wait_with_output().unwrap();
-        println!("{}", String::from_utf8_lossy(&ended.stdout));
-        assert!(ended.status.success(), "{}", String::from_utf8_lossy(&ended.stderr));
-    }
+    let started: Vec<_> = (0..PARTS).map(part).collect();
+    let ended: Vec<_> = started.into_iter().map(|mut part| part.wait().unwrap()).collect();
+    assert!(ended.iter().all(|status| status.success()), "see above: {ended:?}");
 }
 
 /// The only test of this program: the allocator counts for the whole process.

@@ -171,7 +171,8 @@ impl CompareArgs {
 
     /// Refuses to replace an input.
     fn spare_inputs(&self, methods: &[Method]) -> Result<()> {
-        let inputs = Inputs::of([&self.scan]).and(&self.protocol.reference);
+        let named = self.protocol.reference.iter().filter(|r| !conefield::input::is_truth(r));
+        let inputs = Inputs::of([&self.scan]).and(named);
         methods.iter().fold(inputs, |inputs, m| inputs.and_spec(&m.loaded)).spare_folder(&self.output)
     }
 

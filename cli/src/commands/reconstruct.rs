@@ -169,7 +169,7 @@ impl ReconstructArgs {
         let inputs = Inputs::of([&self.scan])
             .and(&self.front)
             .and(&self.init)
-            .and(&self.protocol.reference)
+            .and(self.protocol.reference.iter().filter(|r| !input::is_truth(r)))
             .and(self.units.path());
         let inputs = match session.requested() {
             Some(loaded) if !self.resume => inputs.and_spec(loaded),

@@ -63,6 +63,25 @@ fn explain_says_what_a_gpu_makes_of_a_spec() {
     }
 }
 
+/// Both specs of Gaussians, the published one with its prior and its density control, end at the same PSNR.
+#[test]
+fn gaussians_end_where_the_cpu_ends() {
+    if !adapter("runs of Gaussians") {
+        return;
+    }
+    let d = Folder::after(&["simulate phantom:head:32 -o scan --views 20 --detector 32x32"]);
+    for (spec, more) in
+        [("gaussians", ""), ("gaussians-published", "--set=density_control.every=20 --set=density_control.from=0")]
+    {
+        let psnr = ["cpu", "wgpu"].map(|backend| {
+            let fixed = format!("--set=start.count=800 --set=most=1200 --steps=50 {more}");
+            number(&reconstruct(&d, &format!("{spec}-{backend}"), spec, backend, &fixed)["scores"]["psnr"])
+        });
+        println!("{spec}: {psnr:?} dB");
+        assert!((psnr[0] - psnr[1]).abs() < 0.01 && psnr[0] > 15.0, "{spec}: {psnr:?} dB");
+    }
+}
+
 const TINY: &str = "--set=encoder.levels=2 --set=encoder.log2_table_size=10 --set=training.rays=48 \
                     --set=projector.samples=16 --set=field.width=8";
 

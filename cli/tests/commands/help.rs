@@ -76,7 +76,7 @@ fn version_is_printed() {
     assert_eq!(Folder::new().done("--version").trim(), concat!("conefield ", env!("CARGO_PKG_VERSION")));
 }
 
-/// Options that need or exclude each other; `bad_input` has the values.
+/// Wrong use; see also `bad_input`.
 #[test]
 fn wrong_use_exits_with_2() {
     let d = Folder::new();

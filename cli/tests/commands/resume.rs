@@ -12,6 +12,7 @@ fn line(run: &str, steps: u64, more: &str) -> String {
 
 /// Whether two finished runs are the same, to the bit.
 fn same_results(d: &Folder, a: &str, b: &str) {
+    assert!(d.at(a).join("volume.nii.gz").exists(), "{a}");
     for file in ["volume.nii.gz", "weights.safetensors"].into_iter().filter(|file| d.at(a).join(file).exists()) {
         assert!(d.bytes(format!("{a}/{file}")) == d.bytes(format!("{b}/{file}")), "{file} of {b} differs");
     }

@@ -280,7 +280,7 @@ fn said<'de, D: Deserializer<'de>, T>(
 }
 
 /// Functions that deserialize a setting which is written as on the command line.
-macro_rules! settings {
+macro_rules! as_on_the_command_line {
     ($($name:ident: $type:ty = $parse:path;)*) => {$(
         fn $name<'de, D: Deserializer<'de>>(from: D) -> Result<Option<$type>, D::Error> {
             said(from, $parse)
@@ -288,7 +288,7 @@ macro_rules! settings {
     )*};
 }
 
-settings! {
+as_on_the_command_line! {
     seconds: f64 = parse::seconds;
     above_zero: f64 = parse::above_zero;
     hold_out: HoldOut = parse::hold_out;

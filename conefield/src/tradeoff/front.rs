@@ -25,7 +25,7 @@ pub enum Unknowns {
 }
 
 impl Unknowns {
-    /// The unknowns of a method; for a chain, of its first method.
+    /// The unknowns of a method. A chain with a field trains a field.
     pub fn of(plan: &dyn Plan) -> Self {
         if plan.pipeline().is_some() { Self::Field } else { Self::Voxels }
     }

@@ -76,7 +76,9 @@ impl Draft {
         let mut ordered: Vec<Set> = vec![];
         for set in sets {
             let set = Set::parse(set)?;
-            let before = set.stage().and_then(|stage| ordered.iter().position(|s| s.path.starts_with(stage)));
+            let before = set
+                .stage()
+                .and_then(|stage| ordered.iter().position(|s| s.path.starts_with(stage) && s.stage() != Some(stage)));
             ordered.insert(before.unwrap_or(ordered.len()), set);
         }
         for set in ordered {

@@ -201,5 +201,7 @@ mod tests {
             let e = agreement(a.view(), b.view(), Threshold::Otsu).unwrap_err().to_string();
             assert!(e.contains(what), "{e}");
         }
+        let [two, three] = [volume(&[0.0, 1.0]), volume(&[0.0, 1.0, 1.0])];
+        assert!(agreement(two.view(), three.view(), Threshold::Otsu).is_err());
     }
 }

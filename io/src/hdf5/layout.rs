@@ -4,7 +4,7 @@ use super::{Container, ScanPart};
 use conefield_core::Result;
 use hdf5_reader::Dataset;
 
-/// What a name in a file refers to.
+/// What a name in a file refers to: a data set, or a scan in a known layout.
 pub(super) enum Layout {
     /// A plain data set.
     Plain(Box<Dataset>),

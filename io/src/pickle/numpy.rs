@@ -30,16 +30,21 @@ const NAMES: [(&str, Global); 6] = [
 
 impl Global {
     pub fn find(module: &str, name: &str) -> Result<Self, Refusal> {
+        let refused = || {
+            let shown = |t: &str| t.chars().take(60).flat_map(char::escape_debug).collect::<String>();
+            let expected = "data only: the names that NumPy's arrays, dtypes and numbers need";
+            Refusal::new(format!("the name {}.{}", shown(module), shown(name)), expected)
+        };
+        // No known name is longer; a copy of a huge one would take memory.
+        if module.len() + name.len() > 60 {
+            return Err(refused());
+        }
         // NumPy 2 renamed its core.
         let whole = match module.strip_prefix("numpy._core.") {
             Some(part) => format!("numpy.core.{part}.{name}"),
             None => format!("{module}.{name}"),
         };
-        NAMES.iter().find(|(known, _)| *known == whole).map(|(_, global)| *global).ok_or_else(|| {
-            let shown = |t: &str| t.chars().take(60).flat_map(char::escape_debug).collect::<String>();
-            let expected = "data only: the names that NumPy's arrays, dtypes and numbers need";
-            Refusal::new(format!("the name {}.{}", shown(module), shown(name)), expected)
-        })
+        NAMES.iter().find(|(known, _)| *known == whole).map(|(_, global)| *global).ok_or_else(refused)
     }
 
     pub fn name(self) -> &'static str {

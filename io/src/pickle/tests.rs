@@ -198,6 +198,23 @@ fn what_is_written_comes_back() {
     says(item("b").numbers(), &["a: b: found a list of 4"]);
 }
 
+#[test]
+fn every_cut_and_every_changed_byte_of_a_named_array_is_survived() {
+    let bytes = whole(&array_of("numpy._core", "f4", "<", &[2], false, &[0; 8]));
+    for cut in 0..bytes.len() {
+        refused(&bytes[..cut], &["byte"]);
+    }
+    for at in 0..bytes.len() {
+        for flip in [0x01, 0x80, 0xff, 0x10] {
+            let mut changed = bytes.clone();
+            changed[at] ^= flip;
+            if let Ok(p) = Pickle::parse("a", &changed) {
+                let _ = (p.top().numbers(), p.top().number(), p.top().keys(), p.top().values(&[2], ""));
+            }
+        }
+    }
+}
+
 proptest::proptest! {
     #[test]
     fn no_opcodes_make_it_panic(picks in proptest::collection::vec(0usize..40, 0..300)) {

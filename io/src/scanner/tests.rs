@@ -55,18 +55,17 @@ impl Ellipsoids {
         read_scanner(path, None).unwrap()
     }
 
-    /// How far a scan is off the volume, relative to the scan.
-    fn error(&self, scan: &Scan) -> f64 {
-        rays::agreement(scan, &self.exact.volume.as_ref().unwrap().data).unwrap().residual
+    fn agreement(&self, scan: &Scan) -> rays::Agreement {
+        rays::agreement(scan, &self.exact.volume.as_ref().unwrap().data).unwrap()
     }
 }
 
 #[test]
 fn every_wrong_setting_is_measurably_worse() {
     let Some(e) = Ellipsoids::find() else { return };
-    let right = e.error(&e.changed(&[]));
-    println!("right {right:.4}");
-    assert!(right < 0.05, "{right}");
+    let rays::Agreement { ratio, residual: right } = e.agreement(&e.changed(&[]));
+    println!("right {right:.4}, ratio {ratio:.4}");
+    assert!(right < 0.05 && (ratio - 1.0).abs() < 0.02, "{right} {ratio}");
     let volume = "[volume]";
     let half_u = "offset = { u = 1.0, v = 0.0 }\nstart_deg";
     let half_v = "offset = { u = 0.0, v = -1.0 }\nstart_deg";
@@ -82,7 +81,7 @@ fn every_wrong_setting_is_measurably_worse() {
         ("pixel size", "u = 2.0, v", "u = 2.1, v", 1.2),
         ("source too near", "dso = 500.0", "dso = 450.0", 1.2),
     ] {
-        let wrong = e.error(&e.changed(&[(from, to)]));
+        let wrong = e.agreement(&e.changed(&[(from, to)])).residual;
         println!("{what}: {wrong:.4}");
         assert!(wrong > times * right, "{what}: {wrong} against {right}");
     }

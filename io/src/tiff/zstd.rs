@@ -18,8 +18,8 @@ pub(super) const ZSTD: u32 = 50_000;
 /// Largest window of Zstandard's own encoder.
 const WINDOW: u64 = 8 << 20;
 
-/// Most bytes of all tiles per byte of their page, or of a mebibyte if the page is smaller: tiles extend beyond it.
-const PADDED: u64 = 64;
+/// Most bytes of all tiles of a small page: one tile of 4096² numbers in double precision.
+const TILES: u64 = 128 << 20;
 
 /// Value of the Predictor tag: differences of floats, whose highest byte comes first in either byte order.
 const OF_FLOATS: u32 = 3;
@@ -34,19 +34,23 @@ pub(super) fn read(place: &str, decoder: &mut Pages, page: &Page, out: &mut Vec<
     let bytes = usize::from(page.sample.bits / 8);
     let all = offsets.len() as u64 * bytes as u64;
     let all = all.saturating_mul(u64::from(width)).saturating_mul(u64::from(height));
-    if tiled && all > PADDED.saturating_mul(page.bytes.max(1 << 20)) {
+    // Tiles no larger than the page cover at most four times its pixels.
+    if tiled && all > page.bytes.saturating_mul(4).max(TILES) {
         let found = format!("{} strips or tiles of {height} x {width} pixels", offsets.len());
         return Err(Error::invalid(place, "StripOffsets", found, "those that make up the page"));
     }
+    // The file in memory, with header and directory, and the page that is read from it.
+    let held = (if tiled { all } else { page.bytes }).saturating_add(4096 + 16 * offsets.len() as u64);
+    allowance::memory(place, "page", held.saturating_add(page.bytes))?;
     let predictor = decoder.find_tag_unsigned::<u32>(Tag::Predictor).map_err(broken)?.unwrap_or(1);
     // The file in memory has the byte order of the machine.
     let turned = predictor != OF_FLOATS && decoder.byte_order() != ByteOrder::native();
-    let mut plain = Cursor::new(Vec::with_capacity(usize::try_from(page.bytes).unwrap_or(0)));
+    let mut plain = Cursor::new(Vec::with_capacity(usize::try_from(held).unwrap_or(0)));
     let mut encoder = TiffEncoder::new_big(&mut plain).map_err(broken)?;
     let mut directory = encoder.image_directory().map_err(broken)?;
     let (mut starts, mut lengths) = (vec![], vec![]);
     for (i, (&at, &size)) in offsets.iter().zip(&sizes).enumerate() {
-        // The last strip ends with the page; a tile extends beyond it. A damaged directory may have more of them.
+        // The last strip ends with the page; a tile extends beyond it.
         let left = rows.saturating_sub((i as u32).saturating_mul(height));
         let height = if tiled { height } else { height.min(left) };
         let packed = stored(place, decoder.inner(), at, size)?;

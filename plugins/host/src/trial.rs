@@ -18,6 +18,7 @@ pub const LIMIT: Duration = Duration::from_secs(5);
 
 /// Guard numbers on either side of a buffer: more than a tile of the widest common stages.
 pub(crate) const GUARD: usize = 1 << 14;
+
 /// Stages with more parameters are not initialized for their trial: it takes long, and the run does it anyway.
 const MANY: usize = 1 << 20;
 

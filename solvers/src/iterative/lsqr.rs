@@ -18,8 +18,8 @@ settings! {
         /// File of a known volume to start from.
         start,
         stop: Stop::after(15),
-        /// Strength of the pull towards the start volume, or towards 0 without one: the weight λ² of `‖x − x₀‖²`, relative to
-        /// `‖Aᵀr‖²/‖r‖²` for the residual r of the start, which is close to the largest eigenvalue of AᵀA.
+        /// Strength of the pull towards the start volume, or towards 0 without one: the weight λ² of `‖x − x₀‖²`,
+        /// relative to `‖Aᵀr‖²/‖r‖²` for the residual r of the start, which is close to the largest eigenvalue of AᵀA.
         pull: f64 = 0.0,
         /// Raise attenuation to `scene.bounds.low`, by default 0, at the end.
         nonnegative: bool = true,

@@ -19,8 +19,8 @@ use conefield_core::wgsl::Fragment;
 settings! {
     /// Settings of `mlem`.
     Mlem {
-        /// File of a known volume to start from. Voxels below a thousandth of the uniform start are raised to it: a voxel of 0
-        /// would stay 0.
+        /// File of a known volume to start from. Voxels below a thousandth of the uniform start are raised to it: a voxel
+        /// of 0 would stay 0.
         start,
         stop: Stop::after(20),
         /// Number of ordered subsets of the views, or "views" for one view at a time. 1 is MLEM, more is OSEM.

@@ -148,8 +148,7 @@ fn less<V: SimdFloat<S>, S: Simd>(m: [V; 3], share: V, v: [V; 3]) -> [V; 3] {
 /// `argmin_{l ≤ u ≤ h} ½‖u − v‖² + τ·TV(u)`, with `u = min(h, max(l, v − τ·∇ᵀp))` and `|p_j| ≤ 1` (Beck and Teboulle, IEEE Trans.
 /// Image Process. 18(11), 2009; without their momentum, which a warm start does not need).
 ///
-/// All steps pass through the volume in one sweep (`Sweep`), so that memory is read and written once for all of
-/// them.
+/// All steps pass through the volume in one sweep (`Sweep`), so that memory is read and written once for all of them.
 pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],

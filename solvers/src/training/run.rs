@@ -107,7 +107,7 @@ impl<'a> Run<'a> {
         self.step as f64 / self.steps_an_epoch as f64
     }
 
-    /// Adam's settings for the next update, its number and the factor of the learning rate left out.
+    /// Adam's settings for the next update. The caller sets its number and scales the learning rate.
     pub fn adam(&self) -> Adam {
         self.optimizer.adam(1, self.epoch(), self.clock.share(self.step))
     }

@@ -244,7 +244,9 @@ pub fn on_threads<T: Send>(
 ) -> Option<String> {
     let want = run();
     [1, 3].into_iter().find_map(|n| {
-        let pool = ThreadPoolBuilder::new().num_threads(n).build().ok()?;
+        let Ok(pool) = ThreadPoolBuilder::new().num_threads(n).build() else {
+            return Some(format!("no pool of {n} threads"));
+        };
         differ(&format!("{n} threads"), &pool.install(&run), &want)
     })
 }

@@ -156,7 +156,7 @@ pub fn resolutions(stage: &dyn Encoder) -> Outcome {
     Outcome::Passed(format!("{low} to {high} cells along the cube's side"))
 }
 
-/// Runs the kit on a stage with some of `n` inputs; with all of them it is the stage of the report.
+/// Runs the kit on a stage with some of `n` inputs. With all of them its outputs are compared, and the kit is not run again.
 fn some(n: usize, stage: &dyn Stage, options: &Options) -> Option<String> {
     if stage.info().input < n { whole(stage, options) } else { None }
 }

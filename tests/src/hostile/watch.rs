@@ -123,8 +123,9 @@ impl Parser {
         mutated(from, number, std::str::from_utf8(from).is_ok())
     }
 
-    /// Feeds the reader mutations with these numbers of its seed, which it must accept as it is, of `corpus` and of what
-    /// it ends differently on, after `corpus` itself. `dir` is an empty folder, best one in memory. The same arguments give the same inputs.
+    /// Feeds the reader `corpus`, then mutations with these numbers of its seed, of `corpus` and of what it ends
+    /// differently on. It must accept the seed as it is. `dir` is an empty folder, best one in memory. The same arguments
+    /// give the same inputs.
     pub fn run(&self, dir: &Path, numbers: Range<u64>, corpus: &[Vec<u8>], bounds: Bounds, meter: Meter) -> Seen {
         let (seed, file) = self.prepare(dir);
         if let Err(e) = (self.read)(dir) {

@@ -175,7 +175,8 @@ pub fn goes_on<T: PartialEq>(
     for at in steps(&whole) {
         let (stopped, first) = run(None, at);
         assert!(matches!(stopped, Err(Error::Interrupted { .. })), "interrupted after step {at}");
-        let (again, second) = run(first.kept.as_ref(), u64::MAX);
+        let kept = first.kept.unwrap_or_else(|| panic!("no checkpoint after step {at}"));
+        let (again, second) = run(Some(&kept), u64::MAX);
         assert!(outcome(again) == whole, "interrupted after step {at}");
         assert_eq!([said(&first.records), said(&second.records)].concat(), said(&heard.records), "after step {at}");
     }

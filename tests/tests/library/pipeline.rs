@@ -265,7 +265,7 @@ fn a_field_comes_back_from_its_weights() {
 // ---- units ----
 
 /// Line integrals times a over lengths times l make a/l in 1/mm. A share of what the scan takes by itself is of the scan
-/// alone, a fixed attenuation is not. `extremes` goes through scales and units.
+/// alone, a fixed attenuation is not.
 #[test]
 fn a_relative_attenuation_knows_no_unit() {
     let base = scan();
@@ -276,9 +276,18 @@ fn a_relative_attenuation_knows_no_unit() {
     };
     let mut other = base.clone();
     other.projections.mapv_inplace(|a| 2.0 * a);
-    let [apart, fixed] = [json!({"relative": 0.5}), json!({"fixed": 0.02})]
-        .map(|attenuation| (found(attenuation.clone(), &base, 1.0) - found(attenuation, &other, 0.5)).abs());
-    assert!(apart < 1e-3 && fixed > 1e-3, "{apart} dB apart, of a fixed attenuation {fixed} dB");
+    let mut longer = other.clone();
+    (longer.geometry, longer.unit.mm) = (base.geometry.scaled(1e3), 1e3);
+    let empty = decibels(&ndarray::Array3::zeros(truth().data.dim()), 1.0);
+    let [relative, fixed] = [json!({"relative": 0.5}), json!({"fixed": 0.02})];
+    let right = found(relative.clone(), &base, 1.0);
+    assert!(right > empty + 0.5, "{right} dB, an empty volume {empty}");
+    for scan in [&other, &longer] {
+        let apart = (right - found(relative.clone(), scan, 0.5)).abs();
+        assert!(apart < 1e-3, "{apart} dB apart");
+    }
+    let apart = (found(fixed.clone(), &base, 1.0) - found(fixed, &other, 0.5)).abs();
+    assert!(apart > 1e-3, "{apart} dB apart with a fixed attenuation");
 }
 
 // ---- weights from another scan ----

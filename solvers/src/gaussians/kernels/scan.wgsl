@@ -1,7 +1,7 @@
 // Where each bin's list begins, and where they end; the counts are zero afterwards. One group; each lane takes a run of bins.
 var<workgroup> sums: array<u32, 256>;
 
-// The sum, or the largest number: lists of more entries have no room either.
+// The sum, at most the largest number: no buffer has room for lists of that length.
 fn together(a: u32, b: u32) -> u32 {
     return a + min(b, 0xffffffffu - a);
 }

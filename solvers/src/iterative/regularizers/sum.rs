@@ -191,7 +191,7 @@ mod tests {
     use conefield_core::scan::ScanHeader;
     use std::collections::BTreeSet;
 
-    /// Those of a prior's own state begin with its number, so that they are none of the sum's.
+    /// Names of a prior's state begin with the prior's number. So none of them equals a name of the sum.
     #[test]
     fn the_state_has_a_name_for_each_part() {
         let part = || TotalVariation::default().build().unwrap();
