@@ -5,6 +5,7 @@
 use conefield_core::error::ensure;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result, written};
+use conefield_io::folder_of;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -75,11 +76,6 @@ impl Inputs {
 
 fn place(path: &Path) -> String {
     path.display().to_string()
-}
-
-/// The folder that a path is in.
-pub fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// The location of a path, without following it if it is a link.

@@ -2,7 +2,6 @@
 //! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `volume-hu.nii.gz` if requested,
 //! `weights.safetensors`, `slices.png` and, last and only for a finished run, `record.json`.
 
-use crate::boundary;
 use conefield::plugins::Used;
 use conefield::record::ScanRecord;
 use conefield::scratch;
@@ -79,7 +78,7 @@ impl RunFolder {
     /// Warns if the disk has less room than a volume of `volume` bytes may take.
     pub fn warn_without_room(&self, volume: u64) {
         let path = self.0.path();
-        let place = if path.is_dir() { path } else { boundary::folder_of(path) };
+        let place = if path.is_dir() { path } else { conefield_io::folder_of(path) };
         if let Some(free) = scratch::free(place).filter(|free| *free < volume) {
             tracing::warn!("{}: {} are free; the volume takes up to {}", place.display(), bytes(free), bytes(volume));
         }

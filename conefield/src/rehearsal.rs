@@ -3,7 +3,7 @@
 use crate::method;
 use crate::tradeoff::speed;
 use conefield_core::backend::Backend;
-use conefield_core::method::{Job, Limits, Observer, Record};
+use conefield_core::method::{Job, Limits, Quiet};
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,22 +11,9 @@ use std::time::Instant;
 use tracing::debug;
 use tracing::subscriber::{NoSubscriber, with_default};
 
-/// Ends a rehearsal when the inputs are read.
+/// Ends a rehearsal when it is dropped, also where reading panics.
 struct Curtain<'a>(&'a AtomicBool);
 
-impl Observer for Curtain<'_> {
-    fn progress(&mut self, _: u64, _: f64, _: f64) {}
-
-    fn record(&mut self, _: &Record) {}
-
-    fn note(&mut self, _: &str) {}
-
-    fn cancelled(&self) -> bool {
-        self.0.load(Ordering::Relaxed)
-    }
-}
-
-/// Falls also where reading panics.
 impl Drop for Curtain<'_> {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
@@ -57,12 +44,13 @@ pub fn meanwhile<T>(loaded: &Loaded, backend: &dyn Backend, read: impl FnOnce() 
 /// One step of the method, unless `done`.
 fn rehearse(loaded: &Loaded, backend: &dyn Backend, done: &AtomicBool) -> Result<()> {
     let mut plan = method::plan_without_files(loaded, backend)?;
-    if done.load(Ordering::Relaxed) {
+    let done = || done.load(Ordering::Relaxed);
+    if done() {
         return Err(Error::Interrupted { step: 0 });
     }
     let scan = speed::scan(4, 16, 16);
     let limits = Limits { steps: Some(1), ..Limits::default() };
-    plan.run(&Job { limits, ..Job::new(&scan, backend) }, &mut Curtain(done)).map(drop)
+    plan.run(&Job { limits, ..Job::new(&scan, backend) }, &mut Quiet(&done)).map(drop)
 }
 
 #[cfg(all(test, feature = "wgpu"))]

@@ -187,6 +187,18 @@ impl Observer for Silent {
     fn note(&mut self, _: &str) {}
 }
 
+/// An observer that ignores everything, and says when to stop.
+pub struct Quiet<'a>(pub &'a dyn Fn() -> bool);
+
+impl Observer for Quiet<'_> {
+    fn progress(&mut self, _: u64, _: f64, _: f64) {}
+    fn record(&mut self, _: &Record) {}
+    fn note(&mut self, _: &str) {}
+    fn cancelled(&self) -> bool {
+        (self.0)()
+    }
+}
+
 /// The result of a method, in 1/unit of the scan.
 pub enum Reconstruction {
     /// Voxels.

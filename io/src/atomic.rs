@@ -1,5 +1,6 @@
 //! Atomic writes: a file or folder appears under its final name only when it is complete.
 
+use crate::folder::folder_of;
 use crate::lease;
 use crate::lock::{self, Held};
 use conefield_core::{Error, Result};
@@ -104,7 +105,7 @@ fn temporary(mode: u32) -> tempfile::Builder<'static, 'static> {
 /// If `fill` or the system fails, an earlier file of that name stays unchanged and the temporary file is removed.
 pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
     let path = path.as_ref();
-    let folder = parent(path);
+    let folder = folder_of(path);
     let at = |e| Error::io(path, e);
     // A rename over a folder fails anyway, but only after all the work is done.
     if path.is_dir() {
@@ -133,7 +134,7 @@ pub fn write_text_atomic(path: impl AsRef<Path>, text: &str) -> Result<()> {
 /// The caller checks whether an earlier folder may be replaced.
 pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
     let folder = folder.as_ref();
-    let beside = parent(folder);
+    let beside = folder_of(folder);
     let at = |e| Error::io(folder, e);
     if folder.file_name().is_none() {
         return Err(Error::invalid(folder.display().to_string(), "folder", "no name of its own", "a folder to create"));
@@ -198,11 +199,6 @@ fn without_path(e: std::io::Error) -> std::io::Error {
         Some((words, _)) => std::io::Error::new(e.kind(), words.to_owned()),
         None => e,
     }
-}
-
-/// The folder that holds `path`.
-pub(crate) fn parent(path: &Path) -> &Path {
-    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Syncs the folder, so that a rename survives a power cut where the system supports that. The data is already synced.

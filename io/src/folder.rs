@@ -42,6 +42,11 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
     Ok(path)
 }
 
+/// The folder that holds `path`.
+pub fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Splits the name of a file from that of an array, data set or column in it: `scan.npz:counts`, `scan.h5:/exchange/data`.
 /// No name of a file in a description holds a colon.
 pub(crate) fn split(name: &str) -> (&str, Option<&str>) {

@@ -1,7 +1,7 @@
 //! Headers of NRRD and MetaImage: lines with a name and a value, then the voxels or the name of their file.
 
-use crate::atomic::parent;
 use crate::folder;
+use crate::folder::folder_of;
 use crate::input::Input;
 use crate::text::shortened;
 use conefield_core::{Error, Result};
@@ -59,7 +59,7 @@ impl Header {
         if name.starts_with("LIST") || name.contains('%') {
             return Err(self.invalid(field, shortened(name), expected));
         }
-        Input::open_plain(&folder::inside(parent(path), &self.place, field, name)?)
+        Input::open_plain(&folder::inside(folder_of(path), &self.place, field, name)?)
     }
 
     /// Skips as many bytes of `data` as the entry `field` says in `text`. Where `last` is known, −1 stands for all but

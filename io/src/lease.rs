@@ -4,7 +4,8 @@
 //! command ends without a result, the earlier folder returns; if the new one is complete, the earlier one is removed. A
 //! killed process leaves both; the next command on that folder cleans up.
 
-use crate::atomic::{exchange, parent, sweep, sync_folder};
+use crate::atomic::{exchange, sweep, sync_folder};
+use crate::folder::folder_of;
 use crate::lock::{self, Held};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
@@ -85,7 +86,7 @@ fn aside(folder: &Path) -> PathBuf {
     let mut name = OsString::from(ASIDE[0]);
     name.push(folder.file_name().unwrap_or_default());
     name.push(ASIDE[1]);
-    parent(folder).join(name)
+    folder_of(folder).join(name)
 }
 
 /// The folders in `aside`, the latest last. Removes an empty one that a killed process has only just created.
@@ -142,7 +143,7 @@ impl Lease {
     /// result.
     pub fn replace(&mut self) -> Result<()> {
         let at = |e| Error::io(&self.path, e);
-        fs::create_dir_all(parent(&self.path)).map_err(at)?;
+        fs::create_dir_all(folder_of(&self.path)).map_err(at)?;
         if self.missing && self.path.is_dir() {
             // Another process has made it since, and may still write.
             self.locks = own(&self.path)?;
@@ -172,7 +173,7 @@ impl Lease {
             fs::create_dir_all(&slot).map_err(at)?;
             let new = own(&slot)?;
             swap(&self.path, &slot, &aside).map_err(at)?;
-            sync_folder(parent(&self.path));
+            sync_folder(folder_of(&self.path));
             self.locks.extend(new);
         }
         self.writing = true;
@@ -214,7 +215,7 @@ impl Lease {
                 }
                 // Files that someone else put there stay where they can be found.
                 let _ = fs::remove_dir(&earlier).and_then(|()| fs::remove_dir(&aside));
-                sync_folder(parent(&self.path));
+                sync_folder(folder_of(&self.path));
                 Ok(())
             }
         }
@@ -378,7 +379,7 @@ fn folders(path: &Path, depth: usize, wanted: fn(&Path) -> bool, found: &mut Vec
 /// Puts `earlier` back to `path`. If `path` exists, it holds work without a result and moves to `earlier`.
 fn put_back(earlier: &Path, path: &Path) -> Result<()> {
     let back = match path.symlink_metadata() {
-        Ok(_) => swap(earlier, path, parent(earlier)),
+        Ok(_) => swap(earlier, path, folder_of(earlier)),
         Err(_) => fs::rename(earlier, path),
     };
     back.map_err(|e| Error::io(path, e))

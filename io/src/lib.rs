@@ -68,6 +68,7 @@ pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use dicom::DicomTemplate;
 pub use events::EventFile;
 pub use file_order::{PACKED_BYTES, SLAB_BYTES};
+pub use folder::folder_of;
 pub use lease::{Contents, FolderLock, Lease, Progressed, SharedLease, is_aside, try_alone};
 pub use naf::write_naf;
 pub use r2::write_r2;

@@ -2,8 +2,8 @@
 //! next to it (`.mhd` with `.raw` or `.zraw`).
 
 use crate::affine::{self, Affine};
-use crate::atomic::parent;
 use crate::file_order::{self, FileOrder, PACKED_BYTES};
+use crate::folder::folder_of;
 use crate::header::{Header, finite};
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
@@ -254,7 +254,7 @@ fn open_data(header: &Header, path: &Path, header_file: Input) -> Result<Input> 
 pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let io = |e| Error::io(path, e);
     // The compressed size precedes the data, so the data is compressed to a buffer first: in memory while it is small.
-    let packed = tempfile::spooled_tempfile_in(PACKED_BYTES as usize, parent(path));
+    let packed = tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder_of(path));
     let mut packed = ZlibEncoder::new(packed, Compression::fast());
     file_order::write(&mut packed, path, voxels, FileOrder::XFastest)?;
     let mut packed = packed.finish().map_err(io)?;

@@ -1,7 +1,7 @@
 //! Entry points for scans: they recognize the format of a folder or file.
 
 use crate::text::format_of;
-use crate::{Stored, foreign, naf, pickle, r2, scan_folder, scanner};
+use crate::{Stored, folder, foreign, naf, pickle, r2, scan_folder, scanner};
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -104,7 +104,7 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
         }
         return match (path.file_name().and_then(|n| n.to_str()), path.extension().and_then(|e| e.to_str())) {
             (Some("scan.toml" | "scan.json"), _) => Ok(ScanFile::Own(path.to_path_buf())),
-            (Some(r2::META), _) => Ok(ScanFile::R2(scan_folder::folder_of(path).to_path_buf())),
+            (Some(r2::META), _) => Ok(ScanFile::R2(folder::folder_of(path).to_path_buf())),
             (_, Some("toml" | "json")) => match format_of(path).as_deref() {
                 Some(scan_folder::FORMAT) => Ok(ScanFile::Own(path.to_path_buf())),
                 // The description's reader reports what is missing.

@@ -22,7 +22,7 @@
 //! [provenance]                      # anything
 //! ```
 
-use crate::folder;
+use crate::folder::{self, folder_of};
 use crate::scanner::MOST_VIEWS;
 use crate::text::described;
 use crate::{ScanSize, npy, read_volume, write_atomic, write_folder_atomic, write_text_atomic, write_volume};
@@ -125,10 +125,6 @@ fn views(place: &str, d: &mut Description) -> Result<Vec<View>> {
     }
     let orbit = CircularOrbit { dso: table.dso, dsd: table.dsd, pixel: table.pixel, offset: table.offset, angles };
     Ok(orbit.views())
-}
-
-pub(crate) fn folder_of(file: &Path) -> &Path {
-    file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Reads the scan that `file` (a `scan.toml` or `scan.json`) describes.

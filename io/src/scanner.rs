@@ -66,7 +66,7 @@ use crate::rtk::read_rtk_geometry;
 use crate::stack::{self, Names, StackAxis, StackLayout};
 use crate::table::{self, Numbers};
 use crate::text::{self, described};
-use crate::{ScanSize, folder, foreign, memory, scan_folder};
+use crate::{ScanSize, folder, foreign, memory};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, Radians, View, VoxelGrid, norm};
 use conefield_core::orbit::{Beam, CircularOrbit};
@@ -329,7 +329,7 @@ pub fn read_scanner(path: impl AsRef<Path>, i0: Option<I0>, floor: Option<f64>) 
     let place = path.display().to_string();
     let mut d = Description::read(path)?;
     text::warn(&place, std::mem::take(&mut d.remarks));
-    let folder = scan_folder::folder_of(path);
+    let folder = folder::folder_of(path);
     d.volume.validate(&place)?;
     let layout = layout(&place, &d.layout)?;
     let i0 = open_beam(&place, &d, i0, floor)?;
@@ -378,7 +378,7 @@ pub(crate) fn size(path: &Path) -> Result<ScanSize> {
     let place = path.display().to_string();
     let d = Description::read(path)?;
     d.volume.validate(&place)?;
-    let folder = scan_folder::folder_of(path);
+    let folder = folder::folder_of(path);
     let pixels = stack::values(folder, &place, "files.projections", &d.files.projections)?;
     Ok(ScanSize {
         pixels,

@@ -13,7 +13,7 @@ use crate::solid::Solid;
 use crate::support::Blocks;
 use conefield_core::error::{Error, Result};
 use conefield_core::geometry::{Geometry, View, VoxelGrid, norm};
-use conefield_core::method::{Job, Observer, Record};
+use conefield_core::method::{Job, Observer, Quiet};
 use conefield_core::outside::Outside;
 use conefield_core::place::ViewRays;
 use conefield_core::scan::{Scan, ScanHeader, Unit};
@@ -164,7 +164,8 @@ impl Around {
     fn find(&self, job: &Job<'_>, passes: u64, observer: &mut dyn Observer) -> Result<Array3<f32>> {
         let scan = coarse(job.scan, self.cells);
         let alone = Job { seed: job.seed, ..Job::new(&scan, job.backend) };
-        let mut data = method(passes).solve(&alone, &mut Quiet(observer))?.result.volume(job.backend)?.data;
+        let mut data =
+            method(passes).solve(&alone, &mut Quiet(&|| observer.cancelled()))?.result.volume(job.backend)?.data;
         let [x, y, z]: [_; 3] = std::array::from_fn(|k| self.margin[k]..self.cells.shape[k] - self.margin[k]);
         data.slice_mut(s![x, y, z]).fill(0.0);
         Ok(data)
@@ -229,19 +230,4 @@ fn coarse(scan: &Scan, cells: VoxelGrid) -> Scan {
     // The result is in 1/mm.
     coarse.unit = Unit::default();
     coarse
-}
-
-/// Suppresses all reports of preparatory work, but can be cancelled.
-pub(crate) struct Quiet<'a>(pub(crate) &'a dyn Observer);
-
-impl Observer for Quiet<'_> {
-    fn progress(&mut self, _: u64, _: f64, _: f64) {}
-
-    fn record(&mut self, _: &Record) {}
-
-    fn note(&mut self, _: &str) {}
-
-    fn cancelled(&self) -> bool {
-        self.0.cancelled()
-    }
 }

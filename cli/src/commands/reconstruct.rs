@@ -132,7 +132,7 @@ impl ReconstructArgs {
 
     /// The work of a process that does not lead: what the leading one computes, without a file or a word.
     fn follow(&self, begin: Instant) -> Result<()> {
-        memory::allow_scratch(boundary::folder_of(&self.output));
+        memory::allow_scratch(conefield_io::folder_of(&self.output));
         let backend = self.protocol.backend.open()?;
         let session = self.session(backend.as_ref(), begin)?;
         let (input, _, resume) = self.input(&session)?;
@@ -162,7 +162,7 @@ impl ReconstructArgs {
         }
         // A spec stores this file name as text; a name that is not UTF-8 would be stored as another one.
         self.init.as_deref().map(boundary::text).transpose()?;
-        memory::allow_scratch(boundary::folder_of(&self.output));
+        memory::allow_scratch(conefield_io::folder_of(&self.output));
         let backend = self.protocol.backend.open_for_run(self.protocol.budget)?;
         // An invalid spec, and weights that cannot be read or do not fit, are reported before anything is created.
         let session = self.session(backend.as_ref(), begin)?;

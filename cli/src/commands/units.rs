@@ -1,12 +1,12 @@
 //! The option for Hounsfield units of a written volume.
 
-use crate::boundary::folder_of;
 use crate::run_folder::RunOnDisk;
 use clap::Args;
 use conefield::hounsfield::{Calibration, How};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::{Affine, Unit};
 use conefield_core::{Error, Result};
+use conefield_io::folder_of;
 use std::path::Path;
 
 /// Units of a written volume.

@@ -7,8 +7,8 @@
 use super::slice::{PIXEL_DATA, open};
 use super::{is_dicom, lengths};
 use crate::affine;
-use crate::atomic::parent;
 use crate::file_order::{self, FileOrder};
+use crate::folder::folder_of;
 use crate::{PACKED_BYTES, folder, write_folder_atomic};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{cross, dot};
@@ -122,7 +122,7 @@ impl Series {
         let axes = [0, 1, 2].map(|k| affine::column(&lps, k).map(|x| x / spacing[k]));
         // The identifiers depend on the values and every value has the slope: the voxels are computed once and kept.
         let mut spool = Spool {
-            file: tempfile::spooled_tempfile_in(PACKED_BYTES as usize, parent(path)),
+            file: tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder_of(path)),
             digest: Digest::new(),
             range: [f32::INFINITY, f32::NEG_INFINITY],
         };

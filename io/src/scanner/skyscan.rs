@@ -17,7 +17,7 @@ use super::Description;
 use super::keys::Keys;
 use super::vendor::{MOST_PIXELS, MOST_VIEWS, Open, field_of_view};
 use crate::folder;
-use crate::scan_folder::folder_of;
+use crate::folder::folder_of;
 use crate::stack::Names;
 use crate::text::{shortened, unread};
 use conefield_core::orbit::CircularOrbit;

@@ -5,7 +5,7 @@ use crate::diagnosis::setup;
 use conefield_core::backend::Backend;
 use conefield_core::finite::range;
 use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, norm};
-use conefield_core::method::{Context, Job, Method, Observer, Reconstruction, Record};
+use conefield_core::method::{Context, Job, Method, Quiet, Reconstruction};
 use conefield_core::parallel;
 use conefield_core::place::ViewRays;
 use conefield_core::scan::{Scan, Unit};
@@ -61,18 +61,6 @@ pub(crate) struct Prediction {
     pub views: Vec<Vec<f32>>,
     /// Their root mean square, divided by the largest line integral.
     pub error: f64,
-}
-
-/// An observer without output that can cancel the work.
-struct Quiet<'a>(&'a (dyn Fn() -> bool + Sync));
-
-impl Observer for Quiet<'_> {
-    fn progress(&mut self, _: u64, _: f64, _: f64) {}
-    fn record(&mut self, _: &Record) {}
-    fn note(&mut self, _: &str) {}
-    fn cancelled(&self) -> bool {
-        (self.0)()
-    }
 }
 
 impl Level {

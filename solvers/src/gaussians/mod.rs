@@ -30,12 +30,12 @@ use crate::iterative::known_volume;
 use crate::optimizer::Optimizer;
 use crate::priors::Places;
 use crate::schedule::{Clock, Ends};
-use crate::surround::{Corrected, Quiet};
+use crate::surround::Corrected;
 use crate::training::{Callback, CallbackSpec, Draw, Run, Task};
 use conefield_core::backend::Executable;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::method::{
-    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Solution, StageLine,
+    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Quiet, Solution, StageLine,
 };
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
@@ -357,7 +357,7 @@ impl GaussianPlan {
             Error::Interrupted { .. } => Error::Interrupted { step: 0 },
             e => e.within("start"),
         };
-        let solution = first().run(&alone, &mut Quiet(observer)).map_err(help)?;
+        let solution = first().run(&alone, &mut Quiet(&|| observer.cancelled())).map_err(help)?;
         let mm = job.scan.unit.mm as f32;
         Ok((solution.result.volume(job.backend)?.mapped(|x| x / mm), "an FDK".into()))
     }
