@@ -199,7 +199,7 @@ impl TvProx {
         loop {
             let split = Split::new(self.shape[0], left, rayon::current_num_threads());
             left -= split.reach;
-            self.steps(Map { v, u }, tau, split);
+            self.steps(Lines::Map(v, u), tau, split);
             if left == 0 {
                 return;
             }
@@ -212,13 +212,13 @@ impl TvProx {
         if tau < f32::MIN_POSITIVE || split.reach < steps {
             return Some(update);
         }
-        self.steps(update, tau, split);
+        self.steps(Lines::Update(update), tau, split);
         None
     }
 
     /// Makes some steps in one sweep. The slabs of `split` run in parallel; near its ends each works on a copy of its
     /// neighbour's data, so that every number is computed from the same values whatever the split.
-    fn steps(&mut self, lines: impl Lines, tau: f32, split: Split) {
+    fn steps(&mut self, lines: Lines<'_>, tau: f32, split: Split) {
         let [nz, y, z] = along(self.shape);
         let plane = self.shape[1] * self.shape[2];
         let bounds = split.bounds(self.shape[0]);
@@ -412,57 +412,51 @@ impl Scale {
 struct Planes<'a>([Vec<&'a mut [f32]>; 3]);
 
 /// Input and output of the proximal map in a sweep, line by line. A line is not read again after it was written.
-trait Lines: Send + Sized {
+enum Lines<'a> {
+    /// Those of an update.
+    Update(Update<'a>),
+    /// The map alone, from the first to the second.
+    Map(&'a [f32], &'a mut [f32]),
+}
+
+impl Lines<'_> {
     /// Overwrites `v` with the input from index `at` on.
-    fn read(&self, at: usize, v: &mut [f32]);
+    #[inline(always)]
+    fn read(&self, at: usize, v: &mut [f32]) {
+        match self {
+            Self::Update(update) => update.read(at, v),
+            Self::Map(from, _) => v.copy_from_slice(&from[at..at + v.len()]),
+        }
+    }
+
     /// Receives the proximal map `u` from index `at` on.
-    fn write(&mut self, at: usize, u: &[f32]);
+    #[inline(always)]
+    fn write(&mut self, at: usize, u: &[f32]) {
+        match self {
+            Self::Update(update) => update.write(at, u),
+            Self::Map(_, to) => to[at..at + u.len()].copy_from_slice(u),
+        }
+    }
+
     /// Splits into the first `at` numbers and the rest.
-    fn split(self, at: usize) -> [Self; 2];
-}
-
-impl Lines for Update<'_> {
-    #[inline(always)]
-    fn read(&self, at: usize, v: &mut [f32]) {
-        self.read(at, v);
-    }
-    #[inline(always)]
-    fn write(&mut self, at: usize, u: &[f32]) {
-        self.write(at, u);
-    }
     fn split(self, at: usize) -> [Self; 2] {
-        self.split(at)
-    }
-}
-
-/// The proximal map alone.
-struct Map<'a> {
-    v: &'a [f32],
-    u: &'a mut [f32],
-}
-
-impl Lines for Map<'_> {
-    #[inline(always)]
-    fn read(&self, at: usize, v: &mut [f32]) {
-        v.copy_from_slice(&self.v[at..at + v.len()]);
-    }
-    #[inline(always)]
-    fn write(&mut self, at: usize, u: &[f32]) {
-        self.u[at..at + u.len()].copy_from_slice(u);
-    }
-    fn split(self, at: usize) -> [Self; 2] {
-        let (v, u) = (self.v.split_at(at), self.u.split_at_mut(at));
-        [Self { v: v.0, u: u.0 }, Self { v: v.1, u: u.1 }]
+        match self {
+            Self::Update(update) => update.split(at).map(Self::Update),
+            Self::Map(v, u) => {
+                let (v, u) = (v.split_at(at), u.split_at_mut(at));
+                [Self::Map(v.0, u.0), Self::Map(v.1, u.1)]
+            }
+        }
     }
 }
 
 /// Dual steps and then the primal on a slab of planes, of which `own` are correct at the end. Differences at the slab's
 /// ends count as 0; where the volume goes on, the resulting error spreads by one plane per step.
-struct Sweep<'a, L> {
+struct Sweep<'a> {
     planes: Planes<'a>,
     own: Range<usize>,
     /// The lines of `own`.
-    lines: L,
+    lines: Lines<'a>,
     /// The input of the map below and above `own`.
     v: [&'a [f32]; 2],
     /// The edges of all planes.
@@ -475,7 +469,7 @@ struct Sweep<'a, L> {
     scale: Scale,
 }
 
-impl<L: Lines> Op for Sweep<'_, L> {
+impl Op for Sweep<'_> {
     type Number = f32;
     type Out = ();
     /// Step k runs one plane behind step k − 1, line by line: once a line's primal is known, the dual of the line one
@@ -538,7 +532,7 @@ impl<L: Lines> Op for Sweep<'_, L> {
     }
 }
 
-impl<L: Lines> Sweep<'_, L> {
+impl Sweep<'_> {
     /// Clips line `j` of plane `i` to the bounds of its voxels.
     #[inline(always)]
     fn clip(&self, i: usize, j: usize, u: &mut [f32]) {
