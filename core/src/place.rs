@@ -15,7 +15,7 @@ mod threads;
 mod views;
 
 pub use map::{ADD, CLIP, DIVIDE, EXTRAPOLATE, INVERT, MULTIPLY, Map, RELAX, Reduction, squares};
-pub use penalty::{Bounds, Dual, Guide, Kernels, Penalty, ProximalStep, Update, UpdateOf};
+pub use penalty::{Bounds, Confines, Dual, Guide, Kernels, Penalty, ProximalStep, Update, UpdateOf};
 pub use ranks::{Peers, Ranks, Slab};
 pub use streamed::{SPARE, Streamed, zeros_with_spare};
 pub use threads::Threads;

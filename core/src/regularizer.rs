@@ -3,7 +3,7 @@
 use crate::error::{Result, ensure};
 use crate::geometry::VoxelGrid;
 use crate::place::Host;
-pub use crate::place::{Bounds, Dual, Guide, Kernels, Penalty, Update};
+pub use crate::place::{Bounds, Confines, Dual, Guide, Kernels, Penalty, Update};
 use crate::registry::Registered;
 use crate::space::Space;
 use schemars::JsonSchema;

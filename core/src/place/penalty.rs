@@ -43,6 +43,27 @@ impl std::fmt::Display for Bounds {
     }
 }
 
+/// What a penalty's coefficients keep to, and its part of a volume that several processes share.
+#[derive(Default)]
+pub struct Confines {
+    /// Bounds of all coefficients.
+    pub bounds: Bounds,
+    /// Lower and upper bounds of each coefficient, if they differ.
+    pub each: Option<Arc<[Vec<f32>; 2]>>,
+    /// The slab, if its grid is one.
+    pub slab: Option<Slab>,
+}
+
+impl Confines {
+    /// Clips each `u` to its own bounds, if it has some.
+    pub fn clip_each(&self, u: &mut [f32]) {
+        let Some([low, high]) = self.each.as_deref() else { return };
+        parallel::change(u, [low, high], |u, [low, high]| {
+            u.iter_mut().zip(low).zip(high).for_each(|((u, low), high)| *u = u.max(*low).min(*high));
+        });
+    }
+}
+
 /// A penalty `R` on one grid. It keeps the state from which the next call of [`Penalty::prox`] starts.
 pub trait Penalty: Send {
     /// `R(x)`, without weight.
@@ -65,24 +86,34 @@ pub trait Penalty: Send {
     /// on the number of threads.
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]);
 
+    /// Where it keeps bounds and slab. `None` for a penalty that keeps coefficients from being negative and knows no
+    /// other bounds: clipping its result is no proximal map.
+    fn confines(&mut self) -> Option<&mut Confines> {
+        None
+    }
+
     /// Makes `bounds` those of `u` in [`Penalty::prox`], in place of `u ≥ 0`. Called before the first update, unless
     /// they are the default.
     ///
     /// # Errors
-    /// A penalty without this method keeps coefficients from being negative and knows no other bounds. Clipping its
-    /// result is no proximal map.
+    /// The penalty has no [`Penalty::confines`].
     fn confine(&mut self, bounds: Bounds) -> Result<()> {
         let expected = "0 and no upper bound: this prior has no other bounds";
-        Err(Error::invalid("spec", "scene.bounds", format!("{bounds} (in 1/mm)"), expected))
+        let refused = || Error::invalid("spec", "scene.bounds", format!("{bounds} (in 1/mm)"), expected);
+        self.confines().ok_or_else(refused)?.bounds = bounds;
+        Ok(())
     }
 
     /// Gives each coefficient a lower and an upper bound of its own, within those of [`Penalty::confine`].
     ///
     /// # Errors
-    /// A penalty without this method knows no bounds by coefficient.
+    /// The penalty has no [`Penalty::confines`].
     fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
-        let found = format!("bounds of {} coefficients", bounds[0].len());
-        Err(Error::invalid("spec", "scene.bounds.regions", found, "none: this prior has the same bounds everywhere"))
+        let (found, expected) =
+            (format!("bounds of {} coefficients", bounds[0].len()), "none: this prior has the same bounds everywhere");
+        let refused = || Error::invalid("spec", "scene.bounds.regions", found, expected);
+        self.confines().ok_or_else(refused)?.each = Some(bounds);
+        Ok(())
     }
 
     /// Tells the unit vector along the middle of an arc of less than half a turn, if the views cover such an arc: edges
@@ -100,12 +131,14 @@ pub trait Penalty: Send {
     /// [`Penalty::adapt`] then return the sums over [`Slab::own`]. Called at once, if
     /// [`crate::regularizer::Regularizer::halo`] admits slabs.
     fn divide(&mut self, slab: Slab) {
-        let _ = slab;
+        if let Some(confines) = self.confines() {
+            confines.slab = Some(slab);
+        }
     }
 
     /// The slab of [`Penalty::divide`].
-    fn slab(&self) -> Option<&Slab> {
-        None
+    fn slab(&mut self) -> Option<&Slab> {
+        self.confines()?.slab.as_ref()
     }
 
     /// The whole update, with [`Penalty::prox`] for `tau`. A penalty whose proximal map is a single pass over the

@@ -13,13 +13,12 @@ use conefield_core::error::Result;
 use conefield_core::geometry::{Vec3, VoxelGrid};
 use conefield_core::parallel;
 use conefield_core::place::{ADD, Array, Place, Slab, StatePart, VariationSlope};
-use conefield_core::regularizer::{Bounds, Dual, Kernels, Penalty, Update};
+use conefield_core::regularizer::{Bounds, Confines, Dual, Kernels, Penalty, Update};
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdMask, load, run, store};
 use conefield_core::space::Space;
 use conefield_core::wgsl::Fragment;
 use ndarray::ArrayView3;
 use std::ops::Range;
-use std::sync::Arc;
 
 /// Weights of differences along x, y, z.
 pub fn anisotropy(grid: &VoxelGrid) -> [f32; 3] {
@@ -152,16 +151,12 @@ fn less<V: SimdFloat<S>, S: Simd>(m: [V; 3], share: V, v: [V; 3]) -> [V; 3] {
 pub struct TvProx {
     shape: [usize; 3],
     g: [f32; 3],
-    bounds: Bounds,
-    /// The bounds of each voxel, if they differ.
-    each: Option<Arc<[Vec<f32>; 2]>>,
+    confines: Confines,
     /// The dual variable along x, y and z; with edges or a limited arc it is `D·A·p`.
     dual: [Array; 3],
     /// Edges across which slopes cost less.
     edges: Option<Edges>,
     limited: Option<Limited>,
-    /// Its part of a volume that several processes share.
-    slab: Option<Slab>,
     /// Dual steps of an update.
     inner: usize,
     /// Factor along the middle of a limited arc.
@@ -179,8 +174,8 @@ impl TvProx {
         });
         let dual = || space.array(shape);
         let dual = [dual()?, dual()?, dual()?];
-        let bounds = Bounds::default();
-        Ok(Self { shape, g, bounds, each: None, dual, edges: None, limited: None, slab: None, inner, arc })
+        let confines = Confines::default();
+        Ok(Self { shape, g, confines, dual, edges: None, limited: None, inner, arc })
     }
 
     /// Reduces the cost of slopes across `edges`, which are initially 0.
@@ -192,8 +187,8 @@ impl TvProx {
     /// the bounds.
     fn apply(&mut self, v: &[f32], tau: f32, steps: usize, u: &mut [f32]) {
         if tau < f32::MIN_POSITIVE {
-            self.bounds.clip_to(u, v);
-            return clip_each(u, self.each.as_deref());
+            self.confines.bounds.clip_to(u, v);
+            return self.confines.clip_each(u);
         }
         let mut left = steps;
         loop {
@@ -223,7 +218,7 @@ impl TvProx {
         let plane = self.shape[1] * self.shape[2];
         let bounds = split.bounds(self.shape[0]);
         let limited = self.limited.map(|limited| limited.turned([0, y, z]));
-        let scale = Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.bounds, limited);
+        let scale = Scale::new([self.g[0], self.g[y], self.g[z]], tau, self.confines.bounds, limited);
         let edges = self.edges.as_ref().map(Edges::vectors).map(|n| [n[0], n[y], n[z]]);
         let [px, py, pz] = self.dual.each_mut().map(Array::slice_mut);
         let dual = if y == 1 { [px, py, pz] } else { [px, pz, py] };
@@ -265,7 +260,7 @@ impl TvProx {
             let first = (range.start - copied) * plane;
             let edges = edges.map(|n| n.map(|n| &n[first..first + planes.0[0].len() * plane]));
             let part = first..first + planes.0[0].len() * plane;
-            let each = self.each.as_ref().map(|each| each.each_ref().map(|x| &x[part.clone()]));
+            let each = self.confines.each.as_ref().map(|each| each.each_ref().map(|x| &x[part.clone()]));
             slabs.push(Sweep { planes, own, lines, v, edges, each, line: nz, steps: split.reach, scale });
         }
         parallel::over(slabs, |_, slab| run(slab));
@@ -276,7 +271,7 @@ impl Penalty for TvProx {
     /// The total variation of `x`, or the part of its own planes.
     fn value(&self, x: ArrayView3<'_, f32>) -> f64 {
         let planes = variations(x, self.g, self.edges.as_ref(), self.limited);
-        planes[self.slab.as_ref().map_or(0..planes.len(), Slab::inner)].iter().sum()
+        planes[self.confines.slab.as_ref().map_or(0..planes.len(), Slab::inner)].iter().sum()
     }
 
     fn adapts(&self) -> bool {
@@ -284,7 +279,7 @@ impl Penalty for TvProx {
     }
 
     fn adapt(&mut self, x: ArrayView3<'_, f32>) -> Option<f64> {
-        self.edges.as_mut()?.find(x, self.g, self.slab.as_ref());
+        self.edges.as_mut()?.find(x, self.g, self.confines.slab.as_ref());
         Some(self.value(x))
     }
 
@@ -292,22 +287,8 @@ impl Penalty for TvProx {
         self.apply(v, tau, self.inner, u);
     }
 
-    fn confine(&mut self, bounds: Bounds) -> Result<()> {
-        self.bounds = bounds;
-        Ok(())
-    }
-
-    fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
-        self.each = Some(bounds);
-        Ok(())
-    }
-
-    fn divide(&mut self, slab: Slab) {
-        self.slab = Some(slab);
-    }
-
-    fn slab(&self) -> Option<&Slab> {
-        self.slab.as_ref()
+    fn confines(&mut self) -> Option<&mut Confines> {
+        Some(&mut self.confines)
     }
 
     fn limited(&mut self, middle: Vec3) {
@@ -324,9 +305,7 @@ impl Penalty for TvProx {
 
     /// Kernels have the same bounds for all voxels.
     fn kernels(&mut self) -> Option<Kernels<'_>> {
-        if self.each.is_some() {
-            return None;
-        }
+        let Confines { bounds, each: None, slab } = &self.confines else { return None };
         let fragment = match self.limited {
             Some(Limited { middle: [x, y, z], factor }) => {
                 let constants =
@@ -336,23 +315,14 @@ impl Penalty for TvProx {
             None => Fragment::new(&[if self.edges.is_some() { ALONG_EDGES } else { PLAIN }]),
         };
         let guide = self.edges.as_mut().map(Edges::guide);
-        let (p, slab) = (self.dual.each_mut(), self.slab.as_ref());
-        let (weights, steps, bounds) = (self.g, self.inner, self.bounds);
-        Some(Kernels::Dual(Dual { fragment, weights, steps, bounds, p, guide, slab }))
+        let (p, slab, bounds) = (self.dual.each_mut(), slab.as_ref(), *bounds);
+        Some(Kernels::Dual(Dual { fragment, weights: self.g, steps: self.inner, bounds, p, guide, slab }))
     }
 
     fn state(&mut self) -> Vec<(&str, StatePart<'_>)> {
         let [x, y, z] = self.dual.each_mut().map(StatePart::Placed);
         vec![("dual.x", x), ("dual.y", y), ("dual.z", z)]
     }
-}
-
-/// Clips each `u` to its own bounds, if it has some.
-pub(super) fn clip_each(u: &mut [f32], each: Option<&[Vec<f32>; 2]>) {
-    let Some([low, high]) = each else { return };
-    parallel::change(u, [low, high], |u, [low, high]| {
-        u.iter_mut().zip(low).zip(high).for_each(|((u, low), high)| *u = u.max(*low).min(*high));
-    });
 }
 
 /// Most dual steps per sweep, so that their part of the volume stays in the last-level cache.
@@ -921,7 +891,7 @@ mod tests {
 
     /// The same steps one after another, voxel by voxel; `dual` is `D·A·p`.
     fn plain(prox: &mut TvProx, v: &Array3<f32>, tau: f32, steps: usize) -> Array3<f32> {
-        let TvProx { shape, g, bounds, each, dual, edges, limited, .. } = prox;
+        let TvProx { shape, g, confines: Confines { bounds, each, .. }, dual, edges, limited, .. } = prox;
         let (shape, g, bounds, dual) = (*shape, *g, *bounds, &mut dual.each_mut().map(|p| p.on_host_mut().unwrap()));
         let moved = |at: [usize; 3], k: usize, by: isize| {
             let mut to = at;

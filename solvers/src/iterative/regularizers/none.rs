@@ -1,15 +1,12 @@
 //! No regularizer except the bounds of attenuation.
 
-use crate::iterative::tv::clip_each;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::place::Slab;
-use conefield_core::regularizer::{Bounds, Kernels, Penalty, Regularizer, RegularizerSpec};
+use conefield_core::regularizer::{Confines, Kernels, Penalty, Regularizer, RegularizerSpec};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
 
 /// Settings of `none`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -26,7 +23,7 @@ impl RegularizerSpec for Nonnegative {
 
 impl Regularizer for Nonnegative {
     fn on(&self, _: &VoxelGrid, _: &Space) -> Result<Box<dyn Penalty>> {
-        Ok(Box::new(BoundsPenalty { bounds: Bounds::default(), each: None, slab: None }))
+        Ok(Box::<BoundsPenalty>::default())
     }
 
     fn halo(&self) -> Option<usize> {
@@ -43,12 +40,9 @@ impl Regularizer for Nonnegative {
 }
 
 /// The bounds alone.
+#[derive(Default)]
 struct BoundsPenalty {
-    bounds: Bounds,
-    /// The bounds of each coefficient, if they differ.
-    each: Option<Arc<[Vec<f32>; 2]>>,
-    /// Its part of a volume that several processes share.
-    slab: Option<Slab>,
+    confines: Confines,
 }
 
 impl Penalty for BoundsPenalty {
@@ -57,29 +51,15 @@ impl Penalty for BoundsPenalty {
     }
 
     fn prox(&mut self, v: &[f32], _: f32, u: &mut [f32]) {
-        self.bounds.clip_to(u, v);
-        clip_each(u, self.each.as_deref());
+        self.confines.bounds.clip_to(u, v);
+        self.confines.clip_each(u);
     }
 
-    fn divide(&mut self, slab: Slab) {
-        self.slab = Some(slab);
-    }
-
-    fn slab(&self) -> Option<&Slab> {
-        self.slab.as_ref()
-    }
-
-    fn confine(&mut self, bounds: Bounds) -> Result<()> {
-        self.bounds = bounds;
-        Ok(())
-    }
-
-    fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
-        self.each = Some(bounds);
-        Ok(())
+    fn confines(&mut self) -> Option<&mut Confines> {
+        Some(&mut self.confines)
     }
 
     fn kernels(&mut self) -> Option<Kernels<'_>> {
-        self.each.is_none().then_some(Kernels::Clip(self.bounds))
+        self.confines.each.is_none().then_some(Kernels::Clip(self.confines.bounds))
     }
 }

@@ -14,18 +14,16 @@
 //! group, `Σ_g σ_g·P_gᵀ·P_g ≤ 1`, so that it converges.
 
 use super::total_variation::lambda;
-use crate::iterative::tv::clip_each;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parallel;
-use conefield_core::regularizer::{Bounds, Penalty, Regularizer, RegularizerSpec, Weight};
+use conefield_core::regularizer::{Confines, Penalty, Regularizer, RegularizerSpec, Weight};
 use conefield_core::simd::{Op, Simd, run};
 use conefield_core::space::Space;
 use ndarray::ArrayView3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
-use std::sync::Arc;
 
 /// Voxels along a side of a patch, unless the volume is thinner; also the distance between the first patches of groups.
 const SIDE: usize = 4;
@@ -90,16 +88,8 @@ impl Patches {
             true => (vec![], vec![]),
             false => (lattice.all().map(|at| [at; MANY]).collect(), vec![u8::MAX; count * SIZE]),
         };
-        let mut on = PatchesPenalty {
-            settings: *self,
-            lattice,
-            groups: vec![],
-            limits,
-            dual,
-            sum,
-            bounds: Bounds::default(),
-            each: None,
-        };
+        let (groups, confines) = (vec![], Confines::default());
+        let mut on = PatchesPenalty { settings: *self, lattice, groups, limits, dual, sum, confines };
         on.regroup(first);
         Ok(on)
     }
@@ -193,9 +183,7 @@ struct PatchesPenalty {
     dual: Vec<f32>,
     /// `Σ_g w_g·P_gᵀ·Qᵀ·q_g`.
     sum: Vec<f32>,
-    bounds: Bounds,
-    /// The bounds of each voxel, if they differ.
-    each: Option<Arc<[Vec<f32>; 2]>>,
+    confines: Confines,
 }
 
 impl PatchesPenalty {
@@ -272,11 +260,11 @@ impl PatchesPenalty {
 
     /// `u = clip(v − τ·sum)`
     fn descend(&self, v: &[f32], tau: f32, u: &mut [f32]) {
-        let bounds = self.bounds;
+        let bounds = self.confines.bounds;
         parallel::change(u, [v, &self.sum], |u, [v, sum]| {
             u.iter_mut().zip(v).zip(sum).for_each(|((u, v), sum)| *u = bounds.clip(v - tau * sum));
         });
-        clip_each(u, self.each.as_deref());
+        self.confines.clip_each(u);
     }
 }
 
@@ -318,14 +306,8 @@ impl Penalty for PatchesPenalty {
         }
     }
 
-    fn confine(&mut self, bounds: Bounds) -> Result<()> {
-        self.bounds = bounds;
-        Ok(())
-    }
-
-    fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
-        self.each = Some(bounds);
-        Ok(())
+    fn confines(&mut self) -> Option<&mut Confines> {
+        Some(&mut self.confines)
     }
 }
 
@@ -557,6 +539,7 @@ mod tests {
     use ndarray::{Array3, s};
     use std::collections::BTreeSet;
     use std::f32::consts::PI;
+    use std::sync::Arc;
 
     fn on(shape: [usize; 3], settings: Patches) -> PatchesPenalty {
         let grid = VoxelGrid { shape, spacing: [1.0; 3], center: [0.0; 3] };
