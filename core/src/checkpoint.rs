@@ -38,15 +38,11 @@ const PARTS: [&str; 3] = ["params", "first", "second"];
 /// A model's tensors for a checkpoint: `params.…`, `first.…` and `second.…` of each block of the layout.
 pub fn tensors(model: &Model) -> Vec<(String, &[usize], &[f32])> {
     let Arena { params, first, second, .. } = &model.arena;
-    tensors_of("", model.pipeline.layout(), [params, first, second])
+    tensors_of("", model.pipeline.layout(), &[params, first, second])
 }
 
 /// Parameters of `layout`, optionally with both moments, named as in [`tensors`] after `prefix`.
-pub fn tensors_of<'a, const N: usize>(
-    prefix: &str,
-    layout: &'a Layout,
-    parts: [&'a [f32]; N],
-) -> Vec<(String, &'a [usize], &'a [f32])> {
+pub fn tensors_of<'a>(prefix: &str, layout: &'a Layout, parts: &[&'a [f32]]) -> Vec<(String, &'a [usize], &'a [f32])> {
     let mut all = vec![];
     for (part, values) in PARTS.into_iter().zip(parts) {
         for b in &layout.blocks {
@@ -109,11 +105,11 @@ impl Resume {
             model.mask(keep.clone())?;
         }
         let Arena { params, first, second, .. } = &mut model.arena;
-        self.load("", model.pipeline.layout(), [params, first, second])
+        self.load("", model.pipeline.layout(), &mut [params, first, second])
     }
 
     /// Loads what [`tensors_of`] returned for `layout` under `prefix`.
-    pub fn load<const N: usize>(&self, prefix: &str, layout: &Layout, parts: [&mut [f32]; N]) -> Result<()> {
+    pub fn load(&self, prefix: &str, layout: &Layout, parts: &mut [&mut [f32]]) -> Result<()> {
         for (part, values) in PARTS.into_iter().zip(parts) {
             let prefix = format!("{}{prefix}{part}.", self.prefix);
             let own =

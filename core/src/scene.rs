@@ -39,7 +39,7 @@ impl Scene {
     pub fn new(scan: &Scan, settings: &SceneSettings) -> Result<Self> {
         let grid = scan.geometry.volume;
         let longest = grid.size().into_iter().fold(0.0, f64::max);
-        let attenuation = settings.attenuation.of(scan.unit.mm, longest, || {
+        let attenuation = settings.attenuation.of(scan.unit.mm, longest, &|| {
             let top = top_projection(scan);
             let expected = "line integrals of an object, positive where it absorbs";
             ensure(top > 0.0, "scan", "projections", "no positive line integral", expected)?;

@@ -156,7 +156,7 @@ pub fn learn(
 fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
     volume.grid.validate("volume")?;
     let longest = volume.grid.size().into_iter().fold(0.0, f64::max);
-    let attenuation = settings.attenuation.of(1.0, longest, || {
+    let attenuation = settings.attenuation.of(1.0, longest, &|| {
         let mut sums: Vec<f64> = vec![];
         for axis in 0..2 {
             let spacing = volume.grid.spacing[axis];

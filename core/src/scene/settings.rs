@@ -194,7 +194,7 @@ pub enum AttenuationScale {
 impl AttenuationScale {
     /// The value in 1/mm, for a scan in units of `mm` millimetres and a volume whose longest side is `longest` mm.
     /// `top` returns the line integral of the most absorbing rays.
-    pub fn of(self, mm: f64, longest: f64, top: impl FnOnce() -> Result<f64>) -> Result<f64> {
+    pub fn of(self, mm: f64, longest: f64, top: &dyn Fn() -> Result<f64>) -> Result<f64> {
         Ok(match self {
             Self::Scan => 4.0 * top()? / longest,
             Self::Relative(times) => times * Self::Scan.of(mm, longest, top)?,

@@ -22,7 +22,19 @@ const SLANT: f64 = 0.5;
 
 /// Adds the views `views` of `geometry`, with the pixels `pixels` and the scales `s_i` in `scales` (mm²), to `slab`:
 /// planes of the volume along x, from plane `first` on. The result does not depend on the slabs.
-pub fn backproject<R: Real>(
+pub fn backproject(
+    geometry: &Geometry,
+    views: &[usize],
+    pixels: &ColumnMajor<f32>,
+    scales: &[f64],
+    slab: ArrayViewMut3<'_, f32>,
+    first: usize,
+) {
+    backproject_in(geometry, views, pixels, scales, slab, first);
+}
+
+/// [`backproject`] with numbers of any precision. Whoever calls it compiles its kernel anew.
+pub(super) fn backproject_in<R: Real>(
     geometry: &Geometry,
     views: &[usize],
     pixels: &ColumnMajor<R>,

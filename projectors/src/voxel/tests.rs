@@ -1,6 +1,6 @@
 //! Tests of adjointness, of agreement between implementations, and against closed forms.
 
-use super::backproject::backproject;
+use super::backproject::backproject_in;
 use super::columns;
 use super::layout::{ColumnMajor, Pinhole, main_axis};
 use super::rays;
@@ -315,7 +315,7 @@ fn by_lines<R: Real>(g: &Geometry, y: &Array3<f64>) -> Array3<R> {
     let views = all_views(g);
     let pixels = ColumnMajor::new(g, &views, y.mapv(R::of).view());
     let mut out = Array3::from_elem(g.volume.shape, R::ZERO);
-    backproject(g, &views, &pixels, &scales(g), out.view_mut(), 0);
+    backproject_in(g, &views, &pixels, &scales(g), out.view_mut(), 0);
     out
 }
 

@@ -121,7 +121,7 @@ impl Made {
             tensors.extend(data.and_then(|d| Some((name.to_owned(), d.shape(), d.as_slice()?))));
         }
         if let Some((_, TrainedField { model, .. })) = &self.field {
-            tensors.extend(tensors_of(FIELD, model.pipeline.layout(), [&model.arena.params]));
+            tensors.extend(tensors_of(FIELD, model.pipeline.layout(), &[&model.arena.params]));
         }
         let own = link.into_iter().flat_map(|link| &link.tensors);
         tensors.extend(own.map(|(name, shape, values)| (format!("{LINK}{name}"), *shape, *values)));
@@ -144,7 +144,7 @@ impl Made {
     /// Restores the state from a checkpoint, with the running method's own part if there is one.
     pub(super) fn resumed(resume: &Resume, links: &[Box<dyn Plan>], job: &Job<'_>) -> Result<(Self, Option<Resume>)> {
         let place = &resume.place;
-        let kept = Kept::deserialize(&resume.standing.method);
+        let kept = serde_json::from_value::<Kept>(resume.standing.method.clone());
         let kept = kept.map_err(|e| Error::invalid(place, "method", e, "the state of a chain"))?;
         let expected = format!("fewer than {}", links.len());
         ensure(kept.links < links.len(), place, "method.links", kept.links, expected)?;
@@ -158,7 +158,7 @@ impl Made {
             let expected = format!("fewer than {}", kept.links);
             ensure(by < kept.links, place, "method.field", by, expected)?;
             let field = links[by].restore(&placement, &mut |model| {
-                resume.load(FIELD, model.pipeline.layout(), [&mut model.arena.params])
+                resume.load(FIELD, model.pipeline.layout(), &mut [&mut model.arena.params])
             })?;
             Ok::<_, Error>((by, field))
         };

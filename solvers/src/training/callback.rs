@@ -11,10 +11,9 @@ use conefield_core::registry::Registered;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
-use std::fmt::Debug;
 
 /// Settings of a callback.
-pub trait CallbackSpec: Copied + Registered + Debug + Send + Sync {
+pub trait CallbackSpec: Copied + Registered + Send + Sync {
     /// The callback, or why the settings are invalid.
     fn build(&self) -> Result<Box<dyn Callback>>;
 }
@@ -157,7 +156,8 @@ impl Kept<'_> {
     /// The deserialized values.
     pub fn value<T: DeserializeOwned>(&self) -> Result<T> {
         let expected = "the state of this callback";
-        T::deserialize(self.value).map_err(|e| Error::invalid(&self.resume.place, self.name, e, expected))
+        serde_json::from_value(self.value.clone())
+            .map_err(|e| Error::invalid(&self.resume.place, self.name, e, expected))
     }
 
     /// One of its tensors, of this shape.
@@ -167,7 +167,7 @@ impl Kept<'_> {
 
     /// Reads the parts of an arena that [`tensors_of`](conefield_core::checkpoint::tensors_of) stored under the
     /// callback's name.
-    pub fn parts<const N: usize>(&self, layout: &Layout, parts: [&mut [f32]; N]) -> Result<()> {
+    pub fn parts(&self, layout: &Layout, parts: &mut [&mut [f32]]) -> Result<()> {
         self.resume.load(&format!("{}.", self.name), layout, parts)
     }
 }

@@ -54,7 +54,7 @@ pub fn keep(run: &mut Run<'_>, callbacks: &Callbacks) -> Result<()> {
 /// Restores a run, whose model is already restored, and its callbacks from `resume`. Refuses a missing state, and a
 /// state that belongs to no part of the run.
 pub fn restore(run: &mut Run<'_>, callbacks: &mut Callbacks, resume: &Resume) -> Result<()> {
-    let whole: Whole<Tally> = Whole::deserialize(&resume.standing.method)
+    let whole: Whole<Tally> = serde_json::from_value(resume.standing.method.clone())
         .map_err(|e| Error::invalid(&resume.place, "method", e, "the state of a training run"))?;
     (run.step, run.samples, run.tally) = (resume.standing.step, resume.standing.samples, whole.run);
     let mut known: BTreeSet<String> = tensors(&run.model).into_iter().map(|t| t.0).collect();

@@ -89,7 +89,7 @@ impl Callback for Waiting {
     }
 
     fn state<'a>(&'a self, layout: &'a Layout) -> Result<State<'a>> {
-        let tensors = self.copy.iter().flat_map(|copy| tensors_of(PREFIX, layout, [&**copy])).collect();
+        let tensors = self.copy.iter().flat_map(|copy| tensors_of(PREFIX, layout, &[&**copy])).collect();
         State::new(NAME, &self.waited, tensors)
     }
 
@@ -98,7 +98,7 @@ impl Callback for Waiting {
         if self.waited.best.is_some() {
             let layout = run.model.pipeline.layout();
             let mut params = Pages::zeros(layout.len());
-            kept.parts(layout, [&mut *params])?;
+            kept.parts(layout, &mut [&mut *params])?;
             self.copy = Some(params);
         }
         Ok(())
@@ -141,7 +141,7 @@ mod tests {
     use crate::gaussians::stage::Mixture;
     use conefield_backend_cpu::Cpu;
     use conefield_core::backend::{Adam, Executable, StepStats, Work};
-    use conefield_core::method::{Best, Job, Observer};
+    use conefield_core::method::{Best, Job, Silent};
     use conefield_core::pipeline::{Model, Pipeline};
     use conefield_core::scan::Volume;
     use conefield_core::scene::{Scene, SceneSettings};
@@ -180,14 +180,6 @@ mod tests {
         }
     }
 
-    struct Deaf;
-
-    impl Observer for Deaf {
-        fn progress(&mut self, _: u64, _: f64, _: f64) {}
-        fn record(&mut self, _: &Record) {}
-        fn note(&mut self, _: &str) {}
-    }
-
     /// As a callback does that opens the closed levels at the end of a run.
     #[test]
     fn the_best_state_stays_when_parameters_are_fetched_after_it() {
@@ -197,9 +189,9 @@ mod tests {
         let (scan, backend) = (scan_ellipsoids(&[ball], geometry), Cpu::new());
         let (job, scene) = (Job::new(&scan, &backend), Scene::new(&scan, &SceneSettings::default()).unwrap());
         let pipeline = Pipeline::alone(Box::new(Mixture { most: 1 })).unwrap();
-        let (model, mut deaf) = (Model::random(pipeline, 1), Deaf);
+        let (model, mut silent) = (Model::random(pipeline, 1), Silent);
         let best = model.arena.params.clone();
-        let mut run = Run::new(&job, &scene, &mut deaf, model, Box::new(Remote { loaded: true }));
+        let mut run = Run::new(&job, &scene, &mut silent, model, Box::new(Remote { loaded: true }));
         let found = Best { step: 1, held_out: 0.1 };
         let waited = Waited { best: Some(found), since: 1 };
         let mut waiting = Waiting { records: 1, waited, copy: Some(best.clone()) };

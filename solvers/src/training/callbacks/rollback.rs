@@ -159,7 +159,7 @@ impl Callback for Guard {
 
     fn state<'a>(&'a self, layout: &'a Layout) -> Result<State<'a>> {
         let parts = self.copy.iter().map(|copy| copy.each_ref().map(|p| &**p));
-        let tensors = parts.flat_map(|parts| tensors_of(PREFIX, layout, parts)).collect();
+        let tensors = parts.flat_map(|parts| tensors_of(PREFIX, layout, &parts)).collect();
         State::new(NAME, &self.watched, tensors)
     }
 
@@ -168,7 +168,7 @@ impl Callback for Guard {
         if self.watched.kept.is_some() {
             let layout = run.model.pipeline.layout();
             let mut copy = [(); 3].map(|()| Pages::zeros(layout.len()));
-            kept.parts(layout, copy.each_mut().map(|p| &mut **p))?;
+            kept.parts(layout, &mut copy.each_mut().map(|p| &mut **p))?;
             self.copy = Some(copy);
         }
         Ok(())
