@@ -2,7 +2,8 @@
 
 use super::grid::EXTENT;
 use super::lists::Lists;
-use super::shape::{Shape, V3};
+use super::shape::Shape;
+use conefield_core::geometry::Vec3;
 
 /// Cells per side of the unit cube.
 const SIDE: usize = 48;
@@ -38,7 +39,7 @@ impl Cells {
     }
 
     /// The value of `shapes` at a point of the unit cube; their densities may have changed since.
-    pub fn value(&self, shapes: &[Shape], p: V3) -> f64 {
+    pub fn value(&self, shapes: &[Shape], p: Vec3) -> f64 {
         let [x, y, z] = p.map(cell);
         let near = self.lists.of((x * SIDE + y) * SIDE + z);
         near.iter().fold(0.0, |sum, &i| sum + shapes[i as usize].value(p, EXTENT))

@@ -4,7 +4,8 @@
 //! quadratic polynomial, which gives the Gaussian's end points. Results are bit-identical for any number of threads.
 
 use super::lists::Lists;
-use super::shape::{M3, Shape, Slope, V3, apply, dot};
+use super::shape::{M3, Shape, Slope, apply};
+use conefield_core::geometry::{Vec3, dot};
 use conefield_core::parallel;
 use conefield_core::simd::{self, Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, store};
 use conefield_core::stage::UnitGrid;
@@ -96,7 +97,7 @@ impl<R: Real> Row<R> {
     fn of(grid: &UnitGrid, shape: &Shape, [dx, dy]: [f64; 2], points: &Range<usize>) -> Self {
         let m = &shape.inverse;
         let across = apply(m, [dx, dy, 0.0]);
-        let down: V3 = [m[0][2], m[1][2], m[2][2]];
+        let down: Vec3 = [m[0][2], m[1][2], m[2][2]];
         let (n0, half, n2) = (dot(across, across), dot(across, down), dot(down, down));
         let start = grid.first[2] - shape.centre[2];
         let root = half * half - n2 * (n0 - EXTENT * EXTENT);
@@ -228,7 +229,7 @@ impl<R: Real> Op for Collect<'_, R> {
 
 /// Derivatives with respect to a shape, from `Σ w`, `Σ w·d` and the upper half of `Σ w·d·dᵀ` with `w = dμ·exp(-½|Md|²)`
 /// and `d` the displacement from the centre.
-pub(super) fn slope(shape: &Shape, sum: f64, first: V3, [xx, xy, xz, yy, yz, zz]: [f64; 6]) -> Slope {
+pub(super) fn slope(shape: &Shape, sum: f64, first: Vec3, [xx, xy, xz, yy, yz, zz]: [f64; 6]) -> Slope {
     let m = &shape.inverse;
     let spread: M3 = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
     let moved = apply(m, first);

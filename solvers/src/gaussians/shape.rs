@@ -4,6 +4,7 @@
 //! standard deviations along its axes. Lengths are in sides of the unit cube (Zha et al., R²-Gaussian, NeurIPS 2024,
 //! eq. 4, with the covariance `R·diag(s²)·Rᵀ`).
 
+use conefield_core::geometry::{Vec3, dot, sub};
 use conefield_core::simd::Real;
 
 /// Parameters of a Gaussian: centre (3), logarithms of the standard deviations (3), quaternion (4), density (1).
@@ -19,26 +20,12 @@ pub const DENSITY: usize = 10;
 /// The density before softplus of a free slot: its softplus is exactly 0.
 pub const FREE: f32 = -1000.0;
 
-/// A vector of three.
-pub type V3 = [f64; 3];
 /// A matrix of three rows.
-pub type M3 = [V3; 3];
-
-/// `Σ aᵢ bᵢ`.
-#[inline(always)]
-pub fn dot(a: V3, b: V3) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-/// The vector product.
-#[inline(always)]
-pub fn cross(a: V3, b: V3) -> V3 {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
+pub type M3 = [Vec3; 3];
 
 /// `m·x`.
 #[inline(always)]
-pub fn apply(m: &M3, x: V3) -> V3 {
+pub fn apply(m: &M3, x: Vec3) -> Vec3 {
     [dot(m[0], x), dot(m[1], x), dot(m[2], x)]
 }
 
@@ -46,11 +33,11 @@ pub fn apply(m: &M3, x: V3) -> V3 {
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Shape {
     /// Centre, in cube sides.
-    pub centre: V3,
+    pub centre: Vec3,
     /// Maps displacements to standard deviations.
     pub inverse: M3,
     /// Standard deviations along its own axes, in cube sides.
-    pub deviations: V3,
+    pub deviations: Vec3,
     /// Value at the centre, at least 0; 0 if the slot is free.
     pub density: f64,
 }
@@ -72,8 +59,8 @@ impl Shape {
 
     /// `ρ·exp(-½|M(x - c)|²)` at `x`; 0 beyond `extent` standard deviations.
     #[inline]
-    pub fn value(&self, x: V3, extent: f64) -> f64 {
-        let m = apply(&self.inverse, std::array::from_fn(|k| x[k] - self.centre[k]));
+    pub fn value(&self, x: Vec3, extent: f64) -> f64 {
+        let m = apply(&self.inverse, sub(x, self.centre));
         let e = dot(m, m);
         if e <= extent * extent { self.density * (-0.5 * e).exp() } else { 0.0 }
     }
@@ -84,7 +71,7 @@ impl Shape {
     }
 
     /// Half sides of the box around all points within `extent` standard deviations.
-    pub fn reach(&self, extent: f64) -> V3 {
+    pub fn reach(&self, extent: f64) -> Vec3 {
         // Σ_jj = Σ_k (R_jk s_k)² with R_jk = M_kj s_k.
         std::array::from_fn(|j| {
             let along = |k: usize| self.inverse[k][j] * self.deviations[k] * self.deviations[k];
@@ -97,7 +84,7 @@ impl Shape {
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Slope {
     /// With respect to the centre.
-    pub centre: V3,
+    pub centre: Vec3,
     /// With respect to the entries of the matrix.
     pub inverse: M3,
     /// With respect to the density.

@@ -5,11 +5,11 @@
 
 use super::device::DeviceMixture;
 use super::grid::{self, Grid};
-use super::shape::{DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, V3, apply, cross, dot};
+use super::shape::{DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, apply};
 use super::view;
 use conefield_core::device::Device;
 use conefield_core::error::Result;
-use conefield_core::geometry::{norm, sub};
+use conefield_core::geometry::{Vec3, cross, dot, norm, sub};
 use conefield_core::parallel;
 use conefield_core::simd::Real;
 use conefield_core::stage::{
@@ -55,20 +55,20 @@ fn far<R: Real>(p: &[R], extent: f64) -> f64 {
     extent * p[SCALE].f64().max(p[SCALE + 1].f64()).max(p[SCALE + 2].f64()).exp()
 }
 
-fn place<R: Real>(p: &[R]) -> V3 {
+fn place<R: Real>(p: &[R]) -> Vec3 {
     [p[0].f64(), p[1].f64(), p[2].f64()]
 }
 
 /// The points of a tile, and their bounding box.
 struct Points {
-    all: Vec<V3>,
-    bounds: [V3; 2],
+    all: Vec<Vec3>,
+    bounds: [Vec3; 2],
 }
 
 impl Points {
     fn of<R: Real>(x: Tile<'_, R>) -> Self {
-        let all: Vec<V3> = (0..x.rows).map(|i| std::array::from_fn(|k| x.channel(k)[i].f64())).collect();
-        let fold = |start: f64, f: fn(f64, f64) -> f64| -> V3 {
+        let all: Vec<Vec3> = (0..x.rows).map(|i| std::array::from_fn(|k| x.channel(k)[i].f64())).collect();
+        let fold = |start: f64, f: fn(f64, f64) -> f64| -> Vec3 {
             std::array::from_fn(|k| all.iter().map(|p| p[k]).fold(start, f))
         };
         let bounds = [fold(f64::INFINITY, f64::min), fold(f64::NEG_INFINITY, f64::max)];
@@ -112,8 +112,8 @@ impl<R: Real> Kernel<R> for Mixture {
 /// Rays in similar directions: a Gaussian further from the first ray than `spread` plus its own reach meets none of
 /// them.
 pub(super) struct Bundle {
-    origin: V3,
-    direction: V3,
+    origin: Vec3,
+    direction: Vec3,
     pub(super) spread: f64,
 }
 
@@ -123,7 +123,7 @@ impl Bundle {
         let (origin, direction) = of(rays.first()?);
         // No Gaussian has its centre beyond the cube's far side.
         let far = rays.iter().map(|r| f64::from(r.inside[1])).fold(0.0, f64::max) + 2.0;
-        let at = |(o, d): (V3, V3), t: f64| -> V3 { std::array::from_fn(|k| o[k] + t * d[k]) };
+        let at = |(o, d): (Vec3, Vec3), t: f64| -> Vec3 { std::array::from_fn(|k| o[k] + t * d[k]) };
         let apart = |r: &UnitRay, t: f64| norm(sub(at(of(r), t), at((origin, direction), t)));
         let spread = rays.iter().map(|r| apart(r, 0.0).max(apart(r, far))).fold(0.0, f64::max);
         Some(Self { origin, direction, spread })

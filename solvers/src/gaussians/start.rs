@@ -8,9 +8,10 @@
 
 use super::cells::Cells;
 use super::lists::Lists;
-use super::shape::{CENTRE, DENSITY, NUMBERS, ROTATION, SCALE, V3, before_softplus, dot};
+use super::shape::{CENTRE, DENSITY, NUMBERS, ROTATION, SCALE, before_softplus};
 use super::stage::shapes;
 use conefield_core::error::{Error, Result, ensure};
+use conefield_core::geometry::{Vec3, dot};
 use conefield_core::parallel;
 use conefield_core::random::stream;
 use conefield_core::scan::Volume;
@@ -56,8 +57,8 @@ pub enum Sites {
 
 /// An initial Gaussian: centre, standard deviations, and the volume's value there, in the scale that stages see.
 struct Begin {
-    centre: V3,
-    widths: V3,
+    centre: Vec3,
+    widths: Vec3,
     value: f64,
 }
 
@@ -146,7 +147,7 @@ impl Start {
         let above: Vec<u32> = volume.data.iter().enumerate().filter_map(above).collect();
         let drawn = sample(&mut stream(seed ^ 0x6a05_51a7, 0), above.len(), self.count.min(above.len()));
         let voxels: Vec<usize> = drawn.into_iter().map(|i| above[i] as usize).collect();
-        let points: Vec<V3> = voxels.iter().map(|&i| scene.to_unit(place(i)).map(f64::from)).collect();
+        let points: Vec<Vec3> = voxels.iter().map(|&i| scene.to_unit(place(i)).map(f64::from)).collect();
         let all = points.iter().zip(widths(&points)).zip(&voxels);
         all.map(|((&centre, width), &i)| Begin {
             centre,
@@ -244,22 +245,22 @@ fn cells(volume: &Volume, scene: &Scene, threshold: f32, count: usize) -> Vec<Be
 }
 
 /// Morton code of a point in the unit cube: neighbours stay close.
-fn morton(p: V3) -> u64 {
+fn morton(p: Vec3) -> u64 {
     let n = p.map(|x| (x * 1024.0).clamp(0.0, 1023.0) as u64);
     (0..10).fold(0, |code, bit| (0..3).fold(code, |code, k| code | (n[k] >> bit & 1) << (3 * bit + k)))
 }
 
 /// For each point, the root mean square distance of its nearest neighbours.
-fn widths(points: &[V3]) -> Vec<f64> {
+fn widths(points: &[Vec3]) -> Vec<f64> {
     // About one point per occupied cell.
     let side = ((4.0 * points.len() as f64).cbrt() as usize).clamp(1, 128);
-    let cell = |p: V3| p.map(|x| ((x * side as f64).max(0.0) as usize).min(side - 1));
+    let cell = |p: Vec3| p.map(|x| ((x * side as f64).max(0.0) as usize).min(side - 1));
     let mut lists = Lists::default();
     lists.fill(side.pow(3), points.len(), |i, put| {
         let [x, y, z] = cell(points[i]);
         put((x * side + y) * side + z);
     });
-    let near = |(i, p): (usize, &V3)| {
+    let near = |(i, p): (usize, &Vec3)| {
         let at = cell(*p);
         let mut nearest = [f64::INFINITY; NEIGHBOURS];
         for ring in 0..side {
@@ -273,7 +274,7 @@ fn widths(points: &[V3]) -> Vec<f64> {
                             continue;
                         }
                         for &j in lists.of((x * side + y) * side + z) {
-                            let d: V3 = std::array::from_fn(|k| points[j as usize][k] - p[k]);
+                            let d: Vec3 = std::array::from_fn(|k| points[j as usize][k] - p[k]);
                             let mut d = dot(d, d);
                             if j as usize != i {
                                 nearest.iter_mut().for_each(|n| {
@@ -295,7 +296,7 @@ fn widths(points: &[V3]) -> Vec<f64> {
         (found.iter().sum::<f64>() / found.len().max(1) as f64).sqrt()
     };
     let parts = points.chunks(256).enumerate();
-    let widths = |_, (n, part): (usize, &[V3])| (n * 256..).zip(part).map(near).collect::<Vec<_>>();
+    let widths = |_, (n, part): (usize, &[Vec3])| (n * 256..).zip(part).map(near).collect::<Vec<_>>();
     parallel::map(parts, widths).concat()
 }
 
@@ -305,11 +306,11 @@ mod tests {
 
     #[test]
     fn widths_are_those_of_all_neighbours() {
-        let points: Vec<V3> = (0..300)
+        let points: Vec<Vec3> = (0..300)
             .map(|i| std::array::from_fn(|k| ((i * [7919, 104_729, 1_299_709][k] + 13) % 1000) as f64 / 2500.0))
             .collect();
         for (i, found) in widths(&points).into_iter().enumerate() {
-            let apart = |q: &V3| {
+            let apart = |q: &Vec3| {
                 dot(std::array::from_fn(|k| q[k] - points[i][k]), std::array::from_fn(|k| q[k] - points[i][k]))
             };
             let mut all: Vec<f64> = points.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, q)| apart(q)).collect();

@@ -2,9 +2,10 @@
 //! rays and points.
 
 use super::grid::Grid;
-use super::shape::{FREE, NUMBERS, Slope, V3, apply, cross, dot};
+use super::shape::{FREE, NUMBERS, Slope, apply};
 use super::stage::{Mixture, shapes};
 use super::view::{Beam, EXTENT, Sight};
+use conefield_core::geometry::{Vec3, cross, dot, sub};
 use conefield_core::stage::{Kernel, Tile, TileMut, UnitGrid, UnitRay};
 
 const ROWS: usize = 24;
@@ -13,7 +14,7 @@ const COLUMNS: usize = 29;
 /// A cone beam on a rotated and shifted detector.
 fn beam() -> Beam {
     let (u, v) = ([-0.045, 0.05, 0.004], [0.003, 0.006, -0.07]);
-    let first: V3 = std::array::from_fn(|k| [-2.1, -1.9, 0.1][k] - 13.0 * u[k] - 11.5 * v[k]);
+    let first: Vec3 = std::array::from_fn(|k| [-2.1, -1.9, 0.1][k] - 13.0 * u[k] - 11.5 * v[k]);
     Beam { source: [1.9, 1.8, 0.4], first, u, v, detector: [ROWS, COLUMNS] }
 }
 
@@ -87,11 +88,11 @@ fn line_integrals_are_those_of_quadrature() {
     let (mut worst, mut most) = (0.0f64, 0.0f64);
     for row in 0..ROWS {
         for column in 0..COLUMNS {
-            let d: V3 = std::array::from_fn(|k| beam.first[k] + column as f64 * beam.u[k] + row as f64 * beam.v[k]);
+            let d: Vec3 = std::array::from_fn(|k| beam.first[k] + column as f64 * beam.u[k] + row as f64 * beam.v[k]);
             let length = dot(d, d).sqrt();
             let mut sum = 0.0;
             for shape in &all {
-                let y: V3 = std::array::from_fn(|k| shape.centre[k] - beam.source[k]);
+                let y = sub(shape.centre, beam.source);
                 let off = cross(apply(&shape.inverse, y), apply(&shape.inverse, d));
                 let e = dot(off, off) / dot(apply(&shape.inverse, d), apply(&shape.inverse, d));
                 if e <= EXTENT * EXTENT {
@@ -155,7 +156,7 @@ fn a_view_is_its_rays_in_both_precisions() {
     let (mut unlike, mut apart) = (0, 0.0f64);
     for row in 0..ROWS {
         for column in 0..COLUMNS {
-            let d: V3 = std::array::from_fn(|k| beam.first[k] + column as f64 * beam.u[k] + row as f64 * beam.v[k]);
+            let d: Vec3 = std::array::from_fn(|k| beam.first[k] + column as f64 * beam.u[k] + row as f64 * beam.v[k]);
             let length = dot(d, d).sqrt();
             let ray = UnitRay {
                 origin: beam.source.map(|x| x as f32),

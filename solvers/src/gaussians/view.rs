@@ -14,7 +14,8 @@
 //! independent, and so are Gaussians in the back-projection. Results are bit-identical for any number of threads.
 
 use super::lists::Lists;
-use super::shape::{M3, Shape, Slope, V3, apply, cross, dot};
+use super::shape::{M3, Shape, Slope, apply};
+use conefield_core::geometry::{Vec3, cross, dot, sub};
 use conefield_core::parallel;
 use conefield_core::simd::{self, Op, Real, Select, Simd, SimdBase, SimdFloat, V, WIDEST};
 use std::f64::consts::TAU;
@@ -39,13 +40,13 @@ const SLACK: f64 = 0.01;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Beam {
     /// The source.
-    pub source: V3,
+    pub source: Vec3,
     /// From the source to the centre of the pixel in row 0 and column 0.
-    pub first: V3,
+    pub first: Vec3,
     /// From one column to the next.
-    pub u: V3,
+    pub u: Vec3,
     /// From one row to the next.
-    pub v: V3,
+    pub v: Vec3,
     /// Rows and columns.
     pub detector: [usize; 2],
 }
@@ -89,7 +90,7 @@ impl Beam {
     fn scaled<R: Real>(&self, image: &mut [R]) {
         let (d, u, v) = (self.first, self.u, self.v);
         parallel::over(image.chunks_mut(self.stride()), |row, line| {
-            let start: V3 = std::array::from_fn(|k| d[k] + row as f64 * v[k]);
+            let start: Vec3 = std::array::from_fn(|k| d[k] + row as f64 * v[k]);
             let [c0, c1, c2] = [dot(start, start), 2.0 * dot(start, u), dot(u, u)];
             for (column, x) in line[..self.detector[1]].iter_mut().enumerate() {
                 let c = column as f64;
@@ -100,12 +101,12 @@ impl Beam {
 
     /// Where the line from the source through `y` meets the detector: column, row, and the factor from `D` to `y`;
     /// `None` for a point that is not in front of the detector's plane.
-    fn meet(&self, y: V3, normal: V3) -> Option<([f64; 2], f64)> {
+    fn meet(&self, y: Vec3, normal: Vec3) -> Option<([f64; 2], f64)> {
         let t = dot(y, normal) / dot(self.first, normal);
         if t <= 1e-9 {
             return None;
         }
-        let p: V3 = std::array::from_fn(|k| y[k] / t - self.first[k]);
+        let p: Vec3 = std::array::from_fn(|k| y[k] / t - self.first[k]);
         let (uu, uv, vv) = (dot(self.u, self.u), dot(self.u, self.v), dot(self.v, self.v));
         let (pu, pv) = (dot(p, self.u), dot(p, self.v));
         let det = uu * vv - uv * uv;
@@ -113,11 +114,11 @@ impl Beam {
     }
 
     /// The footprint of a Gaussian; `None` if no pixel sees it, or if it reaches the source.
-    fn footprint<R: Real>(&self, shape: &Shape, normal: V3) -> Option<Footprint<R>> {
+    fn footprint<R: Real>(&self, shape: &Shape, normal: Vec3) -> Option<Footprint<R>> {
         if shape.density == 0.0 {
             return None;
         }
-        let y: V3 = std::array::from_fn(|k| shape.centre[k] - self.source[k]);
+        let y = sub(shape.centre, self.source);
         let (at, t) = self.meet(y, normal)?;
         let m = &shape.inverse;
         let (z, mu, mv) = (apply(m, y), apply(m, self.u), apply(m, self.v));
@@ -157,8 +158,8 @@ impl Beam {
     }
 
     /// Derivatives of a loss with respect to `shape`, from the moments over its pixels.
-    fn slope(&self, shape: &Shape, normal: V3, moments: &Moments) -> Slope {
-        let y: V3 = std::array::from_fn(|k| shape.centre[k] - self.source[k]);
+    fn slope(&self, shape: &Shape, normal: Vec3, moments: &Moments) -> Slope {
+        let y = sub(shape.centre, self.source);
         let Some((_, t)) = self.meet(y, normal) else { return Slope::default() };
         let m = &shape.inverse;
         let (z, mu, mv) = (apply(m, y), apply(m, self.u), apply(m, self.v));
@@ -173,7 +174,7 @@ impl Beam {
         // Σ w·D·Dᵀ multiplied by M from the left: rows belong to M, columns to D.
         let spread = |s: &[f64; 6]| -> M3 {
             let part =
-                |a: f64, b: f64, c: f64| -> V3 { std::array::from_fn(|k| a * d[k] + b * self.u[k] + c * self.v[k]) };
+                |a: f64, b: f64, c: f64| -> Vec3 { std::array::from_fn(|k| a * d[k] + b * self.u[k] + c * self.v[k]) };
             let parts = [part(s[0], s[1], s[2]), part(s[1], s[3], s[4]), part(s[2], s[4], s[5])];
             std::array::from_fn(|i| {
                 std::array::from_fn(|k| mc[i] * parts[0][k] + mu[i] * parts[1][k] + mv[i] * parts[2][k])
@@ -188,10 +189,10 @@ impl Beam {
             + p[3] * dot(mu, mu)
             + p[5] * dot(mv, mv);
         let along = [p[1] * zu + p[2] * zv, p[1] * zc + p[3] * zu + p[4] * zv, p[2] * zc + p[4] * zu + p[5] * zv];
-        let by: V3 = std::array::from_fn(|i| trace * z[i] - (mc[i] * along[0] + mu[i] * along[1] + mv[i] * along[2]));
+        let by: Vec3 = std::array::from_fn(|i| trace * z[i] - (mc[i] * along[0] + mu[i] * along[1] + mv[i] * along[2]));
         let zz = dot(z, z);
         let k = -shape.density * root;
-        let across: V3 = std::array::from_fn(|j| z[0] * bent[0][j] + z[1] * bent[1][j] + z[2] * bent[2][j]);
+        let across: Vec3 = std::array::from_fn(|j| z[0] * bent[0][j] + z[1] * bent[1][j] + z[2] * bent[2][j]);
         let inverse = std::array::from_fn(|i| {
             std::array::from_fn(|j| k * (full[i][j] + zz * bent[i][j] - z[i] * across[j] + by[i] * y[j]))
         });
@@ -404,7 +405,7 @@ struct Gather<'a, R> {
     seen: &'a [Footprint<R>],
     image: &'a [R],
     stride: usize,
-    normal: V3,
+    normal: Vec3,
     slopes: &'a mut [Slope],
 }
 

@@ -3,13 +3,13 @@
 use super::cells::Cells;
 use super::control::{Pulls, lock};
 use super::grid::Grid;
-use super::shape::{CENTRE, DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, Slope, V3};
+use super::shape::{CENTRE, DENSITY, FREE, NUMBERS, ROTATION, SCALE, Shape, Slope};
 use super::ssim::Ssim;
 use super::stage::reshape;
 use super::view::{Beam, Sight};
 use conefield_core::backend::{Adam, BlockWork, Executable, StepStats, Work};
 use conefield_core::error::{Error, Result};
-use conefield_core::geometry::{Geometry, norm, sub};
+use conefield_core::geometry::{Geometry, Vec3, norm, sub};
 use conefield_core::loss::Loss;
 use conefield_core::parallel;
 use conefield_core::pipeline::Model;
@@ -78,7 +78,7 @@ impl Views {
     pub fn half_detector(&self) -> f64 {
         let beam = &self.beams[0];
         let [rows, columns] = beam.detector.map(|n| n as f64);
-        let middle: V3 = std::array::from_fn(|k| beam.first[k] + 0.5 * (columns * beam.u[k] + rows * beam.v[k]));
+        let middle: Vec3 = std::array::from_fn(|k| beam.first[k] + 0.5 * (columns * beam.u[k] + rows * beam.v[k]));
         let to_cube = norm(std::array::from_fn(|k| 0.5 - beam.source[k]));
         0.5 * (columns * norm(beam.u)).max(rows * norm(beam.v)) * to_cube / norm(middle)
     }
@@ -102,7 +102,7 @@ pub struct ViewTraining {
 /// The rays of `view` in the unit cube of `scene`.
 pub fn beam(geometry: &Geometry, view: usize, scene: &Scene) -> Beam {
     let w = &geometry.views[view];
-    let unit = |v: V3| v.map(|x| x / scene.side);
+    let unit = |v: Vec3| v.map(|x| x / scene.side);
     Beam {
         source: std::array::from_fn(|k| (w.source[k] - scene.origin[k]) / scene.side),
         first: unit(sub(w.pixel(geometry.detector, 0.0, 0.0), w.source)),

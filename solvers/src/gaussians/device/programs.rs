@@ -34,25 +34,19 @@ fn kind(buffer: &str) -> &'static str {
     }
 }
 
-/// A program that reads uniform values and buffers, and writes others.
+/// A program that reads uniform values and buffers, and writes others: atomic numbers, if that is the word before the name.
 fn program(label: &str, uniforms: &[&str], read: &[&str], write: &[&str], pieces: &[(&str, &str)]) -> Program {
     let mut source = Source::default();
     for (names, access) in [(uniforms, Access::Uniform), (read, Access::Read), (write, Access::Write)] {
-        names.iter().for_each(|name| source.bind(name, access, kind(name)));
+        for name in names {
+            match name.strip_prefix("atomic ") {
+                Some(name) => source.bind(name, access, "array<atomic<u32>>"),
+                None => source.bind(name, access, kind(name)),
+            }
+        }
     }
     pieces.iter().for_each(|(name, text)| source.add(name, text));
     Program { label: format!("gaussians: {label}"), source }
-}
-
-/// The same with atomic numbers in `buffer`.
-fn with_atomic(mut program: Program, buffer: &str) -> Program {
-    let mut source = Source::default();
-    for binding in program.source.bindings() {
-        let kind = if binding.name == buffer { "array<atomic<u32>>" } else { kind(&binding.name) };
-        source.bind(&binding.name, binding.access, kind);
-    }
-    program.source = source;
-    program
 }
 
 /// Programs for values and line integrals, and the lists of all.
@@ -70,23 +64,20 @@ pub struct Evaluation {
 impl Evaluation {
     pub fn new() -> Self {
         let constants = constants();
-        let visiting = |label, write: &[&str], atomic: &str, visit: &str| {
-            let mut program = with_atomic(program(label, &["bins"], &["boxes"], write, &[]), atomic);
-            program.source.add("bins", piece!("bins").1);
-            program.source.add(label, &piece!("visit").1.replace("VISIT", visit));
-            program
+        let visiting = |label, write: &[&str], visit: &str| {
+            let visit = piece!("visit").1.replace("VISIT", visit);
+            program(label, &["bins"], &["boxes"], write, &[piece!("bins"), (label, &*visit)])
         };
         let shape = piece!("shape");
         Self {
             decode: program("decode", &[], &["params"], &["shapes"], &[shape, piece!("quaternion"), piece!("decode")]),
             // The counts are zero before, and again after the scan.
-            count: visiting("count", &["counts"], "counts", "atomicAdd(&counts[bin], 1u);"),
+            count: visiting("count", &["atomic counts"], "atomicAdd(&counts[bin], 1u);"),
             scan: program("scan", &["bins"], &[], &["counts", "starts", "next"], &[piece!("bins"), piece!("scan")]),
             // Lists in any order. Where there is no room, the host sees it and repeats the work.
             fill: visiting(
                 "fill",
-                &["next", "entries"],
-                "next",
+                &["atomic next", "entries"],
                 "let at = atomicAdd(&next[bin], 1u);
                     if at < bins.room { entries[at] = i; }",
             ),
@@ -237,9 +228,8 @@ impl Training {
 
 /// Adds up the partial sums of a view or block: `body` adds `all[0]` to the statistics of a step.
 fn finish(label: &str, uniforms: &[&str], pieces: &[(&str, &str)], body: &str) -> Program {
-    let mut program = program(label, uniforms, &["partial", "starts"], &["stats"], pieces);
-    program.source.add("finish", &piece!("finish").1.replace("FINISH", body));
-    program
+    let body = piece!("finish").1.replace("FINISH", body);
+    program(label, uniforms, &["partial", "starts"], &["stats"], &[pieces, &[("finish", &*body)]].concat())
 }
 
 /// The penalties of the priors. Refuses one without WGSL.

@@ -3,14 +3,14 @@
 use super::programs::Training;
 use super::{Bins, DeviceMixture, Grid, TILE};
 use crate::gaussians::control::{Pulls, lock};
-use crate::gaussians::shape::{NUMBERS, V3};
+use crate::gaussians::shape::NUMBERS;
 use crate::gaussians::view::Beam;
 use crate::gaussians::views::{Rule, Views, drawn};
 use bytemuck::{Pod, Zeroable, bytes_of, cast_slice, cast_slice_mut};
 use conefield_core::backend::{Adam, BlockWork, Executable, StepStats, Work};
 use conefield_core::device::{Device, Launch};
 use conefield_core::error::{Error, Result};
-use conefield_core::geometry::{cross, dot};
+use conefield_core::geometry::{Vec3, cross, dot};
 use conefield_core::loss::Loss;
 use conefield_core::pipeline::Model;
 use conefield_core::prior::Prior;
@@ -59,16 +59,16 @@ impl View {
     /// The rays of `beam`, relative to the length of the first.
     fn of(beam: &Beam) -> Self {
         let length = dot(beam.first, beam.first).sqrt();
-        let unit = |v: V3| v.map(|x| x / length);
+        let unit = |v: Vec3| v.map(|x| x / length);
         let [first, u, v] = [beam.first, beam.u, beam.v].map(unit);
         // y = t·first + (t·column)·u + (t·row)·v: Cramer's rule.
         let whole = dot(cross(u, v), first);
-        let solve = |a: V3, b: V3| -> [f32; 4] {
+        let solve = |a: Vec3, b: Vec3| -> [f32; 4] {
             let by = cross(a, b).map(|x| x / whole);
-            let middle: V3 = std::array::from_fn(|k| 0.5 - beam.source[k]);
+            let middle: Vec3 = std::array::from_fn(|k| 0.5 - beam.source[k]);
             [by[0] as f32, by[1] as f32, by[2] as f32, dot(by, middle) as f32]
         };
-        let narrow = |v: V3| v.map(|x| x as f32);
+        let narrow = |v: Vec3| v.map(|x| x as f32);
         Self {
             across: solve(v, first),
             down: solve(first, u),
