@@ -155,7 +155,7 @@ impl<'a> Rows<'a> {
         // A step that ends in the same row of every view is one row longer.
         let step = if rows > 2 && step % rows == rows - 1 { step + 1 } else { step };
         let rows: Vec<_> = (0..all).step_by(step).map(row).collect();
-        let object = Blocks::of(scan).object();
+        let object = Blocks::of(scan, 1).object();
         let values = rows.iter().flat_map(|&(view, row)| scan.view(view).row(row).to_vec());
         let mut high: Vec<f32> = values.filter(|p| *p > object).collect();
         if high.is_empty() {

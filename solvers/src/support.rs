@@ -7,7 +7,7 @@
 //! unknown. Neighbours of remaining cells stay too.
 
 use crate::shadow::{dark_differences, dilated};
-use conefield_core::geometry::{Vec3, VoxelGrid};
+use conefield_core::geometry::{Vec3, VoxelGrid, norm};
 use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use conefield_core::support::Support;
@@ -51,13 +51,8 @@ pub(crate) struct Blocks {
 }
 
 impl Blocks {
-    /// The blocks of all views.
-    pub(crate) fn of(scan: &Scan) -> Self {
-        Self::of_every(scan, 1)
-    }
-
     /// The blocks of one in `every` views. Views are counted among these.
-    pub(crate) fn of_every(scan: &Scan, every: usize) -> Self {
+    pub(crate) fn of(scan: &Scan, every: usize) -> Self {
         let g = &scan.geometry;
         let size = g.detector[1].div_ceil(BLOCKS).max(2);
         let views: Vec<usize> = (0..g.views.len()).step_by(every).collect();
@@ -101,13 +96,13 @@ impl Blocks {
 pub fn carve(scan: &Scan) -> CarvedSupport {
     let g = &scan.geometry;
     let nothing = |why: &str| CarvedSupport { support: None, said: format!("the whole volume, {why}") };
-    let blocks = Blocks::of(scan);
+    let blocks = Blocks::of(scan, 1);
     let &Blocks { size, deviation, top, air, .. } = &blocks;
     let Some(air) = air else { return nothing("as no view shows air") };
     let level = air + DEVIATIONS * deviation + 1e-3 * top;
     let cells = cells(&g.volume);
     // Half a cell's diagonal on the detector, in blocks, at the largest magnification.
-    let half = 0.5 * cells.spacing.iter().map(|s| s * s).sum::<f64>().sqrt();
+    let half = 0.5 * norm(cells.spacing);
     let views: Vec<ViewShadow> = parallel::map(&blocks.means, |v, means| {
         let pinhole = Pinhole::of(g, v);
         let nearest = corners(&cells).into_iter().map(|p| pinhole.project(p).1).fold(f64::INFINITY, f64::min);
@@ -115,7 +110,7 @@ pub fn carve(scan: &Scan) -> CarvedSupport {
             return None;
         }
         let w = &g.views[v];
-        let pitch = [w.u, w.v].map(|a| a.iter().map(|x| x * x).sum::<f64>().sqrt());
+        let pitch = [w.u, w.v].map(norm);
         let reach = half * pinhole.distance / nearest / (pitch[0].min(pitch[1]) * size as f64);
         Some(ViewShadow { pinhole, object: dilated(means.mapv(|m| m > level), 1 + reach.ceil() as usize) })
     })
@@ -220,7 +215,7 @@ fn cells(volume: &VoxelGrid) -> VoxelGrid {
 }
 
 /// Corners of a grid.
-fn corners(grid: &VoxelGrid) -> [Vec3; 8] {
+pub(crate) fn corners(grid: &VoxelGrid) -> [Vec3; 8] {
     let [low, high] = grid.bounds();
     std::array::from_fn(|c| std::array::from_fn(|k| if c >> k & 1 == 0 { low[k] } else { high[k] }))
 }

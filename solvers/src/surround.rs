@@ -12,7 +12,7 @@ use crate::iterative::regularizers::TotalVariation;
 use crate::solid::Solid;
 use crate::support::Blocks;
 use conefield_core::error::{Error, Result};
-use conefield_core::geometry::{Geometry, View, VoxelGrid, norm};
+use conefield_core::geometry::{Geometry, View, VoxelGrid, norm, sub};
 use conefield_core::method::{Job, Observer, Quiet};
 use conefield_core::outside::Outside;
 use conefield_core::place::ViewRays;
@@ -54,13 +54,7 @@ impl Corrected {
         observer.note(&format!("surround: {said}"));
         let Some(around) = around else { return Ok(None) };
         let outside = around.find(job, settings.passes, observer)?;
-        let less = |scan: &Scan| -> Result<Scan> {
-            let mut scan = scan.clone();
-            around.project(job, &outside, &scan.geometry.clone(), |view, lines| {
-                scan.projections.index_axis_mut(Axis(0), view).zip_mut_with(&lines, |p, a| *p -= a);
-            })?;
-            Ok(scan)
-        };
+        let less = |scan: &Scan| around.less(job, &outside, scan);
         let scan = less(job.scan)?;
         let sum = |scan: &Scan| scan.projections.iter().map(|p| f64::from(*p)).sum::<f64>();
         let share = 1.0 - sum(&scan) / sum(job.scan);
@@ -117,7 +111,7 @@ struct Around {
 impl Around {
     /// The cells for a scan whose object reaches the borders of views, and a log line.
     fn of(scan: &Scan, settings: CoarseSurround) -> Result<(Option<Self>, String)> {
-        let (g, blocks) = (&scan.geometry, Blocks::of(scan));
+        let (g, blocks) = (&scan.geometry, Blocks::of(scan, 1));
         let n = g.views.len();
         // A detector of one row says nothing about what is above and below.
         let tall = g.detector[0] > 1;
@@ -171,25 +165,21 @@ impl Around {
         Ok(data)
     }
 
-    /// Calls `take` with the line integrals through the cells for each view of `geometry`.
-    fn project(
-        &self,
-        job: &Job<'_>,
-        cells: &Array3<f32>,
-        geometry: &Geometry,
-        mut take: impl FnMut(usize, ndarray::ArrayView2<'_, f32>),
-    ) -> Result<()> {
-        let (place, [rows, columns]) = (job.backend.place(), geometry.detector);
-        let whole = Geometry { volume: self.cells, ..geometry.clone() };
+    /// `scan` less the line integrals through `cells`.
+    fn less(&self, job: &Job<'_>, cells: &Array3<f32>, scan: &Scan) -> Result<Scan> {
+        let (place, mut scan) = (job.backend.place(), scan.clone());
+        let whole = Geometry { volume: self.cells, ..scan.geometry.clone() };
         let cells = place.adopt(cells.clone())?;
-        let views: Vec<usize> = (0..geometry.views.len()).collect();
+        let ([rows, columns], views) = (whole.detector, (0..whole.views.len()).collect::<Vec<_>>());
         let mut lines = place.zeros([TOGETHER.min(views.len()), rows, columns])?;
         for some in views.chunks(TOGETHER) {
             let rays = ViewRays { projector: &Joseph {}, geometry: &whole, views: some };
             place.forward(rays, &cells, &mut lines)?;
-            some.iter().zip(place.read(&lines)?.outer_iter()).for_each(|(&view, image)| take(view, image));
+            for (&view, image) in some.iter().zip(place.read(&lines)?.outer_iter()) {
+                scan.projections.index_axis_mut(Axis(0), view).zip_mut_with(&image, |p, a| *p -= a);
+            }
         }
-        Ok(())
+        Ok(scan)
     }
 }
 
@@ -220,7 +210,7 @@ fn coarse(scan: &Scan, cells: VoxelGrid) -> Scan {
     let [rows, columns] = g.detector;
     let side = cells.spacing.into_iter().fold(f64::INFINITY, f64::min);
     let seen = |w: &View| {
-        let to_axis = norm(std::array::from_fn(|k| cells.center[k] - w.source[k]));
+        let to_axis = norm(sub(cells.center, w.source));
         norm(w.u).max(norm(w.v)) * to_axis / w.normal().1
     };
     let pixel = g.views.iter().map(seen).fold(0.0, f64::max);

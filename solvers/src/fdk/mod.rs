@@ -11,12 +11,12 @@ pub mod weights;
 
 use crate::iterative::drive::finite;
 use crate::iterative::monitor::VolumeMonitor;
-use crate::support::Blocks;
+use crate::support::{Blocks, corners};
 use crate::surround::{self, Corrected};
 use axis::{Axis as OrbitAxis, upright};
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, dot, norm, sub};
+use conefield_core::geometry::{Geometry, View, VoxelGrid, dot, norm, sub};
 use conefield_core::method::{
     Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
 };
@@ -318,7 +318,7 @@ fn doubts(scan: &Scan, orbit: &FdkOrbit, upright: &Geometry, axis: Option<&Orbit
 fn object(scan: &Scan, orbit: &FdkOrbit, upright: &Geometry) -> Option<Disc> {
     let every = scan.geometry.views.len().div_ceil(SHADOWS);
     let columns = scan.geometry.detector[1] as f64;
-    let shadows = Blocks::of_every(scan, every).columns().into_iter().map(|(view, [first, last])| {
+    let shadows = Blocks::of(scan, every).columns().into_iter().map(|(view, [first, last])| {
         let places = [first as f64 - 0.5, (last as f64 - 0.5).min(columns - 0.5)];
         (view, places.map(|c| place(upright, view, c, orbit.radius[view])))
     });
@@ -328,12 +328,8 @@ fn object(scan: &Scan, orbit: &FdkOrbit, upright: &Geometry) -> Option<Disc> {
 /// Angles between the plane of the sources and the nearest and the farthest part of the volume, seen from the far side
 /// of the circle through the axis, rad.
 fn cone(orbit: &FdkOrbit, volume: VoxelGrid, axis: Option<&OrbitAxis>) -> [f64; 2] {
-    let [low, high] = volume.bounds();
-    let heights = (0..8usize).map(|k| {
-        let corner: Vec3 = std::array::from_fn(|i| if k >> i & 1 == 0 { low[i] } else { high[i] });
-        orbit.height(axis.map_or(corner, |a| a.point(corner)))
-    });
-    let [low, high] = heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[l, h], z| [l.min(z), h.max(z)]);
+    let heights = corners(&volume).map(|corner| orbit.height(axis.map_or(corner, |a| a.point(corner))));
+    let [low, high] = heights.into_iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[l, h], z| [l.min(z), h.max(z)]);
     let radius = orbit.radius.iter().sum::<f64>() / orbit.radius.len() as f64;
     let nearest = if low < 0.0 && high > 0.0 { 0.0 } else { low.abs().min(high.abs()) };
     [nearest, low.abs().max(high.abs())].map(|z| (z / radius).atan())
