@@ -12,7 +12,7 @@ use crate::neural_field::NeuralField;
 use crate::pretrain::{Pretraining, learn, pretrain};
 use crate::priors::Places;
 use crate::rays::{Pixels, RaySource, Views, Windows};
-use crate::schedule::{Clock, Ends};
+use crate::schedule::Clock;
 use crate::surround::Corrected;
 use crate::training::callbacks::Rollback;
 use crate::training::{CallbackSpec, Draw, Run, Task};
@@ -21,7 +21,8 @@ use conefield_core::backend::{Executable, TrainRay};
 use conefield_core::error::{Result, ensure};
 use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::method::{
-    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, PretrainJob, Solution, StageLine, StartFile,
+    Context, Findings, Job, Limits, Line, Method, Needs, Observer, Outline, Plan, PretrainJob, Solution, StageLine,
+    StartFile,
 };
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::registry::Registered;
@@ -268,7 +269,7 @@ impl FieldPlan {
         let by_epochs = epochs.map(|e| (e * steps_an_epoch as f64).ceil() as u64);
         let steps = [steps, by_epochs].into_iter().flatten().min();
         let spent = job.resume.map_or(0.0, |r| r.standing.seconds);
-        Clock::new(Ends { steps, seconds }, job.limits, spent)
+        Clock::new(Limits { steps, seconds, ..Limits::default() }, job.limits, spent)
     }
 
     /// The initial model, or the model from a checkpoint, and its executable. `needed`: the encoder's channels that the

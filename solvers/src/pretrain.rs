@@ -3,12 +3,12 @@
 
 use crate::losses::L1;
 use crate::optimizer::Optimizer;
-use crate::schedule::{Clock, Ends};
+use crate::schedule::Clock;
 use crate::training::run::strayed;
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Executable, Work};
 use conefield_core::error::{Error, Result, ensure};
-use conefield_core::method::{Job, Observer, PretrainJob, Record};
+use conefield_core::method::{Job, Limits, Observer, PretrainJob, Record};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::stream;
 use conefield_core::scan::Volume;
@@ -62,7 +62,7 @@ pub fn pretrain(
     let mut model = Model::random(pipeline, job.seed);
     let shared_from = model.pipeline.ranges()[0].end;
     let mut waiting: Vec<Arena> = vec![model.arena.clone(); scenes.len() - 1];
-    let ends = Ends { steps: Some(settings.steps), seconds: None };
+    let ends = Limits { steps: Some(settings.steps), ..Limits::default() };
     let mut clock = Clock::new(ends, job.limits, 0.0);
     let mut points = Vec::with_capacity(settings.points);
     let (mut step, mut loss, mut since) = (0u64, 0.0, 0u64);

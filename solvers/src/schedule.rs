@@ -50,15 +50,6 @@ impl Decay {
     }
 }
 
-/// The spec's limits on a run; the first one reached ends it.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Ends {
-    /// Number of steps.
-    pub steps: Option<u64>,
-    /// Seconds of training.
-    pub seconds: Option<f64>,
-}
-
 /// Counts steps and training time against their limits.
 #[derive(Debug)]
 pub struct Clock {
@@ -74,7 +65,7 @@ impl Clock {
     /// limits only time, the spec's number of steps does not end the run. A deadline replaces both.
     ///
     /// `spent` is the training time in seconds before a resumed run.
-    pub fn new(spec: Ends, cli: Limits, spent: f64) -> Self {
+    pub fn new(spec: Limits, cli: Limits, spent: f64) -> Self {
         let timed = cli.seconds.is_some() || cli.deadline.is_some();
         let counted = cli.steps.is_some() || cli.deadline.is_some();
         let limits = Limits {
@@ -157,7 +148,7 @@ mod tests {
 
     #[test]
     fn the_first_limit_ends_the_run() {
-        let spec = Ends { steps: Some(10), seconds: Some(1e9) };
+        let spec = Limits { steps: Some(10), seconds: Some(1e9), ..Limits::default() };
         let c = Clock::new(spec, Limits::default(), 0.0);
         assert!(c.share(9) < 1.0 && c.share(10) >= 1.0);
         let c = Clock::new(spec, Limits { seconds: Some(1e6), ..Limits::default() }, 0.0);
@@ -166,7 +157,7 @@ mod tests {
 
     #[test]
     fn what_cuts_a_run_short_stretches_no_schedule() {
-        let spec = Ends { steps: Some(10), seconds: None };
+        let spec = Limits { steps: Some(10), ..Limits::default() };
         for (at_most, over) in [(1e9, false), (3.0, true)] {
             let c = Clock::new(spec, Limits { at_most: Some(at_most), ..Limits::default() }, 4.0);
             assert_eq!((c.share(5), c.done(5) >= 1.0), (0.5, over));
@@ -176,7 +167,7 @@ mod tests {
 
     #[test]
     fn a_deadline_replaces_the_other_ends_and_counts_pauses() {
-        let spec = Ends { steps: Some(1), seconds: Some(1e-9) };
+        let spec = Limits { steps: Some(1), seconds: Some(1e-9), ..Limits::default() };
         let within =
             |seconds| Limits { deadline: Some(Instant::now() + Duration::from_secs(seconds)), ..Limits::default() };
         let c = Clock::new(spec, within(1000), 3000.0);

@@ -29,13 +29,13 @@ use crate::fit::{Fitted, fit};
 use crate::iterative::known_volume;
 use crate::optimizer::Optimizer;
 use crate::priors::Places;
-use crate::schedule::{Clock, Ends};
+use crate::schedule::Clock;
 use crate::surround::Corrected;
 use crate::training::{Callback, CallbackSpec, Draw, Run, Task};
 use conefield_core::backend::Executable;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::method::{
-    Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Quiet, Solution, StageLine,
+    Context, Findings, Job, Limits, Line, Method, Needs, Observer, Outline, Plan, Quiet, Solution, StageLine,
 };
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
@@ -315,7 +315,8 @@ impl Plan for GaussianPlan {
         let callbacks = self.parts.callbacks(job, &scene, &model.pipeline, control)?;
         observer.note(&self.outline.backend().backend);
         let spent = job.resume.map_or(0.0, |r| r.standing.seconds);
-        let ends = Ends { steps: self.training.steps, seconds: self.training.seconds };
+        let Steps { steps, seconds, .. } = self.training;
+        let ends = Limits { steps, seconds, ..Limits::default() };
         let views = job.scan.geometry.views.len();
         let run = Run {
             clock: Clock::new(ends, job.limits, spent),

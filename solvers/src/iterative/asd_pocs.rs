@@ -2,12 +2,11 @@
 //! of steepest descent on total variation, whose length depends on the change of the data pass.
 
 use super::noise::{self, Noise};
-use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets};
 use super::plan::OnVoxels;
-use super::problem::copy;
+use super::problem::{change, copy, distance, norm2};
 use super::sart::{Sweep, Updates};
-use super::shared::settings;
+use super::shared::{Shared, settings};
 use super::tv::{anisotropy, descend};
 use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::error::Result;
@@ -48,7 +47,7 @@ impl AsdPocs {
         let updates = Updates { subsets, relaxation: RELAXATION, decay: DECAY, order, nonnegative: true };
         updates.validate()?;
         let text = format!("asd-pocs: {subsets}, {descents} descents per pass");
-        let method = OnVoxels::new("asd-pocs", self.shared()?, text, move |space, x, scan| {
+        let method = OnVoxels::new(Shared { text, subsets, ..self.shared()? }, move |space, x, scan| {
             space.pass(noise::scratch(space.header()));
             let noise = |pixels: &Array3<f32>| Noise::of(pixels.view(), false).sigma * (pixels.len() as f64).sqrt();
             Ok(Box::new(AsdPocsIterate {
@@ -61,7 +60,7 @@ impl AsdPocs {
             }))
         });
         let found = |scan: &Scan| vec![Noise::of(scan.projections.view(), false).to_string()];
-        Ok(OnVoxels { subsets, found, ..method })
+        Ok(OnVoxels { found, ..method })
     }
 }
 

@@ -1,10 +1,9 @@
 //! Conjugate gradients on the normal equations `AᵀA·x = Aᵀp` (Hestenes and Stiefel 1952; Björck, Numerical Methods for
 //! Least Squares Problems, algorithm 7.4.1). Early passes recover smooth structure; later ones also fit noise.
 
-use super::norms::norm2;
 use super::plan::OnVoxels;
-use super::problem::copy;
-use super::shared::settings;
+use super::problem::{copy, norm2};
+use super::shared::{Shared, settings};
 use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::error::Result;
 use conefield_core::method::Method;
@@ -27,8 +26,8 @@ conefield_core::stage_type!(Method, "cgls", Cgls, "conjugate gradients for least
 impl Cgls {
     fn built(&self) -> Result<OnVoxels> {
         let text = "cgls: conjugate gradients on the normal equations".into();
-        let method =
-            OnVoxels::new("cgls", self.shared()?, text, |space, x, _| Ok(Box::new(CglsIterate::new(space, x)?)));
+        let shared = Shared { text, ..self.shared()? };
+        let method = OnVoxels::new(shared, |space, x, _| Ok(Box::new(CglsIterate::new(space, x)?)));
         Ok(OnVoxels { nonnegative: Some(self.nonnegative), ..method })
     }
 }

@@ -1,16 +1,16 @@
 //! The driver of iterative methods: passes, records, checkpoints, stopping criteria.
 
 use super::monitor::VolumeMonitor;
-use super::problem::{Problem, copy};
+use super::problem::{Problem, change, copy};
 use super::stop::Stop;
-use crate::schedule::{Clock, Ends};
+use crate::schedule::Clock;
 use crate::waiting::Waited;
 use crate::watched;
 use conefield_core::Error;
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
 use conefield_core::error::{Result, ensure};
 use conefield_core::finite::stray;
-use conefield_core::method::{Job, Observer, Reconstruction, Record, Solution};
+use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Solution};
 use conefield_core::parallel;
 use conefield_core::place::{Array, Place, StatePart, squares};
 use conefield_core::scan::Volume;
@@ -32,6 +32,11 @@ pub struct Pass {
 
 /// The state of an iterative method.
 pub trait Iteration {
+    /// Whether its passes say how much the volume changed. If not, that costs a volume where a run ends by it.
+    fn knows_change(&self) -> bool {
+        true
+    }
+
     /// Computes what the first pass starts from.
     fn prepare(&mut self, _: &Problem<'_>) -> Result<()> {
         Ok(())
@@ -84,22 +89,25 @@ struct Kept {
     settled: bool,
 }
 
-/// Buffer for the best volume, if `stop` has `patience`.
-pub(super) fn best(stop: &Stop, space: &Space) -> Result<Option<Array>> {
-    stop.patience.map(|_| space.volume()).transpose()
+/// Buffers that `stop` needs: for the best volume, if it has `patience`; for the volume before a pass, if it has `change`
+/// and the method does not know it ([`Iteration::knows_change`]).
+pub(super) fn buffers(stop: &Stop, knows_change: bool, space: &Space) -> Result<[Option<Array>; 2]> {
+    let wanted = [stop.patience.is_some(), stop.change.is_some() && !knows_change];
+    let [best, before] = wanted.map(|wanted| wanted.then(|| space.volume()).transpose());
+    Ok([best?, before?])
 }
 
-/// Runs `method` on `job` until `stop` or the job's limits end it. The time since `begun` counts.
+/// Runs `method` on `job` with its [`buffers`] until `stop` or the job's limits end it. The time since `begun` counts.
 pub(super) fn drive(
     job: &Job<'_>,
     stop: &Stop,
     begun: Instant,
     problem: &Problem<'_>,
-    space: &Space,
+    buffers: [Option<Array>; 2],
     mut method: Box<dyn Iteration + '_>,
     observer: &mut dyn Observer,
 ) -> Result<Solution> {
-    let mut run = Run::begin(job, stop, begun, problem, best(stop, space)?, method.as_mut(), observer)?;
+    let mut run = Run::begin(job, stop, begun, problem, buffers, method.as_mut(), observer)?;
     loop {
         let cancelled = problem.place.agree(observer.cancelled());
         if run.step > run.started && (cancelled || problem.place.agree(observer.checkpoint_due())) {
@@ -128,6 +136,8 @@ struct Run<'a> {
     kept: Kept,
     /// The volume that predicted held-out views best, see [`Kept::waited`].
     best: Option<Array>,
+    /// The volume before a pass, if its change is needed and the method does not know it.
+    before: Option<Array>,
     /// The step at which this process started.
     started: u64,
     step: u64,
@@ -143,7 +153,7 @@ impl<'a> Run<'a> {
         stop: &'a Stop,
         begun: Instant,
         problem: &'a Problem<'a>,
-        mut best: Option<Array>,
+        [mut best, before]: [Option<Array>; 2],
         method: &mut dyn Iteration,
         observer: &mut dyn Observer,
     ) -> Result<Self> {
@@ -156,13 +166,14 @@ impl<'a> Run<'a> {
         if stop.patience.is_some() && job.held_out.is_none() {
             observer.note("stop.patience needs held-out views, and there are none: it does not end this run");
         }
-        let ends = Ends { steps: stop.passes, seconds: stop.seconds };
+        let ends = Limits { steps: stop.passes, seconds: stop.seconds, ..Limits::default() };
         let mut clock = Clock::new(ends, job.limits, seconds + begun.elapsed().as_secs_f64());
         clock.resume();
         let monitor = VolumeMonitor::new(job);
         let empty = problem.scan.projections.as_slice().map_or(f64::MAX, squares);
         let (started, residual, over) = (step, None, false);
-        let mut run = Self { job, stop, problem, monitor, clock, kept, best, started, step, residual, empty, over };
+        let mut run =
+            Self { job, stop, problem, monitor, clock, kept, best, before, started, step, residual, empty, over };
         // Time alone does not end a run before its first pass.
         let share = if step == 0 { run.clock.share_of_steps(step) } else { run.clock.done(step) };
         let over = share >= 1.0 || run.kept.settled || (step > 0 && !run.clock.allows(0.0));
@@ -176,7 +187,14 @@ impl<'a> Run<'a> {
     /// Makes one pass with its record and progress report.
     fn pass(&mut self, method: &mut dyn Iteration, observer: &mut dyn Observer) -> Result<()> {
         let begun = Instant::now();
-        let pass = method.pass(self.problem, self.step)?;
+        let place = self.problem.place;
+        if let Some(before) = &mut self.before {
+            copy(place, method.x(), before)?;
+        }
+        let mut pass = method.pass(self.problem, self.step)?;
+        if let Some(before) = &self.before {
+            pass.change = Some(change(place, method.x(), before)?);
+        }
         method.fault()?;
         self.step += 1;
         self.check(&pass, method)?;

@@ -12,14 +12,14 @@
 
 use super::bases::Voxels;
 use super::data::NoiseWeighted;
+use super::drive::{buffers, drive};
 use super::model::{Model, projected};
-use super::norms::{change, distance, norm2};
 use super::order::{Order, Subsets, split};
 use super::plan::Iterative;
-use super::problem::{copy, room};
+use super::problem::{change, copy, distance, norm2, room};
 use super::regularizers::Nonnegative;
 use super::shared::{Shared, settings};
-use super::{Iteration, Pass, Problem, Stop, drive::drive};
+use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::Error;
 use conefield_core::basis::{Basis, BasisSpec, Expansion};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
@@ -93,18 +93,19 @@ impl Fista {
         let pull = self.pull;
         ensure(pull.is_finite() && pull >= 0.0, "spec", "pull", pull, "a finite number, 0 or more")?;
         ensure((1..=64).contains(&self.bin), "spec", "bin", self.bin, "1 to 64")?;
-        Ok(FistaMethod {
-            shared: self.shared()?,
-            basis: self.basis.build().map_err(|e| e.within("basis"))?,
-            data: self.data.build().map_err(|e| e.within("data"))?,
-            prior: self.prior.build().map_err(|e| e.within("prior"))?,
-            kinds: [self.basis.type_name(), self.data.type_name(), self.prior.type_name()],
-            air: self.air,
-            bin: self.bin,
-            subsets: self.subsets,
-            order: self.order,
-            pull,
-        })
+        let shared = self.shared()?;
+        let basis = self.basis.build().map_err(|e| e.within("basis"))?;
+        let data = self.data.build().map_err(|e| e.within("data"))?;
+        let prior = self.prior.build().map_err(|e| e.within("prior"))?;
+        let stages = vec![
+            Line::new("basis", self.basis.type_name(), &basis.describe()),
+            Line::new("data", self.data.type_name(), &data.describe()),
+            Line::new("prior", self.prior.type_name(), &prior.describe()),
+        ];
+        let held = if pull > 0.0 { format!(", pull {pull} to a volume") } else { String::new() };
+        let text = format!("fista: {}{held}", self.subsets);
+        let shared = Shared { text, stages, subsets: self.subsets, ..shared };
+        Ok(FistaMethod { shared, basis, data, prior, air: self.air, bin: self.bin, order: self.order, pull })
     }
 }
 
@@ -114,11 +115,8 @@ struct FistaMethod {
     basis: Box<dyn Basis>,
     data: Box<dyn DataTerm>,
     prior: Box<dyn Regularizer>,
-    /// The type names of basis, data term and prior.
-    kinds: [&'static str; 3],
     air: bool,
     bin: usize,
-    subsets: Subsets,
     order: Order,
     pull: f64,
 }
@@ -132,10 +130,6 @@ impl FistaMethod {
 }
 
 impl Iterative for FistaMethod {
-    fn kind(&self) -> &'static str {
-        "fista"
-    }
-
     fn shared(&self) -> &Shared {
         &self.shared
     }
@@ -153,7 +147,7 @@ impl Iterative for FistaMethod {
         let room = format!("at most {longest}, the detector's longer side");
         ensure(self.bin <= longest, "spec", "bin", self.bin, room)?;
         let grid = projected(expansion.as_ref(), voxels);
-        let text = format!("{}; {stages}", self.describe());
+        let text = format!("{}; {stages}", self.shared.text);
         let opened = self.shared.open(grid, self.bin, &text, self, job, observer)?;
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
@@ -172,6 +166,7 @@ impl Iterative for FistaMethod {
         if let Some(middle) = limited(problem.geometry) {
             arrays.penalty.limited(middle);
         }
+        let buffers = buffers(&self.shared.stop, true, &space)?;
         problem.settle()?;
         let mut iterate = FistaIterate::new(self, &problem, data, arrays)?;
         observer.note(&iterate.description());
@@ -180,25 +175,12 @@ impl Iterative for FistaMethod {
                 observer.note(&format!("{what} runs on the CPU: what it works on is moved in every pass"));
             });
         }
-        drive(job, &self.shared.stop, begun, &problem, &space, Box::new(iterate), observer)
+        drive(job, &self.shared.stop, begun, &problem, buffers, Box::new(iterate), observer)
     }
 
     fn found(&self, scan: &Scan) -> Vec<String> {
         let noise = self.data.of(scan.projections.view());
         vec![noise.map_or_else(|e| e.to_string(), |n| n.describe())]
-    }
-
-    fn subsets(&self) -> Subsets {
-        self.subsets
-    }
-
-    fn stages(&self) -> Vec<Line> {
-        let [basis, data, prior] = self.kinds;
-        vec![
-            Line::new("basis", basis, &self.basis.describe()),
-            Line::new("data", data, &self.data.describe()),
-            Line::new("prior", prior, &self.prior.describe()),
-        ]
     }
 
     fn seen(&self, header: &ScanHeader) -> ScanHeader {
@@ -210,7 +192,8 @@ impl Iterative for FistaMethod {
         let header = &header.binned(self.bin);
         let space = Space::tally(*header);
         if self.air {
-            space.hold(Problem::air_bytes(header));
+            // The mask of [`Problem::clear_air`].
+            space.hold(header.pixels());
         }
         if self.bin > 1 {
             space.hold(4 * header.pixels());
@@ -225,12 +208,7 @@ impl Iterative for FistaMethod {
                 space.hold(coefficients.saturating_mul(2 * size_of::<f32>() as u64));
             }
         }
-        self.shared.price(&space, self.subsets)
-    }
-
-    fn describe(&self) -> String {
-        let held = if self.pull > 0.0 { format!(", pull {} to a volume", self.pull) } else { String::new() };
-        format!("fista: {}{held}", self.subsets)
+        self.shared.price(&space, true)
     }
 }
 
@@ -285,7 +263,7 @@ impl Arrays {
             gradient: coefficients()?,
             before: coefficients()?,
             towards: (settings.pull > 0.0).then(coefficients).transpose()?,
-            pixels: room(space, settings.subsets.count(space.header().views))?,
+            pixels: room(space, settings.shared.subsets.count(space.header().views))?,
         })
     }
 
@@ -437,7 +415,7 @@ struct FistaIterate {
 impl FistaIterate {
     fn new(settings: &FistaMethod, problem: &Problem<'_>, data: Box<dyn Misfit>, mut arrays: Arrays) -> Result<Self> {
         let views = problem.scan.geometry.views.len();
-        let subsets = settings.subsets.of(views);
+        let subsets = settings.shared.subsets.of(views);
         let grid = arrays.model.grid();
         let (lipschitz, first) = arrays.largest_eigenvalue(problem, data.as_ref(), &subsets)?;
         // One back-projection, however many priors ask.

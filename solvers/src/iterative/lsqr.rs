@@ -2,10 +2,9 @@
 //! Its volumes are those of conjugate gradients, with less rounding, and it takes a pull: it minimizes
 //! `‖p − A·x‖² + λ²‖x − x₀‖²`.
 
-use super::norms::{distance, norm2};
 use super::plan::OnVoxels;
-use super::problem::copy;
-use super::shared::settings;
+use super::problem::{copy, distance, norm2};
+use super::shared::{Shared, settings};
 use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::error::{Result, ensure};
 use conefield_core::method::Method;
@@ -34,9 +33,8 @@ impl Lsqr {
         ensure(pull.is_finite() && pull >= 0.0, "spec", "pull", pull, "a finite number, 0 or more")?;
         let held = if pull > 0.0 { format!(", pull {pull}") } else { String::new() };
         let text = format!("lsqr: Golub and Kahan's bidiagonalization{held}");
-        let method = OnVoxels::new("lsqr", self.shared()?, text, move |space, x, _| {
-            Ok(Box::new(LsqrIterate::new(space, x, pull)?))
-        });
+        let shared = Shared { text, ..self.shared()? };
+        let method = OnVoxels::new(shared, move |space, x, _| Ok(Box::new(LsqrIterate::new(space, x, pull)?)));
         Ok(OnVoxels { nonnegative: Some(self.nonnegative), ..method })
     }
 }

@@ -3,12 +3,11 @@
 //! of line integrals with Poisson's distribution. Those of a CT scan do not have it, but the update is multiplicative:
 //! attenuation stays positive, and errors are relative.
 
-use super::norms::change;
 use super::order::{Order, Subsets};
 use super::plan::OnVoxels;
-use super::problem::{copy, room};
+use super::problem::room;
 use super::sart::column_sums;
-use super::shared::settings;
+use super::shared::{Shared, settings};
 use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::data_term::Misfit;
 use conefield_core::error::{Result, ensure};
@@ -36,9 +35,8 @@ impl Mlem {
     fn built(&self) -> Result<OnVoxels> {
         let Self { subsets, order, .. } = *self;
         subsets.validate()?;
-        let shared = self.shared()?;
-        let limited = shared.stop.change.is_some();
-        let method = OnVoxels::new("mlem", shared, format!("mlem: {subsets}"), move |space, x, _| {
+        let shared = Shared { text: format!("mlem: {subsets}"), subsets, ..self.shared()? };
+        Ok(OnVoxels::new(shared, move |space, x, _| {
             let views = space.header().views;
             Ok(Box::new(MlemIterate {
                 subsets: subsets.of(views),
@@ -48,10 +46,8 @@ impl Mlem {
                 columns: space.volume()?,
                 work: space.volume()?,
                 pixels: room(space, subsets.count(views))?,
-                before: limited.then(|| space.volume()).transpose()?,
             }))
-        });
-        Ok(OnVoxels { subsets, ..method })
+        }))
     }
 }
 
@@ -69,8 +65,6 @@ struct MlemIterate {
     work: Array,
     /// The pixels of a subset.
     pixels: Array,
-    /// The volume before a pass, if its change is needed.
-    before: Option<Array>,
 }
 
 impl MlemIterate {
@@ -95,6 +89,10 @@ impl MlemIterate {
 }
 
 impl Iteration for MlemIterate {
+    fn knows_change(&self) -> bool {
+        false
+    }
+
     /// Makes the start positive inside the object's support, and computes the sums that do not change.
     fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
         let place = problem.place;
@@ -122,15 +120,11 @@ impl Iteration for MlemIterate {
     }
 
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
-        if let Some(before) = &mut self.before {
-            copy(problem.place, &self.x, before)?;
-        }
         let mut residual = 0.0;
         for s in self.order.of(self.subsets.len(), problem.seed, pass) {
             residual += self.update(problem, s)?;
         }
-        let change = self.before.as_ref().map(|before| change(problem.place, &self.x, before)).transpose()?;
-        Ok(Pass { residual, change, prior: None })
+        Ok(Pass { residual, ..Pass::default() })
     }
 
     fn x(&mut self) -> &mut Array {

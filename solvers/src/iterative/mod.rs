@@ -19,7 +19,6 @@ pub mod mlem;
 mod model;
 pub mod monitor;
 pub mod noise;
-pub mod norms;
 pub mod order;
 mod plan;
 pub mod problem;
@@ -30,15 +29,7 @@ pub mod shared;
 pub mod stop;
 pub mod tv;
 
-use conefield_core::scan::ScanHeader;
-use conefield_core::scene::SupportRule;
-
 pub use drive::{Iteration, Pass};
 pub use problem::Problem;
 pub use shared::known_volume;
 pub use stop::Stop;
-
-/// Bytes of the object's support mask.
-pub fn mask_bytes(rule: &SupportRule, header: &ScanHeader) -> u64 {
-    if *rule == SupportRule::Box { 0 } else { header.voxels() }
-}

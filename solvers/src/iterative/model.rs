@@ -1,7 +1,6 @@
 //! A problem in terms of a basis: line integrals of coefficients.
 
-use super::norms::norm2;
-use super::problem::{Problem, copy};
+use super::problem::{Problem, copy, norm2};
 use conefield_core::basis::Expansion;
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;

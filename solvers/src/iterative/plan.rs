@@ -1,8 +1,7 @@
 //! Common part of the plans of iterative methods.
 
-use super::drive::{Iteration, drive};
-use super::mask_bytes;
-use super::order::{Subsets, summary};
+use super::drive::{Iteration, buffers, drive};
+use super::order::summary;
 use super::shared::Shared;
 use crate::fit::object;
 use crate::{solid, surround};
@@ -10,24 +9,14 @@ use conefield_core::error::Result;
 use conefield_core::method::{Findings, Job, Line, Needs, Observer, Outline, Plan, Reconstruction, Solution};
 use conefield_core::place::{Array, Bounds};
 use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::scene::SupportRule;
 use conefield_core::space::Space;
 use std::time::Instant;
 
 /// An iterative method, built and validated.
 pub(super) trait Iterative: Send + Sync {
-    /// Its type name.
-    fn kind(&self) -> &'static str;
-
     /// Its common settings.
     fn shared(&self) -> &Shared;
-
-    /// Its own stages: key, type and description.
-    fn stages(&self) -> Vec<Line> {
-        vec![]
-    }
-
-    /// Its subsets of views.
-    fn subsets(&self) -> Subsets;
 
     /// Its findings about a scan besides the subsets, one line each.
     fn found(&self, scan: &Scan) -> Vec<String>;
@@ -40,9 +29,6 @@ pub(super) trait Iterative: Send + Sync {
     /// Bytes of all its arrays except the resulting volume.
     fn bytes(&self, scan: &ScanHeader) -> u64;
 
-    /// Description of its settings.
-    fn describe(&self) -> String;
-
     /// Runs the method.
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution>;
 }
@@ -53,13 +39,8 @@ type Make = dyn Fn(&Space, Array, Option<&Scan>) -> Result<Box<dyn Iteration>> +
 
 /// An iterative method whose unknowns are the voxels.
 pub(super) struct OnVoxels {
-    pub(super) kind: &'static str,
     pub(super) shared: Shared,
-    /// Description of its settings.
-    pub(super) text: String,
     pub(super) make: Box<Make>,
-    /// Subsets of views, by default all at once.
-    pub(super) subsets: Subsets,
     /// Findings about a scan besides the subsets, one line each.
     pub(super) found: fn(&Scan) -> Vec<String>,
     /// For a method that ignores the bounds until its end: whether it keeps to the lower one, too.
@@ -67,29 +48,18 @@ pub(super) struct OnVoxels {
 }
 
 impl OnVoxels {
-    /// The method of the type `kind`, described by `text`.
+    /// The method whose state `make` makes.
     pub(super) fn new(
-        kind: &'static str,
         shared: Shared,
-        text: String,
         make: impl Fn(&Space, Array, Option<&Scan>) -> Result<Box<dyn Iteration>> + Send + Sync + 'static,
     ) -> Self {
-        let (make, subsets) = (Box::new(make), Subsets::Count(1));
-        Self { kind, shared, text, make, subsets, found: |_| vec![], nonnegative: None }
+        Self { shared, make: Box::new(make), found: |_| vec![], nonnegative: None }
     }
 }
 
 impl Iterative for OnVoxels {
-    fn kind(&self) -> &'static str {
-        self.kind
-    }
-
     fn shared(&self) -> &Shared {
         &self.shared
-    }
-
-    fn subsets(&self) -> Subsets {
-        self.subsets
     }
 
     fn found(&self, scan: &Scan) -> Vec<String> {
@@ -98,25 +68,23 @@ impl Iterative for OnVoxels {
 
     fn bytes(&self, header: &ScanHeader) -> u64 {
         let space = Space::tally(*header);
-        let _ = space.volume().and_then(|x| (self.make)(&space, x, None));
-        self.shared.price(&space, self.subsets)
-    }
-
-    fn describe(&self) -> String {
-        self.text.clone()
+        let made = space.volume().and_then(|x| (self.make)(&space, x, None));
+        let knows_change = made.map_or(true, |method| method.knows_change());
+        self.shared.price(&space, knows_change)
     }
 
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        let opened = self.shared.open(job.scan.geometry.volume, 1, &self.text, self, job, observer)?;
+        let opened = self.shared.open(job.scan.geometry.volume, 1, &self.shared.text, self, job, observer)?;
         let job = &opened.job(job);
         let mut problem = opened.problem(job);
         let space = opened.space(job.scan.header());
         let start = self.shared.start(job, &problem, &space)?;
         let mut iteration = (self.make)(&space, start, Some(job.scan))?;
+        let buffers = buffers(&self.shared.stop, iteration.knows_change(), &space)?;
         problem.settle()?;
         iteration.prepare(&problem)?;
-        let mut solution = drive(job, &self.shared.stop, begun, &problem, &space, iteration, observer)?;
+        let mut solution = drive(job, &self.shared.stop, begun, &problem, buffers, iteration, observer)?;
         if let (Some(nonnegative), Reconstruction::Volume(volume)) = (self.nonnegative, &mut solution.result) {
             let bounds = Bounds { low: if nonnegative { problem.bounds.low } else { f32::MIN }, ..problem.bounds };
             // The volume is in the scan's unit.
@@ -136,22 +104,23 @@ pub(super) struct IterativePlan(pub(super) Box<dyn Iterative>);
 
 impl Plan for IterativePlan {
     fn outline(&self) -> Outline {
-        let shared = self.0.shared();
-        let projector = Line::new("projector", shared.projector_kind, &shared.projector.describe());
-        let beside = [vec![projector], self.0.stages()].concat();
-        Outline { method: Line::new("method", self.0.kind(), &self.0.describe()), beside, ..Outline::default() }
+        let Shared { kind, text, stages, projector, projector_kind, .. } = self.0.shared();
+        let projector = Line::new("projector", projector_kind, &projector.describe());
+        let beside = std::iter::once(projector).chain(stages.iter().cloned()).collect();
+        Outline { method: Line::new("method", kind, text), beside, ..Outline::default() }
     }
 
     fn needs(&self, scan: &ScanHeader) -> Needs {
         let shared = self.0.shared();
-        let working = self.0.bytes(scan) + mask_bytes(&shared.scene.support, &self.0.seen(scan));
+        let mask = if shared.scene.support == SupportRule::Box { 0 } else { self.0.seen(scan).voxels() };
+        let working = self.0.bytes(scan) + mask;
         let [surround, corrected] = surround::bytes(shared.scene.surround, scan);
         let corrected = corrected + solid::bytes(&shared.scene.support, scan);
         Needs { surround, corrected, working, resume: working + 4 * scan.voxels(), volume: true, ..Needs::default() }
     }
 
     fn reads(&self, scan: &ScanHeader, _: u64) -> Vec<String> {
-        let each = match self.0.subsets().count(scan.views) {
+        let each = match self.0.shared().subsets.count(scan.views) {
             1 => String::new(),
             n => format!(" for each of the {n} subsets"),
         };
@@ -159,10 +128,10 @@ impl Plan for IterativePlan {
     }
 
     fn inspect(&self, scan: &Scan) -> Result<Findings> {
-        let scene = &self.0.shared().scene;
+        let Shared { scene, subsets, .. } = self.0.shared();
         let mut lines = surround::found(scan, scene.surround)?;
         lines.extend(object(scan, &scene.support, None)?.found);
-        let subsets = self.0.subsets().of(scan.geometry.views.len());
+        let subsets = subsets.of(scan.geometry.views.len());
         lines.extend((subsets.len() > 1).then(|| summary(&subsets)));
         lines.extend(self.0.found(scan));
         Ok(Findings { lines, ..Findings::default() })

@@ -9,7 +9,7 @@ use conefield_core::parallel;
 use conefield_core::place::{
     ADD, Array, Bounds, CLIP, INVERT, Mask, MeasuredViews, Place, Reduction, ViewRays, Weighing,
 };
-use conefield_core::scan::{Scan, ScanHeader};
+use conefield_core::scan::Scan;
 use conefield_core::space::Space;
 use conefield_core::voxel::VoxelProjector;
 use ndarray::{Array3, Axis};
@@ -55,11 +55,6 @@ impl Problem<'_> {
         let share = 1.0 - seen as f64 / inside.len().max(1) as f64;
         self.shadow = Some(self.place.mask(inside)?);
         Ok(share)
-    }
-
-    /// Bytes of the mask of [`Problem::clear_air`].
-    pub fn air_bytes(header: &ScanHeader) -> u64 {
-        header.pixels()
     }
 
     /// Takes the measured images to the place, if they fit beside what is there.
@@ -127,6 +122,21 @@ impl Problem<'_> {
     pub fn views(&self) -> Vec<usize> {
         (0..self.geometry.views.len()).collect()
     }
+}
+
+/// `‖x‖²`.
+pub(super) fn norm2(place: &dyn Place, x: &Array) -> Result<f64> {
+    place.reduce(Reduction::Squares, x, x)
+}
+
+/// `‖x − y‖`.
+pub(super) fn distance(place: &dyn Place, x: &Array, y: &Array) -> Result<f64> {
+    Ok(place.reduce(Reduction::Differences, x, y)?.sqrt())
+}
+
+/// Root mean square of `x − before`, relative to that of `x`.
+pub(super) fn change(place: &dyn Place, x: &Array, before: &Array) -> Result<f64> {
+    Ok(distance(place, x, before)? / norm2(place, x)?.max(1e-300).sqrt())
 }
 
 /// Overwrites `to` with `from`.

@@ -2,11 +2,10 @@
 //! inverse column sums of the subset (Andersen and Kak, Ultrasonic Imaging 6, 1984). One view per subset is SART, all
 //! views at once are SIRT, anything in between is OS-SART.
 
-use super::norms::change;
 use super::order::{Order, Subsets};
 use super::plan::OnVoxels;
-use super::problem::{copy, invert, room};
-use super::shared::settings;
+use super::problem::{invert, room};
+use super::shared::{Shared, settings};
 use super::{Iteration, Pass, Problem, Stop};
 use conefield_core::error::{Result, ensure};
 use conefield_core::method::Method;
@@ -39,14 +38,9 @@ impl Sart {
         let Self { subsets, relaxation, decay, order, nonnegative, .. } = *self;
         let updates = Updates { subsets, relaxation, decay, order, nonnegative };
         updates.validate()?;
-        let shared = self.shared()?;
-        let limited = shared.stop.change.is_some();
         let text = format!("sart: {subsets}, relaxation {relaxation} times {decay} per pass");
-        let method = OnVoxels::new("sart", shared, text, move |space, x, _| {
-            let before = limited.then(|| space.volume()).transpose()?;
-            Ok(Box::new(SartIterate { before, sweep: Sweep::new(updates, space, x)? }))
-        });
-        Ok(OnVoxels { subsets, ..method })
+        let shared = Shared { text, subsets, ..self.shared()? };
+        Ok(OnVoxels::new(shared, move |space, x, _| Ok(Box::new(Sweep::new(updates, space, x)?))))
     }
 }
 
@@ -100,21 +94,6 @@ impl Sweep {
         })
     }
 
-    /// Computes the sums that do not change.
-    pub(super) fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
-        problem.ones(&mut self.work)?;
-        // One subset at a time, as in every pass.
-        for views in &self.subsets {
-            problem.forward(views, &self.work, &mut self.pixels)?;
-            problem.place.scatter(&self.pixels, 0, &mut self.rows, views)?;
-        }
-        invert(problem.place, &mut self.rows)?;
-        if let [all] = &self.subsets[..] {
-            column_sums(problem, all, &mut self.pixels, &mut self.columns)?;
-        }
-        Ok(())
-    }
-
     /// Makes pass `pass`, counted from 0; returns `‖p − A·x‖²`.
     pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64) -> Result<f64> {
         let Updates { relaxation, decay, order, .. } = self.updates;
@@ -156,31 +135,35 @@ pub(super) fn column_sums(problem: &Problem<'_>, views: &[usize], pixels: &mut A
     invert(problem.place, sums)
 }
 
-struct SartIterate {
-    sweep: Sweep,
-    /// The volume before a pass, if its change is needed.
-    before: Option<Array>,
-}
-
-impl Iteration for SartIterate {
+impl Iteration for Sweep {
     fn advice(&self) -> Option<&'static str> {
         Some("try a smaller relaxation")
     }
 
+    fn knows_change(&self) -> bool {
+        false
+    }
+
+    /// Computes the sums that do not change.
     fn prepare(&mut self, problem: &Problem<'_>) -> Result<()> {
-        self.sweep.prepare(problem)
+        problem.ones(&mut self.work)?;
+        // One subset at a time, as in every pass.
+        for views in &self.subsets {
+            problem.forward(views, &self.work, &mut self.pixels)?;
+            problem.place.scatter(&self.pixels, 0, &mut self.rows, views)?;
+        }
+        invert(problem.place, &mut self.rows)?;
+        if let [all] = &self.subsets[..] {
+            column_sums(problem, all, &mut self.pixels, &mut self.columns)?;
+        }
+        Ok(())
     }
 
     fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
-        if let Some(before) = &mut self.before {
-            copy(problem.place, &self.sweep.x, before)?;
-        }
-        let residual = self.sweep.sweep(problem, pass)?;
-        let change = self.before.as_ref().map(|before| change(problem.place, &self.sweep.x, before)).transpose()?;
-        Ok(Pass { residual, change, prior: None })
+        Ok(Pass { residual: self.sweep(problem, pass)?, ..Pass::default() })
     }
 
     fn x(&mut self) -> &mut Array {
-        &mut self.sweep.x
+        &mut self.x
     }
 }

@@ -12,7 +12,7 @@ use conefield_core::error::{Result, ensure};
 use conefield_core::finite::stray;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::input_file::InputFile;
-use conefield_core::method::{Job, Observer};
+use conefield_core::method::{Job, Line, Observer};
 use conefield_core::parallel;
 use conefield_core::place::{Array, Bounds, Mask, MeasuredViews, Place};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
@@ -72,7 +72,14 @@ macro_rules! settings {
         impl $name {
             /// The settings that all iterative methods have, built.
             fn shared(&self) -> conefield_core::Result<$crate::iterative::shared::Shared> {
-                $crate::iterative::shared::Shared::of(self.projector.as_ref(), &self.scene, &self.start, &self.stop)
+                let kind = conefield_core::registry::Registered::type_name(self);
+                $crate::iterative::shared::Shared::of(
+                    kind,
+                    self.projector.as_ref(),
+                    &self.scene,
+                    &self.start,
+                    &self.stop,
+                )
             }
         }
 
@@ -92,20 +99,29 @@ macro_rules! settings {
 }
 pub(super) use settings;
 
-/// The common settings, built.
+/// The common settings, built, and the outline of a method.
 pub(super) struct Shared {
+    /// The method's type name.
+    pub(super) kind: &'static str,
+    /// Description of its settings.
+    pub(super) text: String,
+    /// Its own stages: key, type and description.
+    pub(super) stages: Vec<Line>,
+    /// Its subsets of views, by default all at once.
+    pub(super) subsets: Subsets,
     pub(super) projector: Arc<dyn VoxelProjector>,
     /// The projector's type name.
     pub(super) projector_kind: &'static str,
     pub(super) scene: VoxelScene,
     /// File of the start volume.
-    start: Option<InputFile>,
+    pub(super) start: Option<InputFile>,
     pub(super) stop: Stop,
 }
 
 impl Shared {
-    /// Builds the settings at the keys `projector`, `scene`, `start` and `stop` of a method.
+    /// Builds the settings at the keys `projector`, `scene`, `start` and `stop` of a method of the type `kind`.
     pub(super) fn of(
+        kind: &'static str,
         projector: &dyn VoxelProjectorSpec,
         scene: &VoxelScene,
         start: &Option<InputFile>,
@@ -116,6 +132,10 @@ impl Shared {
         let projector_kind = projector.type_name();
         let projector = projector.build().map_err(|e| e.within("projector"))?;
         Ok(Self {
+            kind,
+            text: String::new(),
+            stages: vec![],
+            subsets: Subsets::Count(1),
             projector: projector.into(),
             projector_kind,
             scene: scene.clone(),
@@ -209,10 +229,10 @@ impl Shared {
 
     /// Adds the memory of the driver and of the projector for a subset to the method's own arrays in `space`; returns
     /// all bytes except the resulting volume.
-    pub(super) fn price(&self, space: &Space, subsets: Subsets) -> u64 {
-        let _ = super::drive::best(&self.stop, space);
+    pub(super) fn price(&self, space: &Space, knows_change: bool) -> u64 {
+        let _ = super::drive::buffers(&self.stop, knows_change, space);
         let header = space.header();
-        space.pass(self.projector.scratch(header, header.views.div_ceil(subsets.count(header.views))));
+        space.pass(self.projector.scratch(header, header.views.div_ceil(self.subsets.count(header.views))));
         space.bytes().saturating_sub(4 * space.header().voxels())
     }
 }

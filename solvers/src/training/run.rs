@@ -1,13 +1,13 @@
 //! A run: the state shared by the training loop and its callbacks.
 
 use crate::optimizer::Optimizer;
-use crate::schedule::{Clock, Ends};
+use crate::schedule::Clock;
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Adam, Executable, StepStats};
 use conefield_core::error::{Error, Result};
 use conefield_core::finite::stray;
 use conefield_core::loss::Loss;
-use conefield_core::method::{Best, DriftRecord, Job, Observer, Record};
+use conefield_core::method::{Best, DriftRecord, Job, Limits, Observer, Record};
 use conefield_core::pipeline::Model;
 use conefield_core::scene::Scene;
 use ndarray::aview1;
@@ -89,7 +89,7 @@ impl<'a> Run<'a> {
             observer,
             model,
             exe,
-            clock: Clock::new(Ends::default(), job.limits, 0.0),
+            clock: Clock::new(Limits::default(), job.limits, 0.0),
             loss: Arc::new(crate::losses::L1 {}),
             optimizer: Optimizer::default(),
             steps_an_epoch: 1,
