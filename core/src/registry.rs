@@ -5,6 +5,7 @@
 
 use crate::error::{Error, Result};
 use schemars::Schema;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::{Value, json};
 use std::any::Any;
@@ -130,6 +131,13 @@ pub fn read<T: Settings + ?Sized + 'static>(mut value: Value) -> Result<Box<T>, 
         Origin::Loaded { make, .. } => make.call(value),
     });
     settings.unwrap_or_else(|| Err(format!("found type {name}, expected {}", names(T::KIND).join(", "))))
+}
+
+/// Reads the settings of a type from the keys of its table. It reads tables only: what `serde` derives for settings in a
+/// list is not compiled.
+pub fn from_table<T: DeserializeOwned>(keys: Value) -> Result<T, String> {
+    let Value::Object(keys) = keys else { return Err(format!("found {keys}, expected a table")) };
+    T::deserialize(keys).map_err(|e| e.to_string())
 }
 
 /// Reads settings for `serde`.
@@ -345,8 +353,7 @@ macro_rules! stage_type {
                     example: $example,
                     make: || {
                         $crate::registry::Make::new::<dyn $spec>(Box::new(|keys| {
-                            let settings: $settings = $crate::registry::serde_json::from_value(keys).map_err(|e| e.to_string())?;
-                            Ok(Box::new(settings))
+                            Ok(Box::new($crate::registry::from_table::<$settings>(keys)?))
                         }))
                     },
                 },
