@@ -58,13 +58,8 @@ impl Method for Chain {
     fn plan(&self, context: &Context<'_>) -> Result<Box<dyn Plan>> {
         let count = self.methods.len();
         ensure(count > 1, "spec", "methods", count, "at least 2 methods")?;
-        ensure(
-            (1..=count).contains(&self.mean),
-            "spec",
-            "mean",
-            self.mean,
-            format!("1 to {count}, the number of methods"),
-        )?;
+        let expected = format!("1 to {count}, the number of methods");
+        ensure((1..=count).contains(&self.mean), "spec", "mean", self.mean, expected)?;
         let mut links = vec![];
         for (i, method) in self.methods.iter().enumerate() {
             let mut link = method.plan(context).map_err(|e| e.within(&at(i)))?;

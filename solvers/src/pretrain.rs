@@ -56,9 +56,7 @@ pub fn pretrain(
     observer: &mut dyn Observer,
 ) -> Result<Model> {
     let scenes: Vec<Scene> = job.volumes.iter().map(|v| scene(v, seen)).collect::<Result<_>>()?;
-    if scenes.is_empty() {
-        return Err(Error::invalid("pretrain", "volumes", 0, "at least one volume"));
-    }
+    ensure(!scenes.is_empty(), "pretrain", "volumes", 0, "at least one volume")?;
     let mut model = Model::random(pipeline, job.seed);
     let shared_from = model.pipeline.ranges()[0].end;
     let mut waiting: Vec<Arena> = vec![model.arena.clone(); scenes.len() - 1];
@@ -165,9 +163,8 @@ fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
         let k = ((sums.len() as f64 * 0.995) as usize).min(sums.len() - 1);
         Ok(*sums.select_nth_unstable_by(k, f64::total_cmp).1)
     })?;
-    if !(attenuation.is_finite() && attenuation > 0.0) {
-        return Err(Error::invalid("volume", "values", "no attenuation", "a volume of an object that absorbs"));
-    }
+    let absorbs = attenuation.is_finite() && attenuation > 0.0;
+    ensure(absorbs, "volume", "values", "no attenuation", "a volume of an object that absorbs")?;
     Scene::with_attenuation(volume.grid, settings, attenuation)
 }
 

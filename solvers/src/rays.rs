@@ -3,7 +3,7 @@
 use crate::field_plan::Training;
 use crate::shadow::{air_level, shadow};
 use conefield_core::backend::TrainRay;
-use conefield_core::error::{Error, Result, ensure};
+use conefield_core::error::{Result, ensure};
 use conefield_core::parallel;
 use conefield_core::pipeline::Pipeline;
 use conefield_core::random::stream;
@@ -135,14 +135,9 @@ impl<'a> RaySource<'a> {
             pixels
         });
         let usable: Vec<usize> = (0..pixels.len()).filter(|&v| !pixels[v].is_empty()).collect();
-        if usable.is_empty() {
-            return Err(Error::invalid(
-                "scan",
-                "projections",
-                "no ray that meets the volume and the object",
-                "rays to train on (check the geometry and the unit of lengths)",
-            ));
-        }
+        let found = "no ray that meets the volume and the object";
+        let expected = "rays to train on (check the geometry and the unit of lengths)";
+        ensure(!usable.is_empty(), "scan", "projections", found, expected)?;
         let columns = scan.geometry.detector[1];
         let windows: Option<(Windows, Vec<Vec<u32>>)> =
             windows.map(|w| (w, parallel::map(&pixels, |_, p| w.whole(p, columns))));

@@ -11,7 +11,7 @@ use crate::iterative::fista::Fista;
 use crate::iterative::regularizers::TotalVariation;
 use crate::solid::Solid;
 use crate::support::Blocks;
-use conefield_core::error::{Error, Result};
+use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Geometry, View, VoxelGrid, norm, sub};
 use conefield_core::method::{Job, Observer, Quiet};
 use conefield_core::outside::Outside;
@@ -141,10 +141,8 @@ impl Around {
             }
         };
         let [x, y, z] = cells.shape;
-        if cells.len().is_none_or(|n| n > MOST) {
-            let (found, expected) = (format!("{x} x {y} x {z} cells in all"), format!("at most {MOST}"));
-            return Err(Error::invalid("spec", "scene.surround.coarse", found, expected));
-        }
+        let (few, found) = (cells.len().is_some_and(|n| n <= MOST), format!("{x} x {y} x {z} cells in all"));
+        ensure(few, "spec", "scene.surround.coarse", found, format!("at most {MOST}"))?;
         let mm = cells.spacing.into_iter().fold(0.0, f64::max);
         let beside = if outside.is_seen() { ", as rays beside it are attenuated too" } else { "" };
         let said = format!(

@@ -53,13 +53,8 @@ impl Control {
     pub fn validate(&self) -> Result<()> {
         ensure(self.every > 0, "spec", "every", self.every, "at least 1")?;
         let shares = 0.0 <= self.from && self.from <= self.until && self.until <= 1.0;
-        ensure(
-            shares,
-            "spec",
-            "from",
-            format!("{} until {}", self.from, self.until),
-            "two shares of the run, in order",
-        )?;
+        let found = format!("{} until {}", self.from, self.until);
+        ensure(shares, "spec", "from", found, "two shares of the run, in order")?;
         for (key, x) in [("pull", self.pull), ("split", self.split), ("prune", self.prune)] {
             ensure(x.is_finite() && x >= 0.0, "spec", key, x, "a finite number, 0 or more")?;
         }

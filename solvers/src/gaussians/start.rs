@@ -10,7 +10,7 @@ use super::cells::Cells;
 use super::lists::Lists;
 use super::shape::{CENTRE, DENSITY, NUMBERS, ROTATION, SCALE, before_softplus};
 use super::stage::shapes;
-use conefield_core::error::{Error, Result, ensure};
+use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Vec3, dot};
 use conefield_core::parallel;
 use conefield_core::random::stream;
@@ -71,13 +71,8 @@ impl Default for Start {
 impl Start {
     /// Refuses invalid settings.
     pub fn validate(&self, most: usize) -> Result<()> {
-        ensure(
-            (8..=most).contains(&self.count),
-            "spec",
-            "count",
-            self.count,
-            format!("8 to {most}, the number of slots"),
-        )?;
+        let expected = format!("8 to {most}, the number of slots");
+        ensure((8..=most).contains(&self.count), "spec", "count", self.count, expected)?;
         let share = (0.0..1.0).contains(&self.threshold);
         ensure(share, "spec", "threshold", self.threshold, "a share from 0 to below 1")
     }
@@ -108,10 +103,8 @@ impl Start {
             Sites::Cells => cells(volume, scene, threshold, self.count),
             Sites::Random => self.random(volume, scene, threshold, seed),
         };
-        if begins.len() <= NEIGHBOURS {
-            let expected = "more voxels above start.threshold";
-            return Err(Error::invalid("start", "volume", format!("{} of them", begins.len()), expected));
-        }
+        let (found, expected) = (format!("{} of them", begins.len()), "more voxels above start.threshold");
+        ensure(begins.len() > NEIGHBOURS, "start", "volume", found, expected)?;
         // Neighbours in space become neighbours in memory.
         begins.sort_by_cached_key(|b| morton(b.centre));
         let count = begins.len();

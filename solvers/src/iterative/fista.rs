@@ -20,7 +20,6 @@ use super::problem::{change, copy, distance, norm2, room};
 use super::regularizers::Nonnegative;
 use super::shared::{Shared, settings};
 use super::{Iteration, Pass, Problem, Stop};
-use conefield_core::Error;
 use conefield_core::basis::{Basis, BasisSpec, Expansion};
 use conefield_core::data_term::{DataTerm, DataTermSpec, Misfit};
 use conefield_core::error::{Result, ensure};
@@ -136,10 +135,8 @@ impl Iterative for FistaMethod {
 
     fn solve(&self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let begun = Instant::now();
-        if self.pull > 0.0 && !self.shared.has_start(job) {
-            let expected = "0, or a volume to start from and pull towards";
-            return Err(Error::invalid("spec", "pull", self.pull, expected));
-        }
+        let held = self.pull == 0.0 || self.shared.has_start(job);
+        ensure(held, "spec", "pull", self.pull, "0, or a volume to start from and pull towards")?;
         let stages = [self.data.describe(), self.prior.describe(), self.basis.describe()].join("; ");
         let voxels = job.scan.geometry.volume;
         let expansion = self.basis.on(&voxels).map_err(|e| e.within("basis"))?;

@@ -154,8 +154,8 @@ pub struct TvProx {
     confines: Confines,
     /// The dual variable along x, y and z; with edges or a limited arc it is `D·A·p`.
     dual: [Array; 3],
-    /// Edges across which slopes cost less.
-    edges: Option<Edges>,
+    /// Edges across which slopes cost less, initially 0.
+    pub(super) edges: Option<Edges>,
     limited: Option<Limited>,
     /// Dual steps of an update.
     inner: usize,
@@ -176,11 +176,6 @@ impl TvProx {
         let dual = [dual()?, dual()?, dual()?];
         let confines = Confines::default();
         Ok(Self { shape, g, confines, dual, edges: None, limited: None, inner, arc })
-    }
-
-    /// Reduces the cost of slopes across `edges`, which are initially 0.
-    pub fn with_edges(self, edges: Edges) -> Self {
-        Self { edges: Some(edges), ..self }
     }
 
     /// Overwrites `u` with the proximal map of `v` after `steps` dual steps. With a weight of 0, only clips to
@@ -813,7 +808,8 @@ mod tests {
 
     /// The prior with the edges of `x`.
     fn with_edges(shape: [usize; 3], g: [f32; 3], x: &Array3<f32>) -> TvProx {
-        let mut prox = prox(shape, g).with_edges(Edges::new(shape, 0.9, 0.7, &space(shape)).unwrap());
+        let edges = Edges::new(shape, 0.9, 0.7, &space(shape)).unwrap();
+        let mut prox = TvProx { edges: Some(edges), ..prox(shape, g) };
         assert!(prox.adapt(x.view()).is_some());
         prox
     }

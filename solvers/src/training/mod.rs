@@ -51,10 +51,7 @@ pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) 
         let masks = run.model.masks().len();
         callbacks.each(|c| c.before_step(run))?;
         if run.model.masks().len() > masks {
-            callbacks.each(|c| {
-                c.masked();
-                Ok(())
-            })?;
+            callbacks.0.iter_mut().for_each(|c| c.masked());
         }
         step(run, task, callbacks)?;
         let share = run.clock.done(run.step);
@@ -77,12 +74,11 @@ fn step(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) -> Re
         run.exe.step(&mut run.model, &work)
     })?;
     let mut update = Update::Take;
-    callbacks.each(|c| {
+    for callback in &mut callbacks.0 {
         if update == Update::Take {
-            update = c.after_gradients(&work, &stats, run)?;
+            update = callback.after_gradients(&work, &stats, run)?;
         }
-        Ok(())
-    })?;
+    }
     if update == Update::Take && !(stats.loss.is_finite() && stats.prior.is_finite()) {
         let what = format!("the loss is {}, the prior {}", stats.loss, stats.prior);
         return Err(culprit::diverged(run, &work, &what));

@@ -3,5 +3,4 @@
 pub mod cubic;
 pub mod voxels;
 
-pub use cubic::Cubic;
 pub use voxels::Voxels;

@@ -3,5 +3,4 @@
 pub mod least_squares;
 pub mod noise_weighted;
 
-pub use least_squares::LeastSquares;
 pub use noise_weighted::NoiseWeighted;

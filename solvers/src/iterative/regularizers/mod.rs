@@ -6,8 +6,5 @@ pub mod patches;
 pub mod sum;
 pub mod total_variation;
 
-pub use directional_total_variation::DirectionalTotalVariation;
 pub use none::Nonnegative;
-pub use patches::Patches;
-pub use sum::Sum;
 pub use total_variation::TotalVariation;

@@ -88,11 +88,9 @@ impl Regularizer for Variation {
         let g = anisotropy(grid);
         let g = std::array::from_fn(|k| self.weights[k] as f32 * g[k]);
         let edges = self.edges.map(|[strength, edge]| Edges::new(grid.shape, strength as f32, edge, space));
-        let prox = TvProx::new(grid.shape, g, self.inner, self.arc, space)?;
-        Ok(Box::new(match edges.transpose()? {
-            Some(edges) => prox.with_edges(edges),
-            None => prox,
-        }))
+        let mut prox = TvProx::new(grid.shape, g, self.inner, self.arc, space)?;
+        prox.edges = edges.transpose()?;
+        Ok(Box::new(prox))
     }
 
     fn weight(&self, grid: &VoxelGrid, noise: &mut dyn FnMut(f64) -> f64) -> Result<f64> {

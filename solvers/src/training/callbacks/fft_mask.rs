@@ -131,14 +131,12 @@ impl Callback for Masker {
             let expected = format!("some of channels 0 to {}, ascending", width - 1);
             return ensure(fits, "spec", "keep", format!("{keep:?}"), expected);
         }
-        if self.settings.scope == Scope::Finer && !pipeline.encoder.coarse_to_fine() {
-            let found = format!(
-                "\"finer\" with an encoder whose channels are not ordered from coarse to fine: {}",
-                pipeline.encoder.describe()
-            );
-            return Err(Error::invalid("spec", "scope", found, "\"channel\" with this encoder"));
-        }
-        Ok(())
+        let ordered = self.settings.scope != Scope::Finer || pipeline.encoder.coarse_to_fine();
+        let found = format!(
+            "\"finer\" with an encoder whose channels are not ordered from coarse to fine: {}",
+            pipeline.encoder.describe()
+        );
+        ensure(ordered, "spec", "scope", found, "\"channel\" with this encoder")
     }
 
     fn before_step(&mut self, run: &mut Run<'_>) -> Result<()> {

@@ -8,12 +8,9 @@ pub mod live_slices;
 pub mod patience;
 pub mod rollback;
 
-pub use coarse_to_fine::CoarseToFine;
 pub use drift::Drift;
-pub use fft_mask::FftMask;
 pub use field_monitor::FieldMonitor;
 pub use live_slices::LiveSlices;
-pub use patience::Patience;
 pub use rollback::Rollback;
 
 use conefield_core::error::{Result, ensure};
