@@ -117,20 +117,25 @@ pub fn write<S: Serializer>(settings: &dyn Registered, to: S) -> Result<S::Ok, S
 }
 
 /// Reads settings from a table with a `type`, or from the name of a type.
-pub fn read<T: Settings + ?Sized + 'static>(mut value: Value) -> Result<Box<T>, String> {
+pub fn read<T: Settings + ?Sized + 'static>(value: Value) -> Result<Box<T>, String> {
+    let (found, name, keys) = typed(T::KIND, value)?;
+    let settings = found.and_then(|t| match &t.origin {
+        Origin::Linked { make, .. } => make().call(keys),
+        Origin::Loaded { make, .. } => make.call(keys),
+    });
+    settings.unwrap_or_else(|| Err(format!("found type {name}, expected {}", names(T::KIND).join(", "))))
+}
+
+/// What [`read`] does for all kinds alike: the type, if there is one of this name, its name, and the other keys.
+fn typed(kind: Kind, mut value: Value) -> Result<(Option<&'static StageType>, Value, Value), String> {
     if value.is_string() {
         value = json!({ "type": value });
     }
     if !value.is_object() {
-        return Err(format!("found {value}, expected a table or the name of a type ({})", T::KIND));
+        return Err(format!("found {value}, expected a table or the name of a type ({kind})"));
     }
     let name = value.as_object_mut().and_then(|table| table.remove("type")).ok_or("missing field `type`")?;
-    let found = name.as_str().and_then(|name| find(T::KIND, name));
-    let settings = found.and_then(|t| match &t.origin {
-        Origin::Linked { make, .. } => make().call(value),
-        Origin::Loaded { make, .. } => make.call(value),
-    });
-    settings.unwrap_or_else(|| Err(format!("found type {name}, expected {}", names(T::KIND).join(", "))))
+    Ok((name.as_str().and_then(|name| find(kind, name)), name, value))
 }
 
 /// Reads the settings of a type from the keys of its table. It reads tables only: what `serde` derives for settings in a

@@ -10,8 +10,14 @@ use serde_json::Value;
 
 /// For `#[serde(deserialize_with = …)]`: a list of stages.
 pub fn list<'de, T: Settings + ?Sized + 'static, D: Deserializer<'de>>(from: D) -> Result<Vec<Box<T>>, D::Error> {
-    let all = Vec::<Value>::deserialize(from)?.into_iter().enumerate();
+    let all = values(from)?.into_iter().enumerate();
     all.map(|(i, v)| read(v).map_err(|e| D::Error::custom(format!("{i}: {e}")))).collect()
+}
+
+/// Compiled once, whatever the kind of the stages.
+#[inline(never)]
+fn values<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<Value>, D::Error> {
+    Vec::deserialize(from)
 }
 
 /// For `#[schemars(schema_with = …)]`: the schema of a setting that is a stage.

@@ -72,14 +72,9 @@ macro_rules! settings {
         impl $name {
             /// The settings that all iterative methods have, built.
             fn shared(&self) -> conefield_core::Result<$crate::iterative::shared::Shared> {
+                use $crate::iterative::shared::Shared;
                 let kind = conefield_core::registry::Registered::type_name(self);
-                $crate::iterative::shared::Shared::of(
-                    kind,
-                    self.projector.as_ref(),
-                    &self.scene,
-                    &self.start,
-                    &self.stop,
-                )
+                Shared::of(kind, self.projector.as_ref(), &self.scene, &self.start, &self.stop)
             }
         }
 
