@@ -312,7 +312,7 @@ fn positions(edges: &[[f64; 2]]) -> Vec<Vec<usize>> {
     let middle = |v: usize| 0.5 * (edges[v][0] + edges[v][1]);
     let width = edges.iter().map(|e| e[1] - e[0]).fold(0.0, f64::max);
     let mut order: Vec<usize> = (0..edges.len()).collect();
-    order.sort_by(|&a, &b| middle(a).total_cmp(&middle(b)));
+    order.sort_unstable_by(|&a, &b| middle(a).total_cmp(&middle(b)));
     let mut groups: Vec<Vec<usize>> = vec![];
     let mut last = f64::NEG_INFINITY;
     for v in order {

@@ -139,7 +139,7 @@ impl DensityControl {
                 wanted.push((pull, i));
             }
         }
-        wanted.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        wanted.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         let mut rng = stream(run.job.seed ^ 0xde75_17e5, run.step);
         let mut normal = || {
             let (a, b): (f32, f32) = (rng.random(), rng.random());
