@@ -103,8 +103,7 @@ fn temporary(mode: u32) -> tempfile::Builder<'static, 'static> {
 /// Writes a file through `fill`: into a temporary file in the same folder, which is flushed, synced and renamed.
 ///
 /// If `fill` or the system fails, an earlier file of that name stays unchanged and the temporary file is removed.
-pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
-    let path = path.as_ref();
+pub fn write_atomic(path: &Path, fill: &mut dyn FnMut(&mut dyn Write) -> Result<()>) -> Result<()> {
     let folder = folder_of(path);
     let at = |e| Error::io(path, e);
     // A rename over a folder fails anyway, but only after all the work is done.
@@ -126,14 +125,13 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
 /// Writes `text` like [`write_atomic`].
 pub fn write_text_atomic(path: impl AsRef<Path>, text: &str) -> Result<()> {
     let path = path.as_ref();
-    write_atomic(path, |w| w.write_all(text.as_bytes()).map_err(|e| Error::io(path, e)))
+    write_atomic(path, &mut |w| w.write_all(text.as_bytes()).map_err(|e| Error::io(path, e)))
 }
 
 /// Fills a temporary folder beside `folder` and exchanges the two in one step; only then is the earlier folder removed.
 ///
 /// The caller checks whether an earlier folder may be replaced.
-pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    let folder = folder.as_ref();
+pub fn write_folder_atomic(folder: &Path, fill: &mut dyn FnMut(&Path) -> Result<()>) -> Result<()> {
     let beside = folder_of(folder);
     let at = |e| Error::io(folder, e);
     if folder.file_name().is_none() {
@@ -227,7 +225,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.txt");
         write_text_atomic(&path, "first").unwrap();
-        let failed = write_atomic(&path, |w| {
+        let failed = write_atomic(&path, &mut |w| {
             w.write_all(b"half of the sec").unwrap();
             Err(Error::unsupported("test", "fails on purpose"))
         });
@@ -242,14 +240,14 @@ mod tests {
     fn a_failed_folder_leaves_the_earlier_folder_whole() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scan");
-        write_folder_atomic(&path, |d| write_text_atomic(d.join("a"), "1")).unwrap();
-        let failed = write_folder_atomic(&path, |d| {
+        write_folder_atomic(&path, &mut |d| write_text_atomic(d.join("a"), "1")).unwrap();
+        let failed = write_folder_atomic(&path, &mut |d| {
             write_text_atomic(d.join("b"), "2")?;
             Err(Error::unsupported("test", "fails on purpose"))
         });
         assert!(failed.is_err());
         assert_eq!((names(dir.path()), names(&path)), (vec!["scan".to_string()], vec!["a".to_string()]));
-        write_folder_atomic(&path, |d| write_text_atomic(d.join("b"), "2")).unwrap();
+        write_folder_atomic(&path, &mut |d| write_text_atomic(d.join("b"), "2")).unwrap();
         assert_eq!((names(dir.path()), names(&path)), (vec!["scan".to_string()], vec!["b".to_string()]));
     }
 

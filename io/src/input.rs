@@ -212,6 +212,13 @@ impl Input {
     }
 }
 
+/// The first bytes of a regular file, at most `most`.
+pub(crate) fn start_of(path: &Path, most: u64) -> Result<Vec<u8>> {
+    let mut start = Vec::new();
+    files::open(path)?.0.take(most).read_to_end(&mut start).map_err(|e| Error::io(path, e))?;
+    Ok(start)
+}
+
 /// Reads a regular file completely.
 pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>> {
     let (file, size) = files::open(path)?;

@@ -277,7 +277,7 @@ pub(crate) fn write_raw(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
         let found = format!("{name} without its header");
         return Err(Error::invalid(path.display().to_string(), "output", found, "a name of which nothing is there"));
     }
-    write_atomic(&raw, |w| file_order::write(w, &raw, voxels, FileOrder::XFastest))?;
+    write_atomic(&raw, &mut |w| file_order::write(w, &raw, voxels, FileOrder::XFastest))?;
     let text = lines(path, voxels, "CompressedData = False", &name);
     write_text_atomic(path, &text)
 }

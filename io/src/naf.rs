@@ -355,7 +355,8 @@ pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volu
     if let Some(v) = volume {
         entries.push(("image", Out::Floats(v.data.view().into_dyn())));
     }
-    write_atomic(path, |w| pickle::write(w, &Out::Dict(entries)).map_err(|e| Error::io(path, e)))
+    let content = Out::Dict(entries);
+    write_atomic(path, &mut |w| pickle::write(w, &content).map_err(|e| Error::io(path, e)))
 }
 
 fn views_out<'a>(angles: &'a [f64], projections: &'a Array3<f32>) -> Out<'a> {
@@ -454,9 +455,10 @@ mod tests {
             ("train", views(&[0.0, 1.0], [2, 2, 3], 0.5)),
         ];
         change(&mut entries);
+        let content = Out::Dict(entries);
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.pickle");
-        write_atomic(&path, |w| pickle::write(w, &Out::Dict(entries)).map_err(|e| Error::io(&path, e))).unwrap();
+        write_atomic(&path, &mut |w| pickle::write(w, &content).map_err(|e| Error::io(&path, e))).unwrap();
         (dir, path)
     }
 

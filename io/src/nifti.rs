@@ -34,8 +34,9 @@ pub(crate) fn is_second_version(head: &[u8]) -> bool {
     head.get(4..7).is_some_and(|m| m == b"n+2" || m == b"ni2")
 }
 
-/// Reads the volume whose first [`HEADER`] bytes are `head`.
-pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
+/// Reads the volume in `path`; the affine is RAS, in mm.
+pub(crate) fn read(path: &Path) -> Result<Volume> {
+    let (input, head) = &mut open(path)?;
     if head.get(344..348) == Some(b"ni1\0".as_slice()) {
         return Err(Error::unsupported(
             format!("{}: a NIfTI header whose image is in another file", input.place()),
@@ -46,7 +47,7 @@ pub(crate) fn read_from(input: &mut Input, head: &[u8]) -> Result<Volume> {
     if header.sizeof_hdr != HEADER as i32 {
         return Err(input.invalid("sizeof_hdr", header.sizeof_hdr, HEADER.to_string()));
     }
-    let shape = shape(input, &header)?;
+    let shape = voxels(input, &header)?;
     let number = number(input, &header)?;
     let offset = offset(input, &header)?;
     let (slope, inter) = scaling(input, &header)?;
@@ -72,13 +73,21 @@ fn parse(input: &Input, head: &[u8]) -> Result<NiftiHeader> {
         .map_err(|e| input.invalid("header", e, format!("a NIfTI-1 header of {HEADER} bytes")))
 }
 
-/// Voxels along x, y and z, from `head`.
-pub(crate) fn shape_of(input: &Input, head: &[u8]) -> Result<[usize; 3]> {
-    shape(input, &parse(input, head)?)
+/// The file `path` and its first [`HEADER`] bytes.
+fn open(path: &Path) -> Result<(Input, Vec<u8>)> {
+    let mut input = Input::open(path)?;
+    let head = input.take(HEADER)?;
+    Ok((input, head))
+}
+
+/// Voxels along x, y and z, from the header.
+pub(crate) fn shape(path: &Path) -> Result<[usize; 3]> {
+    let (input, head) = open(path)?;
+    voxels(&input, &parse(&input, &head)?)
 }
 
 /// Three axes of at least one voxel; later axes must have length 1.
-fn shape(input: &Input, header: &NiftiHeader) -> Result<[usize; 3]> {
+fn voxels(input: &Input, header: &NiftiHeader) -> Result<[usize; 3]> {
     let dim = header.dim.map(|d| d as i16);
     let shown = || format!("{dim:?}");
     if !(3..=7).contains(&dim[0]) {
@@ -271,7 +280,7 @@ pub(crate) fn write_packed(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxe
 #[cfg(test)]
 mod tests {
     use crate::number::Number;
-    use crate::testing::{file, gzip, says};
+    use crate::testing::{data, file, gzip, says};
     use crate::volume::tests::two_of_each;
     use crate::{read_volume, write_volume};
     use conefield_core::scan::Volume;
@@ -327,6 +336,21 @@ mod tests {
         v.affine.as_mut().unwrap()[1][0] = -0.9;
         write_volume(&path, &v).unwrap();
         assert_eq!(read_volume(&path).unwrap().grid, v.grid);
+    }
+
+    #[test]
+    fn a_clinical_file_keeps_its_place_and_comes_back() {
+        let Some(path) = data("clinical/abdomen_ct_hu.nii.gz") else { return };
+        let v = read_volume(&path).unwrap();
+        assert_eq!((v.grid.shape, v.grid.center), ([122, 101, 112], [0.0; 3]));
+        assert!(v.grid.spacing.iter().all(|s| (s - 3.0).abs() < 1e-6), "{:?}", v.grid.spacing);
+        let [low, high] = conefield_core::finite::range(&v.data);
+        assert!((-3100.0..=-900.0).contains(&low) && high > 300.0, "{low} to {high} are no Hounsfield units");
+        assert!(v.affine.unwrap()[..3].iter().any(|row| row[3] != 0.0), "the file has an offset");
+        let copy = file("copy.nii.gz", &[]);
+        write_volume(&copy.1, &v).unwrap();
+        let back = read_volume(&copy.1).unwrap();
+        assert!((back.data, back.grid, back.affine) == (v.data, v.grid, v.affine));
     }
 
     #[test]

@@ -15,17 +15,17 @@ pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
 
 /// Reads the array `name` of the archive (the only one if `None`) with any of the sets of axes, like [`npy::read`].
 pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
-    npy::read_counts(&mut open(path, name)?, Vec::new(), sets).map(|(array, _)| array)
+    npy::read_counts(&mut open(path, name)?, sets).map(|(array, _)| array)
 }
 
 /// Shape and numbers of the small array `name`, like [`npy::read_exact`].
 pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>, Vec<f64>)> {
-    npy::read_exact(&mut open(path, name)?, Vec::new())
+    npy::read_exact(&mut open(path, name)?)
 }
 
 /// The shape of the array `name`, from its header.
 pub(crate) fn shape(path: &Path, name: Option<&str>) -> Result<Vec<usize>> {
-    npy::shape(&mut open(path, name)?, Vec::new())
+    npy::shape(&mut open(path, name)?)
 }
 
 fn open(path: &Path, name: Option<&str>) -> Result<Input> {

@@ -13,10 +13,10 @@ mod write;
 #[cfg(test)]
 mod tests;
 
-use conefield_core::{Error, Result, files};
+use crate::input::start_of;
+use conefield_core::{Error, Result};
 use numpy::{Array, Dtype, Global};
 use std::collections::HashMap;
-use std::io::Read;
 use std::path::Path;
 use value::{Heap, Node, Refusal, Value};
 
@@ -45,10 +45,7 @@ pub(crate) fn is_start(start: &[u8]) -> bool {
 
 /// Whether the file starts like a pickle of protocol 2 or later.
 pub(crate) fn is_pickle(path: &Path) -> Result<bool> {
-    let mut start = Vec::new();
-    let (file, _) = files::open(path)?;
-    file.take(2).read_to_end(&mut start).map_err(|e| Error::io(path, e))?;
-    Ok(is_start(&start))
+    Ok(is_start(&start_of(path, 2)?))
 }
 
 impl<'a> Pickle<'a> {

@@ -31,8 +31,8 @@ const SIDE: usize = 64;
 /// Writes the folder `path`; an existing folder is replaced only if it holds nothing but such a pyramid.
 pub(crate) fn write(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let known = |name: &str| [".zattrs", ".zgroup"].contains(&name) || name.bytes().all(|b| b.is_ascii_digit());
-    folder::may_replace(path, "OME-Zarr", known, &[".zattrs"])?;
-    write_folder_atomic(path, |folder| {
+    folder::may_replace(path, "OME-Zarr", &known, &[".zattrs"])?;
+    write_folder_atomic(path, &mut |folder| {
         let shapes = shapes(voxels.grid().shape);
         let file = |name: &str, value: &Value| write_text_atomic(folder.join(name), &format!("{value:#}\n"));
         file(".zgroup", &json!({ "zarr_format": 2 }))?;

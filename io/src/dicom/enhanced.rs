@@ -60,11 +60,8 @@ pub(crate) fn write(path: &Path, voxels: &mut dyn Voxels, template: Option<&Dico
     check_one_file(&path.display().to_string(), voxels.grid().shape)?;
     let mut series = Series::new(path, voxels, template, ENHANCED)?;
     series.values.rewind().map_err(|e| Error::io(path, e))?;
-    let object = whole(&series, frames);
-    write_atomic(path, |w| {
-        series.head(path, w, object, &series.digest.uid("image"), frames)?;
-        series.pixels(path, w, frames)
-    })
+    let head = series.head(path, whole(&series, frames), &series.digest.uid("image"), frames)?;
+    write_atomic(path, &mut |w| series.pixels(path, &head, w, frames))
 }
 
 fn sequence(object: &mut InMemDicomObject, tag: Tag, items: Vec<InMemDicomObject>) {

@@ -5,7 +5,6 @@
 
 use super::numpy::{Array, Dtype, Global};
 use crate::memory;
-use conefield_core::finite::stray;
 use conefield_core::{Error, Result};
 use ndarray::{ArrayD, Dimension};
 
@@ -294,10 +293,7 @@ impl<'p, 'a> Item<'p, 'a> {
         let values = ArrayD::from_shape_vec(&array.stored[..], values).map_err(|e| self.invalid(e, expected()))?;
         let values = values.permuted_axes(&array.axes[..]);
         let values = memory::in_order(&self.pickle.place, self.key(), values)?;
-        match stray(&values) {
-            Some((at, x)) => Err(self.invalid_at(format!("{}{:?}", self.key(), at.slice()), x, "a finite number")),
-            None => Ok(values),
-        }
+        memory::all_finite(&self.pickle.place, values, &|at| format!("{}{:?}", self.key(), at.slice()))
     }
 
     fn numeric(&self, value: Value<'a>) -> Option<f64> {

@@ -18,7 +18,6 @@ use crate::number::{ByteOrder, Number};
 use crate::stack::Names;
 use cfb::CompoundFile;
 use conefield_core::error::ensure;
-use conefield_core::finite::stray;
 use conefield_core::geometry::View;
 use conefield_core::{Error, Result, files};
 use ndarray::Array3;
@@ -122,7 +121,7 @@ impl Txrm {
     fn images(
         &mut self,
         count: usize,
-        name: impl Fn(usize) -> String,
+        name: &dyn Fn(usize) -> String,
         number: Number,
         [rows, columns]: [usize; 2],
     ) -> Result<Array3<f32>> {
@@ -139,12 +138,7 @@ impl Txrm {
         }
         let all = Array3::from_shape_vec((count, rows, columns), values)
             .map_err(|e| self.invalid("images", e, "as many pixels as rows and columns say"))?;
-        match stray(&all) {
-            Some(((i, r, c), x)) => {
-                Err(self.invalid(&format!("{}, row {r}, column {c}", name(i)), x, "a finite number"))
-            }
-            None => Ok(all),
-        }
+        memory::all_finite(&self.place, all, &|(i, r, c)| format!("{}, row {r}, column {c}", name(i)))
     }
 }
 
@@ -161,11 +155,11 @@ pub(super) fn read(path: &Path, part: ScanPart) -> Result<Array3<f32>> {
     match part {
         ScanPart::Projections => {
             let number = txrm.number("ImageInfo/DataType")?;
-            txrm.images(count, |i| format!("ImageData{}/Image{}", i / FOLDER + 1, i + 1), number, size)
+            txrm.images(count, &|i| format!("ImageData{}/Image{}", i / FOLDER + 1, i + 1), number, size)
         }
         ScanPart::Flat => {
             let number = txrm.number("ReferenceData/DataType")?;
-            txrm.images(1, |_| FLAT.to_owned(), number, size)
+            txrm.images(1, &|_| FLAT.to_owned(), number, size)
         }
         ScanPart::Dark => Err(txrm.invalid("dark", "no dark field", "a file that has one")),
     }

@@ -3,10 +3,10 @@
 //! `ruzstd` decompresses the strips or tiles. The `tiff` crate reads them from a file in memory that holds nothing but
 //! the page, uncompressed.
 
-use super::{Page, Pages, append, broken, pieces, tags};
+use super::{Page, Pages, Source, append, broken, pieces, tags};
 use conefield_core::{Error, Result, allowance};
 use ruzstd::decoding::FrameDecoder;
-use std::io::{Cursor, Read, Seek, SeekFrom};
+use std::io::{Cursor, Read, SeekFrom};
 use tiff::TiffError;
 use tiff::decoder::{ChunkType, Decoder, Limits};
 use tiff::encoder::TiffEncoder;
@@ -80,13 +80,14 @@ pub(super) fn read(place: &str, decoder: &mut Pages, page: &Page, out: &mut Vec<
     directory.write_tag(sizes, &lengths[..]).map_err(broken)?;
     directory.finish().map_err(broken)?;
     plain.set_position(0);
-    let mut page = Decoder::new(plain).map_err(broken)?.with_limits(Limits::unlimited());
+    let mut page: Pages = Decoder::new(Box::new(plain) as Box<dyn Source>).map_err(broken)?;
+    page = page.with_limits(Limits::unlimited());
     append(out, page.read_image().map_err(broken)?);
     Ok(())
 }
 
 /// The `size` bytes at byte `at` of the file.
-fn stored(place: &str, reader: &mut (impl Read + Seek), at: u64, size: u64) -> Result<Vec<u8>> {
+fn stored(place: &str, reader: &mut dyn Source, at: u64, size: u64) -> Result<Vec<u8>> {
     let mut packed = Vec::new();
     let read = reader.seek(SeekFrom::Start(at)).and_then(|_| reader.take(size).read_to_end(&mut packed));
     match read {
