@@ -3,6 +3,7 @@
 use crate::folder::folder_of;
 use crate::lease;
 use crate::lock::{self, Held};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
@@ -107,9 +108,7 @@ pub fn write_atomic(path: &Path, fill: &mut dyn FnMut(&mut dyn Write) -> Result<
     let folder = folder_of(path);
     let at = |e| Error::io(path, e);
     // A rename over a folder fails anyway, but only after all the work is done.
-    if path.is_dir() {
-        return Err(Error::invalid(path.display().to_string(), "file", "a folder", "a name for a file"));
-    }
+    ensure(!path.is_dir(), &path.display().to_string(), "file", "a folder", "a name for a file")?;
     let made = begin(folder, || temporary(0o666).tempfile_in(folder), |f| f.path());
     let (file, _lock, _noted) = made.map_err(|e| at(without_path(e)))?;
     // Writes to the file itself: errors of its guard would name the temporary path.
@@ -134,9 +133,8 @@ pub fn write_text_atomic(path: impl AsRef<Path>, text: &str) -> Result<()> {
 pub fn write_folder_atomic(folder: &Path, fill: &mut dyn FnMut(&Path) -> Result<()>) -> Result<()> {
     let beside = folder_of(folder);
     let at = |e| Error::io(folder, e);
-    if folder.file_name().is_none() {
-        return Err(Error::invalid(folder.display().to_string(), "folder", "no name of its own", "a folder to create"));
-    }
+    let expected = "a folder to create";
+    ensure(folder.file_name().is_some(), &folder.display().to_string(), "folder", "no name of its own", expected)?;
     lease::put_back_missing(folder)?;
     let made = begin(beside, || temporary(0o777).tempdir_in(beside), |d| d.path());
     let (new, _lock, _noted) = made.map_err(|e| at(without_path(e)))?;

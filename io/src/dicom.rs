@@ -21,6 +21,7 @@ pub(crate) use write::{check_shape, write};
 
 use crate::input::start_of;
 use crate::{affine, folder, foreign};
+use conefield_core::error::ensure;
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm, sub};
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result, allowance};
@@ -112,9 +113,8 @@ fn assemble(place: &str, mut slices: Vec<Slice>, values: &dyn Fn(&Slice) -> Resu
     let lps = affine::from_columns(steps, first.position);
     let grid = VoxelGrid { shape: [first.format.columns, first.format.rows, slices.len()], spacing, center: [0.0; 3] };
     grid.validate(place)?;
-    if !affine::is_regular(&lps) {
-        return Err(Error::invalid(place, "ImagePositionPatient", format!("{lps:?}"), "three independent voxel axes"));
-    }
+    let expected = "three independent voxel axes";
+    ensure(affine::is_regular(&lps), place, "ImagePositionPatient", format!("{lps:?}"), expected)?;
     allowance::numbers(place, "voxels", grid.len().unwrap_or(usize::MAX))?;
     let mut data = Array3::zeros(grid.shape);
     for (z, slice) in slices.iter().enumerate() {
@@ -173,10 +173,8 @@ fn upright(place: &str, first: &Slice, last: &Slice, normal: [f64; 3]) -> Result
     let way = sub(last.position, first.position);
     let along = dot(way, normal);
     let aside = norm(sub(way, normal.map(|x| x * along)));
-    if aside > 0.5 * first.spacing[0].min(first.spacing[1]) {
-        let found = format!("a last slice {aside:.3} mm aside of the first one's normal (a tilted gantry)");
-        let expected = "slices above each other (resample the series to an upright volume first)";
-        return Err(Error::invalid(place, "ImagePositionPatient", found, expected));
-    }
+    let found = format!("a last slice {aside:.3} mm aside of the first one's normal (a tilted gantry)");
+    let expected = "slices above each other (resample the series to an upright volume first)";
+    ensure(aside <= 0.5 * first.spacing[0].min(first.spacing[1]), place, "ImagePositionPatient", found, expected)?;
     Ok(())
 }

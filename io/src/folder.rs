@@ -1,5 +1,6 @@
 //! Names of files in a folder: those in a scan's description stay inside it, those of a series come in order.
 
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use std::collections::{BTreeMap, HashSet};
 use std::io::ErrorKind;
@@ -9,18 +10,15 @@ use std::path::{Component, Path, PathBuf};
 pub(crate) fn plain(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
     let mut parts = Path::new(name).components();
     let one = matches!((parts.next(), parts.next()), (Some(Component::Normal(p)), None) if p == name);
-    if !one || name.contains(['/', '\\', ':', '\0']) {
-        return Err(Error::invalid(place, field, format!("\"{name}\""), "a plain file name inside the folder"));
-    }
+    let expected = "a plain file name inside the folder";
+    ensure(one && !name.contains(['/', '\\', ':', '\0']), place, field, format!("\"{name}\""), expected)?;
     inside(folder, place, field, name)
 }
 
 /// The file at the relative path `name` in `folder`; refuses a path that leads outside, also through a link.
 pub(crate) fn inside(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
     let path = within(folder, place, field, name)?;
-    if !path.is_file() {
-        return Err(Error::invalid(place, field, format!("\"{name}\""), "a file"));
-    }
+    ensure(path.is_file(), place, field, format!("\"{name}\""), "a file")?;
     Ok(path)
 }
 
@@ -29,16 +27,13 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
     let shown = || format!("\"{name}\"");
     let slashed = name.replace('\\', "/");
     let down = Path::new(&slashed).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
-    if name.is_empty() || !down || name.contains([':', '\0']) {
-        return Err(Error::invalid(place, field, shown(), "a relative path inside the folder, without \"..\""));
-    }
+    let expected = "a relative path inside the folder, without \"..\"";
+    ensure(!name.is_empty() && down && !name.contains([':', '\0']), place, field, shown(), expected)?;
     let path = folder.join(slashed);
     let real = path.canonicalize().map_err(|e| Error::invalid(place, field, format!("{} ({e})", shown()), "a file"))?;
     let root = folder.canonicalize().map_err(|e| Error::io(folder, e))?;
-    if !real.starts_with(&root) {
-        let found = format!("{}, a link out of the folder", shown());
-        return Err(Error::invalid(place, field, found, "a file inside the folder"));
-    }
+    let found = format!("{}, a link out of the folder", shown());
+    ensure(real.starts_with(&root), place, field, found, "a file inside the folder")?;
     Ok(path)
 }
 

@@ -92,6 +92,11 @@ impl Input {
         Error::invalid(self.place(), field, found, expected)
     }
 
+    /// An error about this file unless `ok`.
+    pub fn ensure(&self, ok: bool, field: &str, found: impl ToString, expected: impl Into<String>) -> Result<()> {
+        if ok { Ok(()) } else { Err(self.invalid(field, found, expected)) }
+    }
+
     /// Reads up to `n` bytes, fewer only at the end of the file.
     pub fn take(&mut self, n: usize) -> Result<Vec<u8>> {
         let mut out = Vec::with_capacity(n.min(1 << 16));

@@ -131,13 +131,8 @@ impl Lease {
             // Another process has made it since, and may still write.
             self.locks = own(&self.path)?;
             let place = self.path.display().to_string();
-            ensure(
-                self.progressed() == Progressed::Nothing,
-                &place,
-                "output",
-                "what another command wrote",
-                "a new folder",
-            )?;
+            let expected = "a new folder";
+            ensure(self.progressed() == Progressed::Nothing, &place, "output", "what another command wrote", expected)?;
         }
         if !self.path.is_dir() {
             fs::create_dir(&self.path).map_err(at)?;
@@ -146,11 +141,9 @@ impl Lease {
         } else if self.progressed() == Progressed::Nothing {
             self.clear(&self.path)?;
         } else {
-            if self.path.file_name().is_none() {
-                let found = "a folder without a name of its own";
-                let expected = "the name that it has in the folder above";
-                return Err(Error::invalid(self.path.display().to_string(), "output", found, expected));
-            }
+            let found = "a folder without a name of its own";
+            let expected = "the name that it has in the folder above";
+            ensure(self.path.file_name().is_some(), &self.path.display().to_string(), "output", found, expected)?;
             let aside = aside(&self.path);
             let slot = aside.join(waiting(&aside)?.len().to_string());
             fs::create_dir_all(&slot).map_err(at)?;

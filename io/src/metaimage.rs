@@ -9,6 +9,7 @@ use crate::input::Input;
 use crate::number::{ByteOrder, Number};
 use crate::text::{self, shortened, without_mark};
 use crate::{write_atomic, write_text_atomic};
+use conefield_core::error::ensure;
 use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
@@ -273,10 +274,9 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
 pub(crate) fn write_raw(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let raw = path.with_extension("raw");
     let name = raw.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    if raw.exists() && !path.exists() {
-        let found = format!("{name} without its header");
-        return Err(Error::invalid(path.display().to_string(), "output", found, "a name of which nothing is there"));
-    }
+    let found = format!("{name} without its header");
+    let expected = "a name of which nothing is there";
+    ensure(!raw.exists() || path.exists(), &path.display().to_string(), "output", found, expected)?;
     write_atomic(&raw, &mut |w| file_order::write(w, &raw, voxels, FileOrder::XFastest))?;
     let text = lines(path, voxels, "CompressedData = False", &name);
     write_text_atomic(path, &text)

@@ -264,18 +264,14 @@ fn counts<const N: usize>(top: &Item, key: &str, axes: &str) -> Result<[usize; N
     let item = required(top, key)?;
     let found: [f64; N] = item.list(axes)?;
     let whole = found.iter().all(|x| x.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(x));
-    if !whole {
-        return Err(item.invalid(format!("{found:?}"), format!("at least 1, whole numbers of {axes}")));
-    }
+    item.ensure(whole, format!("{found:?}"), format!("at least 1, whole numbers of {axes}"))?;
     Ok(found.map(|x| x as usize))
 }
 
 fn lengths<const N: usize>(top: &Item, key: &str, what: &str, axes: &str) -> Result<[f64; N]> {
     let item = required(top, key)?;
     let found: [f64; N] = item.list(&format!("{what} along {axes}"))?;
-    if found.iter().any(|x| *x <= 0.0) {
-        return Err(item.invalid(format!("{found:?}"), format!("positive lengths in mm along {axes}")));
-    }
+    item.ensure(found.iter().all(|x| *x > 0.0), format!("{found:?}"), format!("positive lengths in mm along {axes}"))?;
     Ok(found)
 }
 
@@ -283,9 +279,7 @@ fn lengths<const N: usize>(top: &Item, key: &str, what: &str, axes: &str) -> Res
 fn check_count(top: &Item, key: &str, views: usize) -> Result<()> {
     let Some(item) = top.get(key)? else { return Ok(()) };
     let said = item.number()?;
-    if said > views as f64 {
-        return Err(item.invalid(said, format!("{views}, as many as there are views")));
-    }
+    item.ensure(said <= views as f64, said, format!("{views}, as many as there are views"))?;
     if said != views as f64 {
         tracing::warn!("{key} is {said}, but there are {views} views: all are read");
     }

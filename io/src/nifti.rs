@@ -44,9 +44,7 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
         ));
     }
     let header = parse(input, head)?;
-    if header.sizeof_hdr != HEADER as i32 {
-        return Err(input.invalid("sizeof_hdr", header.sizeof_hdr, HEADER.to_string()));
-    }
+    input.ensure(header.sizeof_hdr == HEADER as i32, "sizeof_hdr", header.sizeof_hdr, HEADER.to_string())?;
     let shape = voxels(input, &header)?;
     let number = number(input, &header)?;
     let offset = offset(input, &header)?;
@@ -65,10 +63,8 @@ pub(crate) fn read(path: &Path) -> Result<Volume> {
 }
 
 fn parse(input: &Input, head: &[u8]) -> Result<NiftiHeader> {
-    if head.len() < HEADER {
-        let found = format!("the end of the file after {} bytes", head.len());
-        return Err(input.invalid("header", found, format!("a NIfTI-1 header of {HEADER} bytes")));
-    }
+    let found = format!("the end of the file after {} bytes", head.len());
+    input.ensure(head.len() >= HEADER, "header", found, format!("a NIfTI-1 header of {HEADER} bytes"))?;
     NiftiHeader::from_reader(head)
         .map_err(|e| input.invalid("header", e, format!("a NIfTI-1 header of {HEADER} bytes")))
 }
@@ -90,9 +86,7 @@ pub(crate) fn shape(path: &Path) -> Result<[usize; 3]> {
 fn voxels(input: &Input, header: &NiftiHeader) -> Result<[usize; 3]> {
     let dim = header.dim.map(|d| d as i16);
     let shown = || format!("{dim:?}");
-    if !(3..=7).contains(&dim[0]) {
-        return Err(input.invalid("dim[0]", dim[0], "3 (a volume), up to 7 if the later axes are 1"));
-    }
+    input.ensure((3..=7).contains(&dim[0]), "dim[0]", dim[0], "3 (a volume), up to 7 if the later axes are 1")?;
     if dim[1..4].iter().any(|d| *d < 1) {
         return Err(input.invalid("dim", shown(), "at least one voxel along x, y and z"));
     }
@@ -128,10 +122,8 @@ fn number(input: &Input, header: &NiftiHeader) -> Result<Number> {
         }
     };
     let bits = 8 * number.bytes() as i16;
-    if header.bitpix != bits {
-        let expected = format!("{bits}, which datatype {} takes", header.datatype);
-        return Err(input.invalid("bitpix", header.bitpix, expected));
-    }
+    let expected = format!("{bits}, which datatype {} takes", header.datatype);
+    input.ensure(header.bitpix == bits, "bitpix", header.bitpix, expected)?;
     Ok(number)
 }
 
@@ -142,9 +134,9 @@ fn offset(input: &Input, header: &NiftiHeader) -> Result<u64> {
         return Ok(DATA);
     }
     // Beyond 2^24 a 32-bit float no longer counts single bytes; no extension is that long.
-    if offset.fract() != 0.0 || !(DATA as f32..16_777_216.0).contains(&offset) {
-        return Err(input.invalid("vox_offset", offset, "a whole number of bytes from 352 to 16777215"));
-    }
+    let fits = offset.fract() == 0.0 && (DATA as f32..16_777_216.0).contains(&offset);
+    let expected = "a whole number of bytes from 352 to 16777215";
+    input.ensure(fits, "vox_offset", offset, expected)?;
     Ok(offset as u64)
 }
 
@@ -159,9 +151,7 @@ fn scaling(input: &Input, header: &NiftiHeader) -> Result<(f64, f64)> {
     if slope == 0.0 {
         return Ok((1.0, 0.0));
     }
-    if !inter.is_finite() {
-        return Err(input.invalid("scl_inter", inter, "a finite number beside a slope that is one"));
-    }
+    input.ensure(inter.is_finite(), "scl_inter", inter, "a finite number beside a slope that is one")?;
     Ok((slope as f64, inter as f64))
 }
 
@@ -186,9 +176,8 @@ fn orientation(input: &Input, header: &NiftiHeader) -> Result<Affine> {
     };
     let [x, y, z] = rows.map(|r| r.map(|v| v * mm));
     let affine = [x, y, z, [0.0, 0.0, 0.0, 1.0]];
-    if !affine::is_regular(&affine) {
-        return Err(input.invalid(field, format!("{rows:?}"), "finite numbers and three independent voxel axes"));
-    }
+    let expected = "finite numbers and three independent voxel axes";
+    input.ensure(affine::is_regular(&affine), field, format!("{rows:?}"), expected)?;
     text::warn(&input.place(), remarks(header, &affine, mm));
     Ok(affine)
 }

@@ -123,18 +123,15 @@ pub(crate) fn shape(input: &mut Input) -> Result<Vec<usize>> {
 
 fn read_header(input: &mut Input) -> Result<Header> {
     let magic = input.exactly(8, "header")?;
-    if !magic.starts_with(MAGIC) {
-        return Err(input.invalid("magic", format!("{:02x?}", &magic[..6]), "93 4e 55 4d 50 59 (\\x93NUMPY)"));
-    }
+    let expected = "93 4e 55 4d 50 59 (\\x93NUMPY)";
+    input.ensure(magic.starts_with(MAGIC), "magic", format!("{:02x?}", &magic[..6]), expected)?;
     let length = match magic[6] {
         1 => input.exactly(2, "header")?,
         2 | 3 => input.exactly(4, "header")?,
         v => return Err(input.invalid("version", v, "1, 2 or 3")),
     };
     let length = length.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize);
-    if length > LONGEST_HEADER {
-        return Err(input.invalid("header length", length, format!("at most {LONGEST_HEADER} bytes")));
-    }
+    input.ensure(length <= LONGEST_HEADER, "header length", length, format!("at most {LONGEST_HEADER} bytes"))?;
     let raw = input.exactly(length, "header")?;
     let text = String::from_utf8_lossy(&raw);
     let bad = || {

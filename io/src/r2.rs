@@ -182,13 +182,8 @@ fn each<const N: usize>(
     one: Option<[f64; N]>,
 ) -> Result<[f64; N]> {
     let fields = |p: &str| format!("scanner.{p}{what}");
-    ensure(
-        n.iter().all(|&n| n > 0),
-        place,
-        &fields("n"),
-        format!("{n:?}"),
-        format!("at least 1 along each of {axes}"),
-    )?;
+    let expected = format!("at least 1 along each of {axes}");
+    ensure(n.iter().all(|&n| n > 0), place, &fields("n"), format!("{n:?}"), expected)?;
     let divided = whole.map(|w| std::array::from_fn(|k| w[k] / n[k] as f64));
     let (field, size): (_, [f64; N]) = match (one, divided) {
         (Some(d), Some(w)) => {
@@ -200,13 +195,9 @@ fn each<const N: usize>(
         (None, Some(w)) => (fields("s"), w),
         (None, None) => return Err(Error::invalid(place, fields("s"), "nothing", format!("lengths along {axes}"))),
     };
-    ensure(
-        size.iter().all(|s| s.is_finite() && *s > 0.0),
-        place,
-        &field,
-        format!("{:?}", one.or(whole).unwrap_or(size)),
-        format!("positive finite lengths along {axes}"),
-    )?;
+    let fits = size.iter().all(|s| s.is_finite() && *s > 0.0);
+    let expected = format!("positive finite lengths along {axes}");
+    ensure(fits, place, &field, format!("{:?}", one.or(whole).unwrap_or(size)), expected)?;
     Ok(size)
 }
 

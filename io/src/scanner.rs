@@ -439,10 +439,10 @@ fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
 fn open_beam(place: &str, d: &Description, i0: Option<I0>, floor: Option<f64>) -> Result<Option<I0>> {
     let said = d.values.i0;
     let flat = d.files.flat.is_some();
-    if d.values.flat_includes_dark.is_some() && !(flat && d.files.dark.is_some()) {
-        let found = "a value without both files.flat and files.dark";
-        return Err(Error::invalid(place, "values.flat_includes_dark", found, "both files, or no such value"));
-    }
+    let found = "a value without both files.flat and files.dark";
+    let fits = d.values.flat_includes_dark.is_none() || (flat && d.files.dark.is_some());
+    let expected = "both files, or no such value";
+    ensure(fits, place, "values.flat_includes_dark", found, expected)?;
     if d.values.kind == ValueKind::LineIntegrals {
         let field = match (flat, d.files.dark.is_some(), said.or(i0), floor.or(d.values.floor)) {
             (true, ..) => "files.flat",
@@ -454,9 +454,7 @@ fn open_beam(place: &str, d: &Description, i0: Option<I0>, floor: Option<f64>) -
         let found = "a value beside values.kind = \"line-integrals\"";
         return Err(Error::invalid(place, field, found, "nothing, or kind = \"counts\""));
     }
-    if flat && said.is_some() {
-        return Err(Error::invalid(place, "values.i0", "i0 beside files.flat", "one of them"));
-    }
+    ensure(!(flat && said.is_some()), place, "values.i0", "i0 beside files.flat", "one of them")?;
     if flat && i0.is_some() {
         tracing::info!("{place}: --i0 replaces files.flat, which is not read");
     }

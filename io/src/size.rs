@@ -81,13 +81,8 @@ pub(crate) fn product(shape: impl AsRef<[usize]>) -> u64 {
 const MOST: u64 = 1 << 48;
 
 fn must_exist(path: &Path, field: &str, n: u64) -> Result<()> {
-    ensure(
-        n <= MOST,
-        &path.display().to_string(),
-        field,
-        n,
-        format!("at most {MOST}, past which no machine holds them"),
-    )
+    let expected = format!("at most {MOST}, past which no machine holds them");
+    ensure(n <= MOST, &path.display().to_string(), field, n, expected)
 }
 
 pub(crate) fn file_bytes(path: &Path) -> Result<u64> {

@@ -94,11 +94,9 @@ fn arrayed(place: &str, (shape, values): (Vec<usize>, Vec<f64>), width: usize) -
         [_, w] => w == width,
         _ => false,
     };
-    if !fits {
-        let alone = if width == 1 { "[views] or " } else { "" };
-        let expected = format!("{alone}[views, {width}]");
-        return Err(Error::invalid(place, "shape", format!("{shape:?}"), expected));
-    }
+    let alone = if width == 1 { "[views] or " } else { "" };
+    let expected = format!("{alone}[views, {width}]");
+    ensure(fits, place, "shape", format!("{shape:?}"), expected)?;
     Ok(values.chunks(width).map(<[f64]>::to_vec).collect())
 }
 

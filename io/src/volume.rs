@@ -5,6 +5,7 @@ use crate::input::Input;
 use crate::size::product;
 use crate::{dicom, foreign, metaimage, nifti, npy, nrrd, pickle, scan, tiff, write_atomic, zarr};
 use conefield_core::allowance;
+use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Volume};
@@ -165,10 +166,9 @@ pub fn write_voxels_of(
 ) -> Result<()> {
     let path = path.as_ref();
     let format = wanted(path)?;
-    if template.is_some() && !matches!(format.write, Writer::Dicom(_)) {
-        let expected = "an end of .dicom or .dcm: other formats have no patient and study for the template";
-        return Err(Error::invalid(path.display().to_string(), "file name", file_name(path), expected));
-    }
+    let expected = "an end of .dicom or .dcm: other formats have no patient and study for the template";
+    let (fits, expected) = (template.is_none() || matches!(format.write, Writer::Dicom(_)), expected);
+    ensure(fits, &path.display().to_string(), "file name", file_name(path), expected)?;
     voxels.grid().validate(&path.display().to_string())?;
     let layers = &mut Layers::new(voxels, allowance::room());
     match format.write {

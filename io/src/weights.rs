@@ -6,6 +6,7 @@
 use crate::input::read_bytes;
 use crate::{number, write_atomic};
 use conefield_core::arena::Weights;
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result, allowance, files};
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Map, Value, json};
@@ -63,16 +64,12 @@ pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
     let path = path.as_ref();
     let place = path.display().to_string();
     let (mut file, size) = files::open(path)?;
-    if size < 8 {
-        return Err(Error::invalid(place, "header length", format!("{size} bytes"), "a safetensors file"));
-    }
+    ensure(size >= 8, &place, "header length", format!("{size} bytes"), "a safetensors file")?;
     let mut length = [0u8; 8];
     file.read_exact(&mut length).map_err(|e| Error::io(path, e))?;
     let header = u64::from_le_bytes(length);
-    if header > (size - 8).min(LONGEST_HEADER) {
-        let expected = format!("at most {} in a file of {size} bytes", (size - 8).min(LONGEST_HEADER));
-        return Err(Error::invalid(place, "header length", header, expected));
-    }
+    let expected = format!("at most {} in a file of {size} bytes", (size - 8).min(LONGEST_HEADER));
+    ensure(header <= (size - 8).min(LONGEST_HEADER), &place, "header length", header, expected)?;
     // The values are briefly in memory twice, as file and as tensors; a parsed header is larger than its text.
     let words = header.saturating_mul(HEADER_WORDS);
     allowance::memory(&place, "file size", size.saturating_mul(2).saturating_add(words))?;

@@ -198,9 +198,8 @@ impl Head {
         let frames = e.within(FRAMES, None, |n| n > 0, "a number above 0")?;
         let items = self.object.get(PER_FRAME).and_then(|e| e.items()).map_or(0, <[_]>::len);
         let name: Attribute = (PER_FRAME, "PerFrameFunctionalGroupsSequence");
-        if frames as usize != items {
-            return Err(e.invalid(name, format!("{items} items"), &format!("{frames}, as NumberOfFrames says")));
-        }
+        let expected = format!("{frames}, as NumberOfFrames says");
+        e.ensure(frames as usize == items, name, format!("{items} items"), &expected)?;
         Ok(items)
     }
 

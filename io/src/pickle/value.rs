@@ -201,6 +201,11 @@ impl<'p, 'a> Item<'p, 'a> {
         Error::invalid(&self.pickle.place, self.key(), found, expected)
     }
 
+    /// An error about this value unless `ok`.
+    pub fn ensure(&self, ok: bool, found: impl ToString, expected: impl Into<String>) -> Result<()> {
+        if ok { Ok(()) } else { Err(self.invalid(found, expected)) }
+    }
+
     /// An error about the value at `key`, here or below.
     pub fn invalid_at(&self, key: String, found: impl ToString, expected: impl Into<String>) -> Error {
         Error::invalid(&self.pickle.place, key, found, expected)

@@ -62,10 +62,8 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
     }
     let [rows, columns] = [keys.whole(ROWS, MOST_PIXELS)?, keys.whole(COLUMNS, MOST_PIXELS)?];
     let [dso, dsd] = [keys.length(OBJECT)?, keys.length(CAMERA)?];
-    if dsd <= dso {
-        let expected = format!("more than the {dso} of {OBJECT}");
-        return Err(keys.invalid(CAMERA, dsd, expected));
-    }
+    let expected = format!("more than the {dso} of {OBJECT}");
+    keys.ensure(dsd > dso, CAMERA, dsd, expected)?;
     // In micrometres, at the axis.
     let at_axis = keys.length(PIXEL)? / 1000.0;
     let pixel = at_axis * dsd / dso;

@@ -4,6 +4,7 @@
 //! the page, uncompressed.
 
 use super::{Page, Pages, Source, append, broken, pieces, tags};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result, allowance};
 use ruzstd::decoding::FrameDecoder;
 use std::io::{Cursor, Read, SeekFrom};
@@ -35,10 +36,9 @@ pub(super) fn read(place: &str, decoder: &mut Pages, page: &Page, out: &mut Vec<
     let all = offsets.len() as u64 * bytes as u64;
     let all = all.saturating_mul(u64::from(width)).saturating_mul(u64::from(height));
     // Tiles no larger than the page cover at most four times its pixels.
-    if tiled && all > page.bytes.saturating_mul(4).max(TILES) {
-        let found = format!("{} strips or tiles of {height} x {width} pixels", offsets.len());
-        return Err(Error::invalid(place, "StripOffsets", found, "those that make up the page"));
-    }
+    let found = format!("{} strips or tiles of {height} x {width} pixels", offsets.len());
+    let expected = "those that make up the page";
+    ensure(!tiled || all <= page.bytes.saturating_mul(4).max(TILES), place, "StripOffsets", found, expected)?;
     // The file in memory, with header and directory, and the page that is read from it.
     let held = (if tiled { all } else { page.bytes }).saturating_add(4096 + 16 * offsets.len() as u64);
     allowance::memory(place, "page", held.saturating_add(page.bytes))?;

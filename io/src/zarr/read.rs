@@ -7,6 +7,7 @@ use crate::input::{Input, must_unpack};
 use crate::npy;
 use crate::number::{ByteOrder, Number};
 use crate::text::{self, shortened};
+use conefield_core::error::ensure;
 use conefield_core::finite::stray;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
@@ -70,10 +71,8 @@ impl Multiscale {
     /// Millimetres per unit of length.
     fn unit(&self, place: &str) -> Result<f64> {
         let names: Vec<&str> = self.axes.iter().map(|a| a.name.as_str()).collect();
-        if names != ["z", "y", "x"] {
-            let expected = "[\"z\", \"y\", \"x\"]: one volume, one number per voxel";
-            return Err(Error::invalid(place, "multiscales[0].axes", format!("{names:?}"), expected));
-        }
+        let expected = "[\"z\", \"y\", \"x\"]: one volume, one number per voxel";
+        ensure(names == ["z", "y", "x"], place, "multiscales[0].axes", format!("{names:?}"), expected)?;
         let unit = self.axes[0].unit.as_deref();
         let known = match unit {
             None | Some("millimeter") => Some(1.0),
@@ -144,10 +143,8 @@ impl Stored {
             return Err(invalid("zarr_format", array.zarr_format.to_string(), "2"));
         }
         let names = [array.shape, array.chunks].concat();
-        if names.contains(&0) {
-            let found = format!("{:?} in chunks of {:?}", array.shape, array.chunks);
-            return Err(invalid("shape", found, "at least one voxel along each axis"));
-        }
+        let found = format!("{:?} in chunks of {:?}", array.shape, array.chunks);
+        ensure(!names.contains(&0), &place, "shape", found, "at least one voxel along each axis")?;
         // Unlike NumPy, Zarr always states the byte order.
         let element = npy::element(&array.dtype).filter(|_| array.dtype.starts_with(['<', '>', '|']));
         let (number, order) = element.ok_or_else(|| {
