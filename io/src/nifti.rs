@@ -267,10 +267,8 @@ pub(crate) fn write_packed(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxe
 }
 
 #[cfg(test)]
-mod tests {
-    use crate::number::Number;
+pub(crate) mod tests {
     use crate::testing::{data, file, gzip, says};
-    use crate::volume::tests::two_of_each;
     use crate::{read_volume, write_volume};
     use conefield_core::scan::Volume;
     use ndarray::Array3;
@@ -301,30 +299,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_comes_back() {
-        let dir = tempfile::tempdir().unwrap();
+    fn an_affine_of_other_voxels_is_replaced() {
+        let copy = file("a.nii", &[]);
         let mut v = volume();
-        for name in ["a.nii", "a.nii.gz", "B.NII.GZ"] {
-            let path = dir.path().join(name);
-            write_volume(&path, &v).unwrap();
-            let back = read_volume(&path).unwrap();
-            assert_eq!(back.data, v.data);
-            assert!(back.data.is_standard_layout());
-            assert_eq!(back.grid, v.grid);
-            // The centre of 4×3×2 voxels of 0.5×0.75×2 mm is 1.5, 1 and 0.5 voxels from the first one.
-            let a = back.affine.unwrap();
-            assert_eq!([a[0][3], a[1][3], a[2][3]], [-0.75, -0.75, -1.0]);
-        }
-        let turned = [[0.0, 0.75, 0.0, 5.0], [-0.5, 0.0, 0.0, 6.0], [0.0, 0.0, 2.0, -7.0], [0.0, 0.0, 0.0, 1.0]];
-        v.affine = Some(turned);
-        let path = dir.path().join("turned.nii.gz");
-        write_volume(&path, &v).unwrap();
-        let back = read_volume(&path).unwrap();
-        assert_eq!((back.affine, back.grid), (Some(turned), v.grid));
-        // An affine of other voxels would make the file contradict itself.
-        v.affine.as_mut().unwrap()[1][0] = -0.9;
-        write_volume(&path, &v).unwrap();
-        assert_eq!(read_volume(&path).unwrap().grid, v.grid);
+        v.affine = Some([[0.0, 0.75, 0.0, 5.0], [-0.9, 0.0, 0.0, 6.0], [0.0, 0.0, 2.0, -7.0], [0.0, 0.0, 0.0, 1.0]]);
+        // It would make the file contradict itself.
+        write_volume(&copy.1, &v).unwrap();
+        assert_eq!(read_volume(&copy.1).unwrap().grid, v.grid);
     }
 
     #[test]
@@ -351,7 +332,7 @@ mod tests {
     }
 
     /// The header of 2×1×1 voxels without an orientation: type and bits of a number, `pixdim`, slope and intercept.
-    fn header(big_endian: bool, [code, bits]: [i16; 2], pixdim: [f32; 4], scaling: [f32; 2]) -> Vec<u8> {
+    pub(crate) fn header(big_endian: bool, [code, bits]: [i16; 2], pixdim: [f32; 4], scaling: [f32; 2]) -> Vec<u8> {
         let mut b = vec![0u8; 352];
         let mut put = |at: usize, little: &[u8]| {
             let field = &mut b[at..at + little.len()];
@@ -397,30 +378,6 @@ mod tests {
         let want = [[0.0, -3.0, 0.0, 10.0], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, -4.0, 0.0]];
         for (a, w) in a.iter().flatten().zip(want.iter().flatten()) {
             assert!((a - w).abs() < 1e-6, "{a} {w}");
-        }
-    }
-
-    #[test]
-    fn every_type_is_read_in_both_orders() {
-        let codes = [
-            (Number::U8, 2i16),
-            (Number::I16, 4),
-            (Number::I32, 8),
-            (Number::F32, 16),
-            (Number::F64, 64),
-            (Number::I8, 256),
-            (Number::U16, 512),
-            (Number::U32, 768),
-            (Number::I64, 1024),
-            (Number::U64, 1280),
-        ];
-        for (number, values, bytes) in two_of_each() {
-            let code = codes.iter().find(|(n, _)| *n == number).unwrap().1;
-            for (big, bytes) in [false, true].into_iter().zip(bytes) {
-                let b = header(big, [code, 8 * number.bytes() as i16], [1.0; 4], [0.5, -8.0]);
-                let found = read_volume(&file("a.nii", &[&b, &bytes]).1).unwrap().data;
-                assert_eq!(found.as_slice().unwrap(), values.map(|x| (0.5 * x - 8.0) as f32), "{number:?}, big {big}");
-            }
         }
     }
 

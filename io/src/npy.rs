@@ -195,7 +195,6 @@ pub(crate) fn element(descr: &str) -> Option<(Number, ByteOrder)> {
 mod tests {
     use super::*;
     use crate::testing::{file, npy_bytes, says};
-    use crate::volume::tests::two_of_each;
     use ndarray::{Array3, array};
     use ndarray_npy::WriteNpyExt;
 
@@ -238,16 +237,6 @@ mod tests {
             read_bytes(&npy_bytes("|b1", false, "(3,)", &[0, 1, 1]), &["i"]).unwrap(),
             array![0.0f32, 1.0, 1.0].into_dyn()
         );
-        for (number, values, bytes) in two_of_each() {
-            for (order, bytes) in ['<', '>'].into_iter().zip(bytes) {
-                let kind =
-                    ['u', 'i', 'f'].into_iter().find(|k| Number::of(*k, number.bytes()) == Some(number)).unwrap();
-                let raw = npy_bytes(&format!("{order}{kind}{}", number.bytes()), false, "(2,)", &bytes);
-                assert_eq!(read_bytes(&raw, &["i"]).unwrap().as_slice().unwrap(), values.map(|x| x as f32));
-                let exact = read_exact(&mut Input::open(&file("a.npy", &[&raw]).1).unwrap()).unwrap();
-                assert_eq!(exact, (vec![2], values.to_vec()), "{number}");
-            }
-        }
     }
 
     #[test]

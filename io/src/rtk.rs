@@ -142,8 +142,7 @@ impl Projection {
 ///
 /// As in RTK, a number that a projection omits is inherited from the projection before. Refuses a matrix that
 /// contradicts the numbers, a cylindrical detector and a parallel beam.
-pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 2]) -> Result<Vec<View>> {
-    let path = path.as_ref();
+pub fn read_rtk_geometry(path: &Path, pixel: [f64; 2], offset: [f64; 2]) -> Result<Vec<View>> {
     let place = path.display().to_string();
     let text = read_foreign(path, LONGEST)?;
     let document = text::xml(&place, &text, "RTK's geometry")?;

@@ -469,7 +469,7 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
         (_, None, None, Some(r), None) => {
             lengths(place, "rtk", r.pixel, r.offset)?;
             let file = folder::inside(folder, place, "rtk.file", &r.file)?;
-            ("rtk.file", read_rtk_geometry(file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?)
+            ("rtk.file", read_rtk_geometry(&file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?)
         }
         (_, None, None, None, Some(c)) => {
             ("cil.file", cil::views(&folder::inside(folder, place, "cil.file", &c.file)?)?)

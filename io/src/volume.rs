@@ -166,8 +166,8 @@ pub fn write_voxels_of(
 ) -> Result<()> {
     let path = path.as_ref();
     let format = wanted(path)?;
+    let fits = template.is_none() || matches!(format.write, Writer::Dicom(_));
     let expected = "an end of .dicom or .dcm: other formats have no patient and study for the template";
-    let (fits, expected) = (template.is_none() || matches!(format.write, Writer::Dicom(_)), expected);
     ensure(fits, &path.display().to_string(), "file name", file_name(path), expected)?;
     voxels.grid().validate(&path.display().to_string())?;
     let layers = &mut Layers::new(voxels, allowance::room());
@@ -324,8 +324,9 @@ fn format_of(path: &Path) -> Option<&'static VolumeFormat> {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::nifti::tests::header;
     use crate::number::Number;
-    use crate::testing::{comes_back_to_the_bit, says};
+    use crate::testing::{comes_back_to_the_bit, file, npy_bytes, says, zlib};
     use conefield_core::parts::Part;
 
     /// Two numbers of each type, with their bytes in both orders, little-endian first.
@@ -357,9 +358,62 @@ pub(crate) mod tests {
     fn what_is_written_comes_back_to_the_bit() {
         let data = |shape| Array3::from_shape_fn(shape, |(x, y, z)| (x + 10 * y + 100 * z) as f32 / 7.0);
         // For Zarr, more than one chunk along x and z.
-        comes_back_to_the_bit("a.zarr", data((70, 5, 66)));
+        let spacing = [1.0 / 3.0, 0.7, 2.0];
+        comes_back_to_the_bit("a.zarr", data((70, 5, 66)), spacing);
         for name in ["a.mha", "a.mhd", "a.nrrd", "a.tif"] {
-            comes_back_to_the_bit(name, data((4, 3, 2)));
+            comes_back_to_the_bit(name, data((4, 3, 2)), spacing);
+        }
+        // NIfTI has 32-bit numbers.
+        for name in ["a.nii", "a.nii.gz", "B.NII.GZ"] {
+            comes_back_to_the_bit(name, data((4, 3, 2)), [0.5, 0.75, 2.0]);
+        }
+    }
+
+    #[test]
+    fn every_type_is_read_in_both_orders() {
+        let all = two_of_each();
+        // NIfTI's code, and the names of MetaImage, NRRD and NumPy.
+        for (number, code, met, nrrd, kind) in [
+            (Number::I8, 256, "CHAR", "int8", "i1"),
+            (Number::U8, 2, "UCHAR", "unsigned char", "u1"),
+            (Number::I16, 4, "SHORT", "short int", "i2"),
+            (Number::U16, 512, "USHORT", "uint16_t", "u2"),
+            (Number::I32, 8, "INT", "int", "i4"),
+            (Number::U32, 768, "UINT", "unsigned int", "u4"),
+            (Number::I32, 8, "LONG", "signed int", "i4"),
+            (Number::U32, 768, "ULONG", "uint32", "u4"),
+            (Number::I64, 1024, "LONG_LONG", "long long int", "i8"),
+            (Number::U64, 1280, "ULONG_LONG", "ulonglong", "u8"),
+            (Number::F32, 16, "FLOAT", "float", "f4"),
+            (Number::F64, 64, "DOUBLE", "double", "f8"),
+        ] {
+            let (_, values, bytes) = all.iter().find(|(n, ..)| *n == number).unwrap();
+            for (big, bytes) in [false, true].into_iter().zip(bytes) {
+                let [order, msb, sign] = if big { ["big", "True", ">"] } else { ["little", "False", "<"] };
+                let met =
+                    format!("NDims = 3\nBinaryDataByteOrderMSB = {msb}\nDimSize = 1 2 1\nElementType = MET_{met}\n");
+                let packed = format!("{met}CompressedData = True\nElementDataFile = LOCAL\n");
+                let nrrd = format!("type: {nrrd}\ndimension: 3\nsizes: 1 2 1\nencoding: raw\nendian: {order}\n\n");
+                for (head, data, [slope, intercept]) in [
+                    (header(big, [code, 8 * number.bytes() as i16], [1.0; 4], [0.5, -8.0]), bytes, [0.5, -8.0]),
+                    (format!("{met}ElementDataFile = LOCAL\n").into_bytes(), bytes, [1.0, 0.0]),
+                    (packed.into_bytes(), &zlib(bytes), [1.0, 0.0]),
+                    (format!("NRRD0004\n{nrrd}").into_bytes(), bytes, [1.0, 0.0]),
+                    (npy_bytes(&format!("{sign}{kind}"), false, "(1, 2, 1)", &[]), bytes, [1.0, 0.0]),
+                ] {
+                    let found = read_volume(&file("a", &[&head, data]).1).unwrap().data;
+                    let want = values.map(|x| (slope * x + intercept) as f32);
+                    assert_eq!(
+                        found.as_slice().unwrap(),
+                        want,
+                        "{number}, {order}: {}",
+                        String::from_utf8_lossy(&head)
+                    );
+                }
+                let list = npy_bytes(&format!("{sign}{kind}"), false, "(2,)", bytes);
+                let exact = npy::read_exact(&mut Input::open(&file("a.npy", &[&list]).1).unwrap()).unwrap();
+                assert_eq!(exact, (vec![2], values.to_vec()), "{number}, {order}");
+            }
         }
     }
 

@@ -63,11 +63,6 @@ impl Keys {
         Error::invalid(&self.place, key, found, expected)
     }
 
-    /// The same unless `ok`.
-    pub fn ensure(&self, ok: bool, key: &str, found: impl ToString, expected: impl Into<String>) -> Result<()> {
-        if ok { Ok(()) } else { Err(self.invalid(key, found, expected)) }
-    }
-
     pub fn has(&self, key: &str) -> bool {
         self.all.contains_key(&key.to_lowercase())
     }
