@@ -99,9 +99,8 @@ impl Input {
 
     /// Reads up to `n` bytes, fewer only at the end of the file.
     pub fn take(&mut self, n: usize) -> Result<Vec<u8>> {
-        let mut out = Vec::with_capacity(n.min(1 << 16));
-        let got = self.reader.by_ref().take(n as u64).read_to_end(&mut out);
-        self.at += got.map_err(|e| self.broken(e))? as u64;
+        let out = read_up_to(&mut self.reader, n as u64).map_err(|e| self.broken(e))?;
+        self.at += out.len() as u64;
         Ok(out)
     }
 
@@ -219,9 +218,14 @@ impl Input {
 
 /// The first bytes of a regular file, at most `most`.
 pub(crate) fn start_of(path: &Path, most: u64) -> Result<Vec<u8>> {
-    let mut start = Vec::new();
-    files::open(path)?.0.take(most).read_to_end(&mut start).map_err(|e| Error::io(path, e))?;
-    Ok(start)
+    read_up_to(&mut files::open(path)?.0, most).map_err(|e| Error::io(path, e))
+}
+
+/// Reads at most `most` bytes, fewer only at the end. It is compiled once for all readers.
+pub(crate) fn read_up_to(reader: &mut dyn Read, most: u64) -> std::io::Result<Vec<u8>> {
+    let mut out = Vec::with_capacity(most.min(1 << 16) as usize);
+    reader.take(most).read_to_end(&mut out)?;
+    Ok(out)
 }
 
 /// Reads a regular file completely.

@@ -255,10 +255,10 @@ fn open_data(header: &Header, path: &Path, header_file: Input) -> Result<Input> 
 pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let io = |e| Error::io(path, e);
     // The compressed size precedes the data, so the data is compressed to a buffer first: in memory while it is small.
-    let packed = tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder_of(path));
-    let mut packed = ZlibEncoder::new(packed, Compression::fast());
-    file_order::write(&mut packed, path, voxels, FileOrder::XFastest)?;
-    let mut packed = packed.finish().map_err(io)?;
+    let mut packed = tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder_of(path));
+    let mut encoder = ZlibEncoder::new(&mut packed as &mut dyn Write, Compression::fast());
+    file_order::write(&mut encoder, path, voxels, FileOrder::XFastest)?;
+    encoder.finish().map_err(io)?;
     let size = packed.stream_position().map_err(io)?;
     packed.rewind().map_err(io)?;
     let packing = format!("CompressedData = True\nCompressedDataSize = {size}");

@@ -138,10 +138,12 @@ impl Pyramid<'_> {
         if let Some(folder) = file.parent() {
             fs::create_dir_all(folder).map_err(io)?;
         }
-        let mut packed = ZlibEncoder::new(Vec::new(), Compression::fast());
-        number::write(&mut packed, whole.as_slice().unwrap_or_default()).map_err(io)?;
+        let mut packed = Vec::new();
+        let mut encoder = ZlibEncoder::new(&mut packed as &mut dyn Write, Compression::fast());
+        number::write(&mut encoder, whole.as_slice().unwrap_or_default()).map_err(io)?;
+        encoder.finish().map_err(io)?;
         let mut to = File::create(&file).map_err(io)?;
-        to.write_all(&packed.finish().map_err(io)?).and_then(|()| to.sync_all()).map_err(io)
+        to.write_all(&packed).and_then(|()| to.sync_all()).map_err(io)
     }
 }
 

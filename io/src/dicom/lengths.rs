@@ -236,7 +236,11 @@ impl ElementWalk {
                 ITEM => self.skip(tag, self.coding.word(length))?,
                 SEQUENCE_END => break,
                 _ => {
-                    return Err(self.invalid("PixelData", format!("{tag} at byte {}", self.at), "a piece of a picture"));
+                    return Err(self.invalid(
+                        "PixelData",
+                        format!("{tag} at byte {}", self.at),
+                        "a piece of a picture",
+                    ));
                 }
             }
         }

@@ -13,6 +13,7 @@ use super::Description;
 use super::turning::TurningObject;
 use super::vendor::{MOST_VIEWS, Open, field_of_view};
 use crate::hdf5::ScanPart;
+use crate::input::read_up_to;
 use crate::memory;
 use crate::number::{ByteOrder, Number};
 use crate::stack::Names;
@@ -22,7 +23,6 @@ use conefield_core::geometry::View;
 use conefield_core::{Error, Result, files};
 use ndarray::Array3;
 use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 /// The start of every OLE compound file.
@@ -65,9 +65,8 @@ impl Txrm {
         if !self.has(name) {
             return Err(self.invalid(name, "nothing", format!("{bytes} bytes")));
         }
-        let mut raw = Vec::new();
-        let read = self.file.open_stream(name).and_then(|s| s.take(bytes as u64).read_to_end(&mut raw));
-        read.map_err(|e| self.invalid(name, e, "a stream that can be read"))?;
+        let read = self.file.open_stream(name).and_then(|mut stream| read_up_to(&mut stream, bytes as u64));
+        let raw = read.map_err(|e| self.invalid(name, e, "a stream that can be read"))?;
         ensure(raw.len() == bytes, &self.place, name, format!("{} bytes", raw.len()), format!("{bytes} bytes"))?;
         Ok(raw)
     }

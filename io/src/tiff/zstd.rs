@@ -4,10 +4,11 @@
 //! the page, uncompressed.
 
 use super::{Page, Pages, Source, append, broken, pieces, tags};
+use crate::input::read_up_to;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result, allowance};
 use ruzstd::decoding::FrameDecoder;
-use std::io::{Cursor, Read, SeekFrom};
+use std::io::{Cursor, SeekFrom};
 use tiff::TiffError;
 use tiff::decoder::{ChunkType, Decoder, Limits};
 use tiff::encoder::TiffEncoder;
@@ -88,16 +89,11 @@ pub(super) fn read(place: &str, decoder: &mut Pages, page: &Page, out: &mut Vec<
 
 /// The `size` bytes at byte `at` of the file.
 fn stored(place: &str, reader: &mut dyn Source, at: u64, size: u64) -> Result<Vec<u8>> {
-    let mut packed = Vec::new();
-    let read = reader.seek(SeekFrom::Start(at)).and_then(|_| reader.take(size).read_to_end(&mut packed));
-    match read {
-        Ok(n) if n as u64 == size => Ok(packed),
-        Ok(n) => {
-            let expected = format!("{size}, as StripByteCounts says");
-            Err(Error::invalid(place, "TIFF", format!("{n} bytes at byte {at}"), expected))
-        }
-        Err(e) => Err(Error::invalid(place, "TIFF", e, "a file that can be read")),
-    }
+    let packed = reader.seek(SeekFrom::Start(at)).and_then(|_| read_up_to(reader, size));
+    let packed = packed.map_err(|e| Error::invalid(place, "TIFF", e, "a file that can be read"))?;
+    let (found, expected) = (packed.len(), format!("{size}, as StripByteCounts says"));
+    ensure(found as u64 == size, place, "TIFF", format!("{found} bytes at byte {at}"), expected)?;
+    Ok(packed)
 }
 
 /// The `want` bytes of a strip or tile.
