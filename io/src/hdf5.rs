@@ -173,9 +173,8 @@ impl Container {
     fn shape(&self, data: &Dataset) -> Result<Vec<usize>> {
         let shape: Vec<usize> = data.shape().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
         let text = || format!("{:?}", data.shape());
-        if shape.contains(&0) {
-            return Err(self.invalid(data.name(), text(), "at least one value along every axis"));
-        }
+        let expected = "at least one value along every axis";
+        ensure(!shape.contains(&0), &self.place, data.name(), text(), expected)?;
         let count = data.shape().iter().try_fold(1u64, |n, &s| n.checked_mul(s));
         let (number, _) = self.number(data)?;
         let bytes = count.and_then(|n| n.checked_mul(number.bytes() as u64));
@@ -278,11 +277,9 @@ impl Container {
                 }
             }
         }
-        if seen < wanted || out.len() < total {
-            let found = format!("{seen} chunks of values");
-            let expected = format!("{wanted}: the file was not written to its end");
-            return Err(self.invalid(data.name(), found, expected));
-        }
+        let expected = format!("{wanted}: the file was not written to its end");
+        let whole = seen >= wanted && out.len() >= total;
+        ensure(whole, &self.place, data.name(), format!("{seen} chunks of values"), expected)?;
         Ok(out)
     }
 

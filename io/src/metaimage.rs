@@ -175,15 +175,12 @@ fn place_of_voxels(header: &Header, axes: usize) -> Result<([f64; 3], Affine)> {
         ("TransformMatrix", (0..axes * axes).map(|i| f64::from(u8::from(i % (axes + 1) == 0))).collect())
     });
     let entry = |k: usize, i: usize| turn[k * axes + i];
-    if axes == 4 && (0..3).any(|k| entry(k, 3) != 0.0 || entry(3, k) != 0.0) {
-        return Err(header.invalid(name, format!("{turn:?}"), "a fourth axis apart from the others"));
-    }
+    let apart = axes == 3 || (0..3).all(|k| entry(k, 3) == 0.0 && entry(3, k) == 0.0);
+    ensure(apart, &header.place, name, format!("{turn:?}"), "a fourth axis apart from the others")?;
     // The file stores one axis after the other: its rows are the affine's columns.
     let steps: [[f64; 3]; 3] = std::array::from_fn(|k| std::array::from_fn(|i| entry(k, i) * spacing[k]));
     let lps = affine::from_columns(steps, first);
-    if !affine::is_regular(&lps) {
-        return Err(header.invalid(name, format!("{turn:?}"), "three independent voxel axes"));
-    }
+    ensure(affine::is_regular(&lps), &header.place, name, format!("{turn:?}"), "three independent voxel axes")?;
     // ITK multiplies both: an axis that is not a unit vector scales the voxels.
     let scaled = std::array::from_fn(|k| {
         let length = norm(std::array::from_fn(|i| entry(k, i)));

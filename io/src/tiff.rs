@@ -17,6 +17,7 @@ pub(crate) use write::{check_shape, write};
 use crate::input::must_unpack;
 use crate::number::{ByteOrder, Number};
 use crate::{memory, text};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result, allowance, files, parallel};
 use entries::AsStored;
 use images::{Calibration, Claim};
@@ -195,14 +196,10 @@ fn images(path: &Path, each: &mut dyn FnMut(&mut Pages, Page) -> Result<()>) -> 
             let calibration = Calibration::of(&text).filter(|_| page.sample.is_calibrated());
             (page, images::claimed(&text, page.size.map(|n| n as u64)), calibration)
         });
-        if like.size != page.size {
-            let found = format!("{} x {} pixels", page.size[0], page.size[1]);
-            return Err(Error::invalid(&place, format!("page {pages}"), found, "the size of the first page"));
-        }
-        if like.sample != page.sample {
-            let expected = format!("{}, as on the first page", like.sample);
-            return Err(Error::invalid(&place, format!("page {pages}"), page.sample, expected));
-        }
+        let (at, found) = (format!("page {pages}"), format!("{} x {} pixels", page.size[0], page.size[1]));
+        ensure(like.size == page.size, &place, &at, found, "the size of the first page")?;
+        let expected = format!("{}, as on the first page", like.sample);
+        ensure(like.sample == page.sample, &place, &at, page.sample, expected)?;
         let [offsets, sizes] = pieces(&place, &mut decoder)?;
         for (at, bytes) in offsets.into_iter().zip(sizes) {
             stored = stored.saturating_add(bytes);

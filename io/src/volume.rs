@@ -144,10 +144,9 @@ pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
 /// An affine is kept if its voxel sizes match the grid; without one, the grid's centre is placed at `grid.center`.
 pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
     let path = path.as_ref();
-    if volume.data.shape() != volume.grid.shape {
-        let (found, expected) = (format!("{:?}", volume.data.shape()), format!("{:?}", volume.grid.shape));
-        return Err(Error::invalid(path.display().to_string(), "shape of the data", found, expected));
-    }
+    let (found, expected) = (volume.data.shape(), volume.grid.shape);
+    let (place, field) = (path.display().to_string(), "shape of the data");
+    ensure(found == expected, &place, field, format!("{found:?}"), format!("{expected:?}"))?;
     write_voxels(path, &mut volume)
 }
 

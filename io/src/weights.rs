@@ -36,14 +36,12 @@ pub fn write_weights(path: &Path, tensors: &[Tensor<'_>], notes: &BTreeMap<Strin
     let mut names = BTreeSet::new();
     let mut at = 0usize;
     for (name, shape, values) in tensors {
-        if *name == METADATA || !names.insert(name) {
-            let expected = format!("a name of its own, other than {METADATA}");
-            return Err(Error::invalid(place, "tensor name", format!("\"{name}\""), expected));
-        }
-        if shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s)) != Some(values.len()) {
-            let found = format!("{} values for the shape {shape:?}", values.len());
-            return Err(Error::invalid(place, format!("tensor {name}"), found, "as many values as the shape has"));
-        }
+        let (own, expected) =
+            (*name != METADATA && names.insert(name), format!("a name of its own, other than {METADATA}"));
+        ensure(own, &place, "tensor name", format!("\"{name}\""), expected)?;
+        let fits = shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s)) == Some(values.len());
+        let found = format!("{} values for the shape {shape:?}", values.len());
+        ensure(fits, &place, &format!("tensor {name}"), found, "as many values as the shape has")?;
         let end = at + size_of_val(*values);
         header.insert((*name).into(), json!({ "dtype": "F32", "shape": shape, "data_offsets": [at, end] }));
         at = end;
@@ -80,15 +78,8 @@ pub fn read_weights(path: impl AsRef<Path>) -> Result<Weights> {
     let views = SafeTensors::deserialize(&raw).map_err(broken)?;
     let mut tensors = BTreeMap::new();
     for (name, view) in views.iter() {
-        if view.dtype() != Dtype::F32 {
-            let expected = "F32; convert the weights to 32-bit floats first";
-            return Err(Error::invalid(
-                place,
-                format!("tensor {name}: dtype"),
-                format!("{:?}", view.dtype()),
-                expected,
-            ));
-        }
+        let (found, expected) = (format!("{:?}", view.dtype()), "F32; convert the weights to 32-bit floats first");
+        ensure(view.dtype() == Dtype::F32, &place, &format!("tensor {name}: dtype"), found, expected)?;
         let (values, _) = view.data().as_chunks::<4>();
         let values = values.iter().map(|b| f32::from_le_bytes(*b)).collect();
         tensors.insert(name.to_string(), (view.shape().to_vec(), values));

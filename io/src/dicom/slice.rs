@@ -134,9 +134,8 @@ impl Elements<'_> {
         let six = self.required::<6>(ORIENTATION)?;
         let axes = [[six[0], six[1], six[2]], [six[3], six[4], six[5]]];
         // Files round the numbers: each axis is normalized again.
-        if axes.iter().any(|a| (norm(*a) - 1.0).abs() > 1e-2) || dot(axes[0], axes[1]).abs() > 1e-2 {
-            return Err(self.invalid(ORIENTATION, format!("{six:?}"), "two orthogonal unit vectors"));
-        }
+        let fits = axes.iter().all(|a| (norm(*a) - 1.0).abs() <= 1e-2) && dot(axes[0], axes[1]).abs() <= 1e-2;
+        self.ensure(fits, ORIENTATION, format!("{six:?}"), "two orthogonal unit vectors")?;
         Ok(axes.map(|a| a.map(|x| x / norm(a))))
     }
 }

@@ -62,9 +62,7 @@ impl Txrm {
 
     /// The first `bytes` bytes of a stream, which must hold as many.
     fn bytes(&mut self, name: &str, bytes: usize) -> Result<Vec<u8>> {
-        if !self.has(name) {
-            return Err(self.invalid(name, "nothing", format!("{bytes} bytes")));
-        }
+        ensure(self.has(name), &self.place, name, "nothing", format!("{bytes} bytes"))?;
         let read = self.file.open_stream(name).and_then(|mut stream| read_up_to(&mut stream, bytes as u64));
         let raw = read.map_err(|e| self.invalid(name, e, "a stream that can be read"))?;
         ensure(raw.len() == bytes, &self.place, name, format!("{} bytes", raw.len()), format!("{bytes} bytes"))?;
