@@ -42,6 +42,16 @@ pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
+/// The name of a file, for errors.
+pub(crate) fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// The extension of a file's name in small letters; empty if there is none.
+pub(crate) fn extension(path: &Path) -> String {
+    path.extension().unwrap_or_default().to_string_lossy().to_lowercase()
+}
+
 /// Splits the name of a file from that of an array, data set or column in it: `scan.npz:counts`, `scan.h5:/exchange/data`.
 /// No name of a file in a description holds a colon.
 pub(crate) fn split(name: &str) -> (&str, Option<&str>) {

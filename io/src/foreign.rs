@@ -1,6 +1,7 @@
 //! Files of scanners and programs that conefield does not read, or not alone: one message for each, which names the format
 //! and what to name or convert instead, whatever command meets the file.
 
+use crate::folder::extension;
 use crate::input::start_of;
 use conefield_core::{Error, Result};
 use std::path::Path;
@@ -40,7 +41,7 @@ const FORMATS: &[(&[u8], &str, &str, &str)] = &[
 
 /// The name of the format of `path`, which starts with `head`, and what to do.
 fn format(path: &Path, head: &[u8]) -> Option<(&'static str, &'static str)> {
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let extension = extension(path);
     let marked = FORMATS.iter().find(|(mark, ..)| !mark.is_empty() && head.starts_with(mark));
     let named = || FORMATS.iter().find(|(_, end, ..)| !end.is_empty() && *end == extension);
     marked.or_else(named).map(|(.., name, way)| (*name, *way))

@@ -5,7 +5,7 @@
 //! killed process leaves both; the next command on that folder cleans up.
 
 use crate::atomic::{exchange, sweep, sync_folder};
-use crate::folder::{entries, folder_of, is_folder};
+use crate::folder::{entries, file_name, folder_of, is_folder};
 use crate::lock::{self, Held};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
@@ -48,7 +48,7 @@ impl Contents {
     pub fn entries(&self, folder: &Path) -> Result<Vec<PathBuf>> {
         let all = entries(folder)?;
         if let Some(other) = all.iter().find(|path| !(self.known)(path)) {
-            let found = format!("a folder with {} in it", other.file_name().unwrap_or_default().to_string_lossy());
+            let found = format!("a folder with {} in it", file_name(other));
             return Err(Error::invalid(folder.display().to_string(), "output", found, "a new or empty folder"));
         }
         Ok(all)

@@ -3,7 +3,7 @@
 
 use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder, PACKED_BYTES};
-use crate::folder::folder_of;
+use crate::folder::{file_name, folder_of};
 use crate::header::{Header, finite};
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
@@ -270,7 +270,7 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
 /// is not overwritten.
 pub(crate) fn write_raw(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let raw = path.with_extension("raw");
-    let name = raw.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let name = file_name(&raw);
     let found = format!("{name} without its header");
     let expected = "a name of which nothing is there";
     ensure(!raw.exists() || path.exists(), &path.display().to_string(), "output", found, expected)?;

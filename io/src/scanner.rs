@@ -209,7 +209,7 @@ impl Description {
 
 /// Refuses a folder or a file of images in place of the text that describes them.
 fn refuse_images(path: &Path) -> Result<()> {
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let extension = folder::extension(path);
     let found = match &extension[..] {
         _ if path.is_dir() => "a folder".to_owned(),
         "tif" | "tiff" | "npy" | "npz" | "mat" | "mha" | "h5" | "hdf5" | "nxs" => {

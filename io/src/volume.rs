@@ -1,6 +1,7 @@
 //! Entry points for volumes: they recognize a file's format, and choose a format for a file name.
 
 use crate::dicom::DicomTemplate;
+use crate::folder::file_name;
 use crate::input::Input;
 use crate::size::product;
 use crate::{dicom, foreign, metaimage, nifti, npy, nrrd, pickle, scan, tiff, write_atomic, zarr};
@@ -310,10 +311,6 @@ const FORMATS: &[VolumeFormat] = &[
     format(".dicom", dicom::check_shape, Writer::Dicom(dicom::write)),
     format(".dcm", dicom::enhanced::check_one_file, Writer::Dicom(dicom::enhanced::write)),
 ];
-
-fn file_name(path: &Path) -> String {
-    path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
-}
 
 fn format_of(path: &Path) -> Option<&'static VolumeFormat> {
     let name = file_name(path).to_ascii_lowercase();

@@ -2,6 +2,7 @@
 
 use super::lengths::{self, PixelStorage};
 use super::pixels::{self, PixelFormat};
+use crate::folder::file_name;
 use conefield_core::error::ensure;
 use conefield_core::geometry::{dot, norm};
 use conefield_core::{Error, Result, allowance, files};
@@ -187,7 +188,7 @@ impl Slice {
 
     /// The file's name.
     pub fn name(&self) -> String {
-        self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
+        file_name(&self.path)
     }
 
     /// Refuses a slice of another size, pixel size or orientation than `first`.

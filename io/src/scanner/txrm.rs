@@ -12,6 +12,7 @@
 use super::Description;
 use super::turning::TurningObject;
 use super::vendor::{MOST_VIEWS, Open, field_of_view};
+use crate::folder::file_name;
 use crate::hdf5::ScanPart;
 use crate::input::read_up_to;
 use crate::memory;
@@ -199,7 +200,7 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
         ..w
     };
     let views = rest.views(angles.iter().map(|a| -a)).into_iter().zip(x.iter().zip(&y)).map(shifted).collect();
-    let own = Names::One(path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default());
+    let own = Names::One(file_name(path));
     let open = if txrm.has(FLAT) {
         Open::Flat(own.clone())
     } else {

@@ -2,6 +2,7 @@
 //! beam and a volume, as a [`Description`].
 
 use super::{Description, Files, I0, LayoutTable, ValueKind, ValuesTable, his, obi, skyscan, txrm, xim, xtekct};
+use crate::folder::extension;
 use crate::input::LONGEST_TEXT;
 use crate::rtk::Projection;
 use crate::stack::Names;
@@ -37,7 +38,7 @@ const READERS: [(&str, &str, Reader); 6] = [
 
 /// The reader of the vendor that describes a scan in the file `path`.
 pub(super) fn reader(path: &Path) -> Option<Reader> {
-    let extension = path.extension()?.to_string_lossy().to_lowercase();
+    let extension = extension(path);
     let mut readers = READERS.iter().filter(|(end, ..)| *end == extension).peekable();
     let text = match readers.peek()? {
         (_, "", _) => String::new(),
