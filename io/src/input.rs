@@ -175,13 +175,8 @@ impl Input {
             })?;
         } else {
             let left = self.size.saturating_sub(self.at);
-            if left != want {
-                return Err(self.invalid(
-                    field,
-                    format!("{left} bytes of data in the file"),
-                    format!("{want} bytes ({count} values of {} bytes, as the header says)", number.bytes()),
-                ));
-            }
+            let expected = format!("{want} bytes ({count} values of {} bytes, as the header says)", number.bytes());
+            self.ensure(left == want, field, format!("{left} bytes of data in the file"), expected)?;
         }
         let mut out: Vec<T> = Vec::new();
         // A plain file has just been measured; a compressed one must prove its claim piece by piece. Each growth draws

@@ -80,9 +80,8 @@ struct Machine<'p, 'a> {
 impl<'a> Machine<'_, 'a> {
     fn run(&mut self) -> Result<Value<'a>, Refusal> {
         let first = self.byte()?;
-        if first != op::PROTO {
-            return Err(Refusal::new(format!("0x{first:02x}"), "0x80, the start of a pickle of protocol 2 or later"));
-        }
+        let expected = "0x80, the start of a pickle of protocol 2 or later";
+        Refusal::unless(first == op::PROTO, format!("0x{first:02x}"), expected)?;
         self.protocol()?;
         loop {
             self.start = self.at;
@@ -92,13 +91,9 @@ impl<'a> Machine<'_, 'a> {
             }
         }
         let top = self.pop()?;
-        if !self.stack.is_empty() || !self.marks.is_empty() {
-            return Err(Refusal::new(format!("{} values left over", self.stack.len()), "one value at the end"));
-        }
-        if self.at != self.bytes.len() {
-            let found = format!("{} bytes after the end", self.bytes.len() - self.at);
-            return Err(Refusal::new(found, "the end of the file"));
-        }
+        let alone = self.stack.is_empty() && self.marks.is_empty();
+        Refusal::unless(alone, format!("{} values left over", self.stack.len()), "one value at the end")?;
+        Refusal::unless(self.left() == 0, format!("{} bytes after the end", self.left()), "the end of the file")?;
         Ok(top)
     }
 
@@ -365,9 +360,7 @@ impl<'a> Machine<'_, 'a> {
 
     fn set_items(&mut self, items: Vec<Value<'a>>) -> Result<(), Refusal> {
         let (pairs, rest) = items.as_chunks::<2>();
-        if !rest.is_empty() {
-            return Err(Refusal::new("a key without a value", "pairs of key and value"));
-        }
+        Refusal::unless(rest.is_empty(), "a key without a value", "pairs of key and value")?;
         let dict = self.peek()?;
         match self.node_mut(dict) {
             Some(Node::Dict(all)) if all.len() + pairs.len() > MOST_KEYS => {
@@ -424,9 +417,8 @@ impl<'a> Machine<'_, 'a> {
         };
         // Encoding one text repeatedly would create more than the file holds.
         self.encoded += text.len();
-        if self.encoded > self.bytes.len() {
-            return Err(Refusal::new("the same text encoded again and again", "every text at most once"));
-        }
+        let once = self.encoded <= self.bytes.len();
+        Refusal::unless(once, "the same text encoded again and again", "every text at most once")?;
         let bytes = text.chars().map(|c| u8::try_from(u32::from(c)).ok()).collect::<Option<Vec<u8>>>();
         let bytes = bytes.ok_or_else(|| Refusal::new("a character past U+00FF", "bytes as text"))?;
         self.make(Node::Encoded(bytes))

@@ -37,7 +37,7 @@ pub(crate) enum ScanFile {
 /// (`scanner.toml` or a vendor's file, see [`read_scanner`](crate::read_scanner)). For folders, the path may also
 /// name the description file.
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Stored> {
-    read_data_set(path, Parts { tests: false, volume: false }).map(|set| set.train)
+    read_data_set(path.as_ref(), Parts { tests: false, volume: false }).map(|set| set.train)
 }
 
 /// What to read beside the training views.

@@ -46,6 +46,11 @@ pub(super) struct Refusal {
 }
 
 impl Refusal {
+    /// A refusal unless `ok`.
+    pub fn unless(ok: bool, found: impl ToString, expected: impl ToString) -> Result<(), Self> {
+        if ok { Ok(()) } else { Err(Self::new(found, expected)) }
+    }
+
     pub fn new(found: impl ToString, expected: impl ToString) -> Self {
         Self { found: found.to_string(), expected: expected.to_string() }
     }
