@@ -18,7 +18,8 @@ const UNFINISHED: [&str; 2] = [".conefield-", ".tmp"];
 /// Temporary paths that this process is writing. Holding the lock keeps others from starting a write.
 static OPEN: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
-/// Whether `name` is a temporary name of [`write_atomic`] or [`write_folder_atomic`], left when the process was killed.
+/// Whether `name` is the temporary name of a file that [`write_atomic`] writes, or of a folder, left when the process was
+/// killed.
 pub fn is_unfinished(name: &OsStr) -> bool {
     name.to_str().is_some_and(|n| n.starts_with(UNFINISHED[0]) && n.ends_with(UNFINISHED[1]))
 }
