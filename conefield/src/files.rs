@@ -63,8 +63,8 @@ pub fn warn_of(path: &Path, survey: &Survey) {
 
 /// Writes weights with their notes.
 pub fn write_weights(path: impl AsRef<Path>, weights: &Weights) -> Result<()> {
-    let tensors: Vec<_> = weights.tensors.iter().map(|(name, (shape, values))| (name, shape, &values[..])).collect();
-    conefield_io::write_weights(path, &tensors, &weights.notes)
+    let tensors = weights.tensors.iter().map(|(name, (shape, values))| (&name[..], &shape[..], &values[..]));
+    conefield_io::write_weights(path.as_ref(), &tensors.collect::<Vec<_>>(), &weights.notes)
 }
 
 /// The note with the placement of the field.
@@ -74,11 +74,11 @@ const PLACEMENT: &str = "placement";
 pub fn write_field(path: impl AsRef<Path>, field: &TrainedField, mut notes: BTreeMap<String, String>) -> Result<()> {
     let Model { pipeline, arena, .. } = &field.model;
     let blocks = &pipeline.layout().blocks;
-    let tensors: Vec<_> = blocks.iter().map(|b| (&b.name, &b.shape, &arena.params[b.range.clone()])).collect();
+    let tensors: Vec<_> = blocks.iter().map(|b| (&b.name[..], &b.shape[..], &arena.params[b.range.clone()])).collect();
     let placement = serde_json::to_string(&field.placement())
         .map_err(|e| Error::unsupported("weights", format!("cannot be written as text: {e}")))?;
     notes.insert(PLACEMENT.into(), placement);
-    conefield_io::write_weights(path, &tensors, &notes)
+    conefield_io::write_weights(path.as_ref(), &tensors, &notes)
 }
 
 /// Reads a file written by [`write_field`].
@@ -115,7 +115,8 @@ pub fn write_checkpoint(path: &Path, checkpoint: &Checkpoint<'_>, run: &BTreeMap
         .map_err(|e| Error::unsupported("checkpoint", format!("cannot be written as text: {e}")))?;
     let mut text = run.clone();
     text.insert(STANDING.into(), standing);
-    conefield_io::write_checkpoint(path, &checkpoint.tensors, &text)
+    let tensors: Vec<_> = checkpoint.tensors.iter().map(|(name, shape, values)| (&name[..], *shape, *values)).collect();
+    conefield_io::write_checkpoint(path, &tensors, &text)
 }
 
 /// Reads the checkpoint of the run described by `run`; refuses the checkpoint of another run.

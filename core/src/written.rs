@@ -126,6 +126,7 @@ mod tests {
             ),
             ("[[parts]]\nkind = 'plain'", "a.toml:1:1: parts.0.size: found nothing, expected a value"),
             ("parts = 3", "a.toml:1:9: parts: found invalid type: integer `3`, expected a sequence"),
+            ("parts = [[[1, 2]]]", "a.toml:1:10: parts.0: found invalid type: sequence, expected struct Part"),
             ("[[parts]]\nsize = [1, 2]\nkind = 'plane'", "a.toml:3:8: parts.0.kind: found unknown variant `plane`"),
             (
                 "[[parts]]\nsize = [1, 2]\nat = 300",

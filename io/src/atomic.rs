@@ -3,6 +3,7 @@
 use crate::folder::folder_of;
 use crate::lease;
 use crate::lock::{self, Held};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
@@ -17,7 +18,8 @@ const UNFINISHED: [&str; 2] = [".conefield-", ".tmp"];
 /// Temporary paths that this process is writing. Holding the lock keeps others from starting a write.
 static OPEN: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
-/// Whether `name` is a temporary name of [`write_atomic`] or [`write_folder_atomic`], left when the process was killed.
+/// Whether `name` is the temporary name of a file that [`write_atomic`] writes, or of a folder, left when the process was
+/// killed.
 pub fn is_unfinished(name: &OsStr) -> bool {
     name.to_str().is_some_and(|n| n.starts_with(UNFINISHED[0]) && n.ends_with(UNFINISHED[1]))
 }
@@ -103,14 +105,11 @@ fn temporary(mode: u32) -> tempfile::Builder<'static, 'static> {
 /// Writes a file through `fill`: into a temporary file in the same folder, which is flushed, synced and renamed.
 ///
 /// If `fill` or the system fails, an earlier file of that name stays unchanged and the temporary file is removed.
-pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
-    let path = path.as_ref();
+pub fn write_atomic(path: &Path, fill: &mut dyn FnMut(&mut dyn Write) -> Result<()>) -> Result<()> {
     let folder = folder_of(path);
     let at = |e| Error::io(path, e);
     // A rename over a folder fails anyway, but only after all the work is done.
-    if path.is_dir() {
-        return Err(Error::invalid(path.display().to_string(), "file", "a folder", "a name for a file"));
-    }
+    ensure(!path.is_dir(), &path.display().to_string(), "file", "a folder", "a name for a file")?;
     let made = begin(folder, || temporary(0o666).tempfile_in(folder), |f| f.path());
     let (file, _lock, _noted) = made.map_err(|e| at(without_path(e)))?;
     // Writes to the file itself: errors of its guard would name the temporary path.
@@ -126,19 +125,17 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
 /// Writes `text` like [`write_atomic`].
 pub fn write_text_atomic(path: impl AsRef<Path>, text: &str) -> Result<()> {
     let path = path.as_ref();
-    write_atomic(path, |w| w.write_all(text.as_bytes()).map_err(|e| Error::io(path, e)))
+    write_atomic(path, &mut |w| w.write_all(text.as_bytes()).map_err(|e| Error::io(path, e)))
 }
 
 /// Fills a temporary folder beside `folder` and exchanges the two in one step; only then is the earlier folder removed.
 ///
 /// The caller checks whether an earlier folder may be replaced.
-pub fn write_folder_atomic(folder: impl AsRef<Path>, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    let folder = folder.as_ref();
+pub fn write_folder_atomic(folder: &Path, fill: &mut dyn FnMut(&Path) -> Result<()>) -> Result<()> {
     let beside = folder_of(folder);
     let at = |e| Error::io(folder, e);
-    if folder.file_name().is_none() {
-        return Err(Error::invalid(folder.display().to_string(), "folder", "no name of its own", "a folder to create"));
-    }
+    let expected = "a folder to create";
+    ensure(folder.file_name().is_some(), &folder.display().to_string(), "folder", "no name of its own", expected)?;
     lease::put_back_missing(folder)?;
     let made = begin(beside, || temporary(0o777).tempdir_in(beside), |d| d.path());
     let (new, _lock, _noted) = made.map_err(|e| at(without_path(e)))?;
@@ -227,7 +224,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.txt");
         write_text_atomic(&path, "first").unwrap();
-        let failed = write_atomic(&path, |w| {
+        let failed = write_atomic(&path, &mut |w| {
             w.write_all(b"half of the sec").unwrap();
             Err(Error::unsupported("test", "fails on purpose"))
         });
@@ -242,14 +239,14 @@ mod tests {
     fn a_failed_folder_leaves_the_earlier_folder_whole() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scan");
-        write_folder_atomic(&path, |d| write_text_atomic(d.join("a"), "1")).unwrap();
-        let failed = write_folder_atomic(&path, |d| {
+        write_folder_atomic(&path, &mut |d| write_text_atomic(d.join("a"), "1")).unwrap();
+        let failed = write_folder_atomic(&path, &mut |d| {
             write_text_atomic(d.join("b"), "2")?;
             Err(Error::unsupported("test", "fails on purpose"))
         });
         assert!(failed.is_err());
         assert_eq!((names(dir.path()), names(&path)), (vec!["scan".to_string()], vec!["a".to_string()]));
-        write_folder_atomic(&path, |d| write_text_atomic(d.join("b"), "2")).unwrap();
+        write_folder_atomic(&path, &mut |d| write_text_atomic(d.join("b"), "2")).unwrap();
         assert_eq!((names(dir.path()), names(&path)), (vec!["scan".to_string()], vec!["b".to_string()]));
     }
 

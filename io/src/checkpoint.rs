@@ -1,6 +1,6 @@
 //! Checkpoints: safetensors with a format version and a checksum over all text, names, shapes and values.
 
-use crate::weights::{read_weights, write_weights};
+use crate::weights::{Tensor, read_weights, write_weights};
 use conefield_core::arena::Weights;
 use conefield_core::{Error, Result};
 use flate2::Crc;
@@ -14,19 +14,15 @@ const VERSION: &str = "3";
 /// The key of the checksum.
 const SUM: &str = "crc32";
 
-/// Writes a checkpoint: named `f32` tensors (name, shape, values in C order) and free text. An earlier file of that
-/// name stays intact until the new one is on disk.
-pub fn write_checkpoint(
-    path: impl AsRef<Path>,
-    tensors: &[(impl AsRef<str>, impl AsRef<[usize]>, &[f32])],
-    text: &BTreeMap<String, String>,
-) -> Result<()> {
+/// Writes a checkpoint: `f32` tensors and free text. An earlier file of that name stays intact until the new one is on
+/// disk.
+pub fn write_checkpoint(path: &Path, tensors: &[Tensor<'_>], text: &BTreeMap<String, String>) -> Result<()> {
     let mut text = text.clone();
     text.extend([("format", FORMAT), ("format_version", VERSION)].map(|(k, v)| (k.to_owned(), v.to_owned())));
     // The file holds tensors in the order of their names.
-    let mut order: Vec<_> = tensors.iter().map(|(name, shape, v)| (name.as_ref(), shape.as_ref(), *v)).collect();
+    let mut order = tensors.to_vec();
     order.sort_unstable_by_key(|(name, ..)| *name);
-    let sum = checksum(&text, order.into_iter());
+    let sum = checksum(&text, &mut order.into_iter());
     text.insert(SUM.to_owned(), sum);
     write_weights(path, tensors, &text)
 }
@@ -46,18 +42,15 @@ pub fn read_checkpoint(path: impl AsRef<Path>) -> Result<Weights> {
     for (key, expected) in [("format", FORMAT), ("format_version", VERSION)] {
         expect(key, file.notes.get(key).cloned(), expected)?;
     }
-    let tensors = file.tensors.iter().map(|(name, (shape, values))| (&name[..], &shape[..], &values[..]));
-    expect(SUM, said, &checksum(&file.notes, tensors))?;
+    let mut tensors = file.tensors.iter().map(|(name, (shape, values))| (&name[..], &shape[..], &values[..]));
+    expect(SUM, said, &checksum(&file.notes, &mut tensors))?;
     file.notes.retain(|key, _| !["format", "format_version"].contains(&&key[..]));
     Ok(file)
 }
 
 /// Checksum over every text and tensor. Each is preceded by its length, so that nothing can move from one into the
 /// next.
-fn checksum<'a>(
-    text: &BTreeMap<String, String>,
-    tensors: impl Iterator<Item = (&'a str, &'a [usize], &'a [f32])>,
-) -> String {
+fn checksum<'a>(text: &BTreeMap<String, String>, tensors: &mut dyn Iterator<Item = Tensor<'a>>) -> String {
     let mut crc = Crc::new();
     let word = |crc: &mut Crc, bytes: &[u8]| {
         crc.update(&(bytes.len() as u64).to_le_bytes());
@@ -89,7 +82,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("checkpoint.safetensors");
         let text = BTreeMap::from([("step".to_owned(), "7".to_owned())]);
-        let tensors = [("b", [2], &[1.0f32, 2.0][..]), ("a", [3], &[0.5, -1.0, 4.0][..])];
+        let tensors = [("b", &[2][..], &[1.0f32, 2.0][..]), ("a", &[3], &[0.5, -1.0, 4.0])];
         write_checkpoint(&path, &tensors, &text).unwrap();
         let back = read_checkpoint(&path).unwrap();
         assert_eq!((back.notes, back.tensors["a"].1[2]), (text.clone(), 4.0));

@@ -19,14 +19,15 @@ mod written;
 pub use write::DicomTemplate;
 pub(crate) use write::{check_shape, write};
 
-use crate::{affine, foreign};
+use crate::input::start_of;
+use crate::{affine, folder, foreign};
+use conefield_core::error::ensure;
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm, sub};
 use conefield_core::scan::Volume;
-use conefield_core::{Error, Result, allowance, files};
+use conefield_core::{Error, Result, allowance};
 use ndarray::{Array3, s};
 use slice::Slice;
 use std::collections::BTreeMap;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Whether `head`, the start of a file, contains DICOM's magic bytes.
@@ -81,22 +82,11 @@ fn slices(folder: &Path) -> Result<Vec<Slice>> {
 
 /// The regular files of `folder`, sorted by name.
 pub(crate) fn files(folder: &Path) -> Result<Vec<PathBuf>> {
-    let io = |e| Error::io(folder, e);
-    let mut all = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        let path = entry.map_err(io)?.path();
-        if path.is_file() {
-            all.push(path);
-        }
-    }
-    all.sort();
-    Ok(all)
+    Ok(folder::entries(folder)?.into_iter().filter(|path| path.is_file()).collect())
 }
 
 fn is_dicom(path: &Path) -> Result<bool> {
-    let mut head = Vec::with_capacity(132);
-    files::open(path)?.0.take(132).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
-    Ok(is_header(&head))
+    Ok(is_header(&start_of(path, 132)?))
 }
 
 fn assemble(place: &str, mut slices: Vec<Slice>, values: &dyn Fn(&Slice) -> Result<Vec<f32>>) -> Result<Volume> {
@@ -123,9 +113,8 @@ fn assemble(place: &str, mut slices: Vec<Slice>, values: &dyn Fn(&Slice) -> Resu
     let lps = affine::from_columns(steps, first.position);
     let grid = VoxelGrid { shape: [first.format.columns, first.format.rows, slices.len()], spacing, center: [0.0; 3] };
     grid.validate(place)?;
-    if !affine::is_regular(&lps) {
-        return Err(Error::invalid(place, "ImagePositionPatient", format!("{lps:?}"), "three independent voxel axes"));
-    }
+    let expected = "three independent voxel axes";
+    ensure(affine::is_regular(&lps), place, "ImagePositionPatient", format!("{lps:?}"), expected)?;
     allowance::numbers(place, "voxels", grid.len().unwrap_or(usize::MAX))?;
     let mut data = Array3::zeros(grid.shape);
     for (z, slice) in slices.iter().enumerate() {
@@ -184,10 +173,8 @@ fn upright(place: &str, first: &Slice, last: &Slice, normal: [f64; 3]) -> Result
     let way = sub(last.position, first.position);
     let along = dot(way, normal);
     let aside = norm(sub(way, normal.map(|x| x * along)));
-    if aside > 0.5 * first.spacing[0].min(first.spacing[1]) {
-        let found = format!("a last slice {aside:.3} mm aside of the first one's normal (a tilted gantry)");
-        let expected = "slices above each other (resample the series to an upright volume first)";
-        return Err(Error::invalid(place, "ImagePositionPatient", found, expected));
-    }
+    let found = format!("a last slice {aside:.3} mm aside of the first one's normal (a tilted gantry)");
+    let expected = "slices above each other (resample the series to an upright volume first)";
+    ensure(aside <= 0.5 * first.spacing[0].min(first.spacing[1]), place, "ImagePositionPatient", found, expected)?;
     Ok(())
 }

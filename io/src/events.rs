@@ -4,6 +4,7 @@
 //! encoded as a protocol buffer, of which a few fields suffice. Source: TensorFlow's `record_writer`, `event.proto` and
 //! `summary.proto`.
 
+use crate::input::read_up_to;
 use conefield_core::{Error, Result};
 use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
@@ -97,7 +98,7 @@ impl EventFile {
 }
 
 /// The next event of a file; `None` at its end and where it is damaged.
-fn next(reader: &mut impl Read) -> Option<Vec<u8>> {
+fn next(reader: &mut dyn Read) -> Option<Vec<u8>> {
     let mut head = [0; 12];
     reader.read_exact(&mut head).ok()?;
     let (length, check) = head.split_at(8);
@@ -105,8 +106,7 @@ fn next(reader: &mut impl Read) -> Option<Vec<u8>> {
         return None;
     }
     let length = u64::from_le_bytes(length.try_into().ok()?);
-    let mut event = vec![];
-    reader.take(length.min(LONGEST)).read_to_end(&mut event).ok()?;
+    let event = read_up_to(reader, length.min(LONGEST)).ok()?;
     let mut check = [0; 4];
     reader.read_exact(&mut check).ok()?;
     (event.len() as u64 == length && check == masked(crc32c(&event)).to_le_bytes()).then_some(event)

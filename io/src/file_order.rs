@@ -27,10 +27,7 @@ pub(crate) fn read(place: &str, grid: VoxelGrid, affine: Option<Affine>, values:
     let data = Array3::from_shape_vec((nx, ny, nz).f(), values)
         .map_err(|e| Error::invalid(place, "data", e, "as many values as voxels"))?;
     let data = memory::in_order(place, "data", data)?;
-    if let Some((at, x)) = stray(&data) {
-        let voxel = format!("voxel [{}, {}, {}]", at.0, at.1, at.2);
-        return Err(Error::invalid(place, voxel, x, "a finite number"));
-    }
+    let data = memory::all_finite(place, data, &|(x, y, z)| format!("voxel [{x}, {y}, {z}]"))?;
     Ok(Volume { data, grid, affine })
 }
 

@@ -1,26 +1,24 @@
 //! Names of files in a folder: those in a scan's description stay inside it, those of a series come in order.
 
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use std::collections::{BTreeMap, HashSet};
-use std::fs::DirEntry;
+use std::io::ErrorKind;
 use std::path::{Component, Path, PathBuf};
 
 /// The file `name` in `folder`; refuses anything but a plain file name.
 pub(crate) fn plain(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
     let mut parts = Path::new(name).components();
     let one = matches!((parts.next(), parts.next()), (Some(Component::Normal(p)), None) if p == name);
-    if !one || name.contains(['/', '\\', ':', '\0']) {
-        return Err(Error::invalid(place, field, format!("\"{name}\""), "a plain file name inside the folder"));
-    }
+    let expected = "a plain file name inside the folder";
+    ensure(one && !name.contains(['/', '\\', ':', '\0']), place, field, format!("\"{name}\""), expected)?;
     inside(folder, place, field, name)
 }
 
 /// The file at the relative path `name` in `folder`; refuses a path that leads outside, also through a link.
 pub(crate) fn inside(folder: &Path, place: &str, field: &str, name: &str) -> Result<PathBuf> {
     let path = within(folder, place, field, name)?;
-    if !path.is_file() {
-        return Err(Error::invalid(place, field, format!("\"{name}\""), "a file"));
-    }
+    ensure(path.is_file(), place, field, format!("\"{name}\""), "a file")?;
     Ok(path)
 }
 
@@ -29,22 +27,29 @@ pub(crate) fn within(folder: &Path, place: &str, field: &str, name: &str) -> Res
     let shown = || format!("\"{name}\"");
     let slashed = name.replace('\\', "/");
     let down = Path::new(&slashed).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
-    if name.is_empty() || !down || name.contains([':', '\0']) {
-        return Err(Error::invalid(place, field, shown(), "a relative path inside the folder, without \"..\""));
-    }
+    let expected = "a relative path inside the folder, without \"..\"";
+    ensure(!name.is_empty() && down && !name.contains([':', '\0']), place, field, shown(), expected)?;
     let path = folder.join(slashed);
     let real = path.canonicalize().map_err(|e| Error::invalid(place, field, format!("{} ({e})", shown()), "a file"))?;
     let root = folder.canonicalize().map_err(|e| Error::io(folder, e))?;
-    if !real.starts_with(&root) {
-        let found = format!("{}, a link out of the folder", shown());
-        return Err(Error::invalid(place, field, found, "a file inside the folder"));
-    }
+    let found = format!("{}, a link out of the folder", shown());
+    ensure(real.starts_with(&root), place, field, found, "a file inside the folder")?;
     Ok(path)
 }
 
 /// The folder that holds `path`.
 pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+/// The name of a file, for errors.
+pub(crate) fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// The extension of a file's name in small letters; empty if there is none.
+pub(crate) fn extension(path: &Path) -> String {
+    path.extension().unwrap_or_default().to_string_lossy().to_lowercase()
 }
 
 /// Splits the name of a file from that of an array, data set or column in it: `scan.npz:counts`, `scan.h5:/exchange/data`.
@@ -74,7 +79,7 @@ impl NamedFiles {
 }
 
 /// Refuses to replace a folder that holds anything but the files that the format itself writes, as `known` decides.
-pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> bool, mark: &[&str]) -> Result<()> {
+pub(crate) fn may_replace(folder: &Path, format: &str, known: &dyn Fn(&str) -> bool, mark: &[&str]) -> Result<()> {
     let place = folder.display().to_string();
     // What a killed program kept aside is looked at, too.
     crate::lease::put_back_missing(folder)?;
@@ -84,9 +89,8 @@ pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> b
     if !folder.is_dir() {
         return Err(Error::invalid(place, "folder", "a file", "a new name, an empty folder or an earlier scan"));
     }
-    let mut names: Vec<String> =
-        entries(folder)?.iter().map(|e| e.file_name().to_string_lossy().into_owned()).collect();
-    names.sort();
+    let all = entries(folder)?;
+    let names: Vec<_> = all.iter().filter_map(|path| path.file_name()).map(|n| n.to_string_lossy()).collect();
     if names.is_empty() {
         return Ok(());
     }
@@ -101,7 +105,7 @@ pub(crate) fn may_replace(folder: &Path, format: &str, known: impl Fn(&str) -> b
 /// The names in `folder` that end in one of `ends` (small letters, no dot), in the order of the numbers in them; hidden
 /// files are left out.
 pub(crate) fn names(folder: &Path, ends: &[&str]) -> Result<Vec<String>> {
-    let mut found: Vec<String> = entries(folder)?.iter().filter_map(|e| e.file_name().into_string().ok()).collect();
+    let mut found: Vec<String> = entries(folder)?.iter().filter_map(|path| name_of(path)).collect();
     found.retain(|n| {
         let end = n.rsplit_once('.').map(|(_, e)| e.to_ascii_lowercase()).unwrap_or_default();
         !n.starts_with('.') && ends.contains(&end.as_str())
@@ -117,17 +121,34 @@ pub(crate) fn below(folder: &Path, depth: usize, ends: &[&str]) -> Result<Vec<St
     if depth == 0 {
         return Ok(found);
     }
-    for entry in entries(folder)?.iter().filter(|e| e.file_type().is_ok_and(|t| t.is_dir())) {
-        if let Ok(name) = entry.file_name().into_string() {
-            found.extend(below(&entry.path(), depth - 1, ends)?.into_iter().map(|n| format!("{name}/{n}")));
+    for path in entries(folder)?.iter().filter(|path| is_folder(path)) {
+        if let Some(name) = name_of(path) {
+            found.extend(below(path, depth - 1, ends)?.into_iter().map(|n| format!("{name}/{n}")));
         }
     }
     found.sort_by_cached_key(|n| natural(n));
     Ok(found)
 }
 
-fn entries(folder: &Path) -> Result<Vec<DirEntry>> {
-    std::fs::read_dir(folder).and_then(Iterator::collect).map_err(|e| Error::io(folder, e))
+/// The paths in `folder`, sorted; none if there is no folder.
+pub(crate) fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
+    let found = match std::fs::read_dir(folder) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
+        found => found.and_then(|all| all.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()),
+    };
+    let mut all = found.map_err(|e| Error::io(folder, e))?;
+    all.sort_unstable_by(|a, b| a.as_os_str().cmp(b.as_os_str()));
+    Ok(all)
+}
+
+/// Whether `path` is a folder, and no link to one.
+pub(crate) fn is_folder(path: &Path) -> bool {
+    path.symlink_metadata().is_ok_and(|info| info.is_dir())
+}
+
+/// The name of the file at `path`, if it is UTF-8.
+fn name_of(path: &Path) -> Option<String> {
+    path.file_name()?.to_str().map(str::to_owned)
 }
 
 /// Those of `names` that are `start`, in small or capital letters, a number and an extension, by their numbers.

@@ -1,8 +1,9 @@
 //! Files of scanners and programs that conefield does not read, or not alone: one message for each, which names the format
 //! and what to name or convert instead, whatever command meets the file.
 
-use conefield_core::{Error, Result, files};
-use std::io::Read;
+use crate::folder::extension;
+use crate::input::start_of;
+use conefield_core::{Error, Result};
 use std::path::Path;
 
 /// Bytes that suffice to recognize a file.
@@ -40,7 +41,7 @@ const FORMATS: &[(&[u8], &str, &str, &str)] = &[
 
 /// The name of the format of `path`, which starts with `head`, and what to do.
 fn format(path: &Path, head: &[u8]) -> Option<(&'static str, &'static str)> {
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let extension = extension(path);
     let marked = FORMATS.iter().find(|(mark, ..)| !mark.is_empty() && head.starts_with(mark));
     let named = || FORMATS.iter().find(|(_, end, ..)| !end.is_empty() && *end == extension);
     marked.or_else(named).map(|(.., name, way)| (*name, *way))
@@ -57,9 +58,7 @@ pub(crate) fn refuse(path: &Path, head: &[u8]) -> Result<()> {
 
 /// Like [`refuse`], for a file of which nothing has been read.
 pub(crate) fn refuse_file(path: &Path) -> Result<()> {
-    let mut head = Vec::new();
-    files::open(path)?.0.take(HEAD).read_to_end(&mut head).map_err(|e| Error::io(path, e))?;
-    refuse(path, &head)
+    refuse(path, &start_of(path, HEAD)?)
 }
 
 /// Refuses a folder in which no reader has found its files, and one of these formats is among the first files.

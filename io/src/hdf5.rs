@@ -14,7 +14,6 @@ use crate::input::must_unpack;
 use crate::memory;
 use crate::number::{ByteOrder, Number};
 use conefield_core::error::ensure;
-use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance, files};
 use hdf5_reader::datatype_api::H5Type;
 use hdf5_reader::{Dataset, Datatype, FileStorage, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
@@ -174,9 +173,8 @@ impl Container {
     fn shape(&self, data: &Dataset) -> Result<Vec<usize>> {
         let shape: Vec<usize> = data.shape().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
         let text = || format!("{:?}", data.shape());
-        if shape.contains(&0) {
-            return Err(self.invalid(data.name(), text(), "at least one value along every axis"));
-        }
+        let expected = "at least one value along every axis";
+        ensure(!shape.contains(&0), &self.place, data.name(), text(), expected)?;
         let count = data.shape().iter().try_fold(1u64, |n, &s| n.checked_mul(s));
         let (number, _) = self.number(data)?;
         let bytes = count.and_then(|n| n.checked_mul(number.bytes() as u64));
@@ -223,10 +221,7 @@ impl Container {
         shape[0] = count;
         let array = ArrayD::from_shape_vec(IxDyn(&shape), values)
             .map_err(|e| self.invalid(data.name(), e, "values of its shape"))?;
-        match stray(&array) {
-            Some((at, x)) => Err(self.invalid(&format!("{}{:?}", data.name(), at.slice()), x, "a finite number")),
-            None => Ok(array),
-        }
+        memory::all_finite(&self.place, array, &|at| format!("{}{:?}", data.name(), at.slice()))
     }
 
     /// Reads frames of `rows` and `columns` chunk by chunk, in the order of the file, each to its place; memory grows with
@@ -282,11 +277,9 @@ impl Container {
                 }
             }
         }
-        if seen < wanted || out.len() < total {
-            let found = format!("{seen} chunks of values");
-            let expected = format!("{wanted}: the file was not written to its end");
-            return Err(self.invalid(data.name(), found, expected));
-        }
+        let expected = format!("{wanted}: the file was not written to its end");
+        let whole = seen >= wanted && out.len() >= total;
+        ensure(whole, &self.place, data.name(), format!("{seen} chunks of values"), expected)?;
         Ok(out)
     }
 
@@ -358,25 +351,12 @@ fn three(all: &[u64], row: u64) -> Option<[usize; 3]> {
 
 /// How values of the type `dtype` are stored; `None` if they are not numbers.
 fn stored(dtype: &Datatype) -> Option<(Number, ByteOrder)> {
-    let (number, order) = match *dtype {
-        Datatype::FixedPoint { size, signed, byte_order } => {
-            let number = match (size, signed) {
-                (1, false) => Number::U8,
-                (1, true) => Number::I8,
-                (2, false) => Number::U16,
-                (2, true) => Number::I16,
-                (4, false) => Number::U32,
-                (4, true) => Number::I32,
-                (8, false) => Number::U64,
-                (8, true) => Number::I64,
-                _ => return None,
-            };
-            (number, byte_order)
-        }
-        Datatype::FloatingPoint { size: 4, byte_order } => (Number::F32, byte_order),
-        Datatype::FloatingPoint { size: 8, byte_order } => (Number::F64, byte_order),
+    let (kind, size, order) = match *dtype {
+        Datatype::FixedPoint { size, signed, byte_order } => (if signed { 'i' } else { 'u' }, size, byte_order),
+        Datatype::FloatingPoint { size, byte_order } => ('f', size, byte_order),
         _ => return None,
     };
+    let number = Number::of(kind, size.into())?;
     let order = match order {
         hdf5_reader::ByteOrder::LittleEndian => ByteOrder::Little,
         hdf5_reader::ByteOrder::BigEndian => ByteOrder::Big,
@@ -405,7 +385,8 @@ impl H5Type for Single {
     fn decode_vec(raw: &[u8], dtype: &Datatype, count: usize) -> Option<hdf5_reader::error::Result<Vec<Self>>> {
         let (number, order) = stored(dtype)?;
         let mut all = Vec::with_capacity(count);
-        number.decode(order, raw.get(..count.checked_mul(number.bytes())?)?, &mut all, |x| Self(x as f32));
-        Some(Ok(all))
+        number.singles(order, raw.get(..count.checked_mul(number.bytes())?)?, &mut all);
+        // In place: the layouts are the same.
+        Some(Ok(all.into_iter().map(Self).collect()))
     }
 }

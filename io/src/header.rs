@@ -4,6 +4,7 @@ use crate::folder;
 use crate::folder::folder_of;
 use crate::input::Input;
 use crate::text::shortened;
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use std::path::Path;
 
@@ -33,9 +34,7 @@ impl Header {
     pub fn text(&self, name: &str) -> Result<Option<&str>> {
         let mut all = self.entries.iter().filter(|(n, _)| n == name);
         let Some((_, value)) = all.next() else { return Ok(None) };
-        if all.next().is_some() {
-            return Err(self.invalid(name, "two entries", "one"));
-        }
+        ensure(all.next().is_none(), &self.place, name, "two entries", "one")?;
         let text = std::str::from_utf8(value);
         text.map(Some).map_err(|e| self.invalid(name, format!("bytes that are no UTF-8 ({e})"), "a text"))
     }
@@ -56,9 +55,7 @@ impl Header {
 
     /// The file `name` in the folder of the header `path`, as the entry `field` says; refuses lists of files.
     pub fn data_file(&self, path: &Path, field: &str, name: &str, expected: &str) -> Result<Input> {
-        if name.starts_with("LIST") || name.contains('%') {
-            return Err(self.invalid(field, shortened(name), expected));
-        }
+        ensure(!name.starts_with("LIST") && !name.contains('%'), &self.place, field, shortened(name), expected)?;
         Input::open_plain(&folder::inside(folder_of(path), &self.place, field, name)?)
     }
 

@@ -92,11 +92,15 @@ impl Input {
         Error::invalid(self.place(), field, found, expected)
     }
 
+    /// An error about this file unless `ok`.
+    pub fn ensure(&self, ok: bool, field: &str, found: impl ToString, expected: impl Into<String>) -> Result<()> {
+        if ok { Ok(()) } else { Err(self.invalid(field, found, expected)) }
+    }
+
     /// Reads up to `n` bytes, fewer only at the end of the file.
     pub fn take(&mut self, n: usize) -> Result<Vec<u8>> {
-        let mut out = Vec::with_capacity(n.min(1 << 16));
-        let got = self.reader.by_ref().take(n as u64).read_to_end(&mut out);
-        self.at += got.map_err(|e| self.broken(e))? as u64;
+        let out = read_up_to(&mut self.reader, n as u64).map_err(|e| self.broken(e))?;
+        self.at += out.len() as u64;
         Ok(out)
     }
 
@@ -171,13 +175,8 @@ impl Input {
             })?;
         } else {
             let left = self.size.saturating_sub(self.at);
-            if left != want {
-                return Err(self.invalid(
-                    field,
-                    format!("{left} bytes of data in the file"),
-                    format!("{want} bytes ({count} values of {} bytes, as the header says)", number.bytes()),
-                ));
-            }
+            let expected = format!("{want} bytes ({count} values of {} bytes, as the header says)", number.bytes());
+            self.ensure(left == want, field, format!("{left} bytes of data in the file"), expected)?;
         }
         let mut out: Vec<T> = Vec::new();
         // A plain file has just been measured; a compressed one must prove its claim piece by piece. Each growth draws
@@ -210,6 +209,18 @@ impl Input {
             _ => Error::io(&self.path, e),
         }
     }
+}
+
+/// The first bytes of a regular file, at most `most`.
+pub(crate) fn start_of(path: &Path, most: u64) -> Result<Vec<u8>> {
+    read_up_to(&mut files::open(path)?.0, most).map_err(|e| Error::io(path, e))
+}
+
+/// Reads at most `most` bytes, fewer only at the end. It is compiled once for all readers.
+pub(crate) fn read_up_to(reader: &mut dyn Read, most: u64) -> std::io::Result<Vec<u8>> {
+    let mut out = Vec::with_capacity(most.min(1 << 16) as usize);
+    reader.take(most).read_to_end(&mut out)?;
+    Ok(out)
 }
 
 /// Reads a regular file completely.

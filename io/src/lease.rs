@@ -5,7 +5,7 @@
 //! killed process leaves both; the next command on that folder cleans up.
 
 use crate::atomic::{exchange, sweep, sync_folder};
-use crate::folder::folder_of;
+use crate::folder::{entries, file_name, folder_of, is_folder};
 use crate::lock::{self, Held};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
@@ -46,15 +46,9 @@ impl Contents {
     /// The paths in `folder`, sorted; none if there is no folder. Refuses a folder with anything that its commands do not
     /// write.
     pub fn entries(&self, folder: &Path) -> Result<Vec<PathBuf>> {
-        let at = |e| Error::io(folder, e);
-        let entries = match fs::read_dir(folder) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
-            entries => entries.map_err(at)?,
-        };
-        let mut all = entries.map(|entry| Ok(entry.map_err(at)?.path())).collect::<Result<Vec<PathBuf>>>()?;
-        all.sort();
+        let all = entries(folder)?;
         if let Some(other) = all.iter().find(|path| !(self.known)(path)) {
-            let found = format!("a folder with {} in it", other.file_name().unwrap_or_default().to_string_lossy());
+            let found = format!("a folder with {} in it", file_name(other));
             return Err(Error::invalid(folder.display().to_string(), "output", found, "a new or empty folder"));
         }
         Ok(all)
@@ -91,22 +85,11 @@ fn aside(folder: &Path) -> PathBuf {
 
 /// The folders in `aside`, the latest last. Removes an empty one that a killed process has only just created.
 fn waiting(aside: &Path) -> Result<Vec<PathBuf>> {
-    let entries = match fs::read_dir(aside) {
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
-        entries => entries.map_err(|e| Error::io(aside, e))?,
-    };
-    let mut all = vec![];
-    for entry in entries {
-        let entry = entry.map_err(|e| Error::io(aside, e))?;
-        if fs::remove_dir(entry.path()).is_ok() {
-            continue;
-        }
-        if let Some(n) = entry.file_name().to_str().and_then(|n| n.parse::<u64>().ok()) {
-            all.push((n, entry.path()));
-        }
-    }
-    all.sort();
-    Ok(all.into_iter().map(|(_, path)| path).collect())
+    let number = |path: &Path| path.file_name()?.to_str()?.parse::<u64>().ok();
+    let mut all = entries(aside)?;
+    all.retain(|path| fs::remove_dir(path).is_err() && number(path).is_some());
+    all.sort_by_key(|path| number(path));
+    Ok(all)
 }
 
 impl Lease {
@@ -148,13 +131,8 @@ impl Lease {
             // Another process has made it since, and may still write.
             self.locks = own(&self.path)?;
             let place = self.path.display().to_string();
-            ensure(
-                self.progressed() == Progressed::Nothing,
-                &place,
-                "output",
-                "what another command wrote",
-                "a new folder",
-            )?;
+            let expected = "a new folder";
+            ensure(self.progressed() == Progressed::Nothing, &place, "output", "what another command wrote", expected)?;
         }
         if !self.path.is_dir() {
             fs::create_dir(&self.path).map_err(at)?;
@@ -163,11 +141,9 @@ impl Lease {
         } else if self.progressed() == Progressed::Nothing {
             self.clear(&self.path)?;
         } else {
-            if self.path.file_name().is_none() {
-                let found = "a folder without a name of its own";
-                let expected = "the name that it has in the folder above";
-                return Err(Error::invalid(self.path.display().to_string(), "output", found, expected));
-            }
+            let found = "a folder without a name of its own";
+            let expected = "the name that it has in the folder above";
+            ensure(self.path.file_name().is_some(), &self.path.display().to_string(), "output", found, expected)?;
             let aside = aside(&self.path);
             let slot = aside.join(waiting(&aside)?.len().to_string());
             fs::create_dir_all(&slot).map_err(at)?;
@@ -223,8 +199,7 @@ impl Lease {
 
     /// Removes the known files of work without a result.
     fn clear(&self, folder: &Path) -> Result<()> {
-        for entry in fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
-            let path = entry.map_err(|e| Error::io(folder, e))?.path();
+        for path in entries(folder)? {
             if (self.contents.known)(&path) {
                 let gone = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
                 gone.map_err(|e| Error::io(&path, e))?;
@@ -358,20 +333,12 @@ fn await_parts(path: &Path, contents: Contents) -> Result<()> {
 
 /// Collects the folders within `path` that are `wanted`, down to `depth`.
 fn folders(path: &Path, depth: usize, wanted: fn(&Path) -> bool, found: &mut Vec<PathBuf>) -> Result<()> {
-    if depth == 0 {
+    if depth == 0 || !path.is_dir() {
         return Ok(());
     }
-    let entries = match fs::read_dir(path) {
-        // It is not a folder, or its writer has just removed it.
-        Err(e) if [ErrorKind::NotFound, ErrorKind::NotADirectory].contains(&e.kind()) => return Ok(()),
-        entries => entries.map_err(|e| Error::io(path, e))?,
-    };
-    for entry in entries {
-        let entry = entry.map_err(|e| Error::io(path, e))?;
-        if entry.file_type().is_ok_and(|t| t.is_dir()) && wanted(&entry.path()) {
-            folders(&entry.path(), depth - 1, |_| true, found)?;
-            found.push(entry.path());
-        }
+    for inner in entries(path)?.into_iter().filter(|inner| is_folder(inner) && wanted(inner)) {
+        folders(&inner, depth - 1, |_| true, found)?;
+        found.push(inner);
     }
     Ok(())
 }

@@ -63,7 +63,8 @@ mod zarr;
 #[cfg(test)]
 mod testing;
 
-pub use atomic::{discard_unfinished, is_unfinished, write_atomic, write_folder_atomic, write_text_atomic};
+pub(crate) use atomic::write_folder_atomic;
+pub use atomic::{discard_unfinished, is_unfinished, write_atomic, write_text_atomic};
 pub use checkpoint::{read_checkpoint, write_checkpoint};
 pub use dicom::DicomTemplate;
 pub use events::EventFile;
@@ -79,4 +80,4 @@ pub use scan_folder::write_scan;
 pub use scanner::{Conversion, Counts, I0, OpenBeam, Stored, read_scanner};
 pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};
 pub use volume::{check_shape, is_volume, packed_bytes, read_volume, write_volume, write_voxels, write_voxels_of};
-pub use weights::{read_weights, write_weights};
+pub use weights::{Tensor, read_weights, write_weights};

@@ -9,7 +9,7 @@
 //! Source: MathWorks, MAT-File Format (Level 5 MAT-File Format).
 
 use crate::hdf5::{self, ScanPart};
-use crate::input::Input;
+use crate::input::{Input, start_of};
 use crate::npy::{self, Header};
 use crate::number::{ByteOrder, Number};
 use conefield_core::error::ensure;
@@ -75,7 +75,7 @@ pub(crate) fn shape(path: &Path, name: Option<&str>) -> Result<Vec<usize>> {
 
 /// The data set of a version 7.3 file in which `name` is stored; `None` for version 5.
 fn data_set(path: &Path, name: Option<&str>) -> Result<Option<String>> {
-    if !is_hdf5(&Input::open_plain(path)?.take(8)?) {
+    if !is_hdf5(&start_of(path, 8)?) {
         return Ok(None);
     }
     let place = path.display().to_string();

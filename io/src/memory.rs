@@ -1,5 +1,6 @@
-//! Memory for numbers, reserved in the process's allowance before it is allocated.
+//! Memory for numbers, reserved in the process's allowance before it is allocated, and what all arrays must pass.
 
+use conefield_core::finite::stray;
 use conefield_core::{Error, Result, allowance};
 use ndarray::{Array, Dimension};
 
@@ -23,4 +24,16 @@ pub(crate) fn in_order<D: Dimension>(place: &str, field: &str, array: Array<f32,
     }
     allowance::numbers(place, field, array.len())?;
     Ok(array.as_standard_layout().into_owned())
+}
+
+/// `array`, unless a value is not finite; `name` is what errors call the value at an index.
+pub(crate) fn all_finite<D: Dimension>(
+    place: &str,
+    array: Array<f32, D>,
+    name: &dyn Fn(D::Pattern) -> String,
+) -> Result<Array<f32, D>> {
+    match stray(&array) {
+        Some((at, x)) => Err(Error::invalid(place, name(at), x, "a finite number")),
+        None => Ok(array),
+    }
 }

@@ -264,18 +264,14 @@ fn counts<const N: usize>(top: &Item, key: &str, axes: &str) -> Result<[usize; N
     let item = required(top, key)?;
     let found: [f64; N] = item.list(axes)?;
     let whole = found.iter().all(|x| x.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(x));
-    if !whole {
-        return Err(item.invalid(format!("{found:?}"), format!("at least 1, whole numbers of {axes}")));
-    }
+    item.ensure(whole, format!("{found:?}"), format!("at least 1, whole numbers of {axes}"))?;
     Ok(found.map(|x| x as usize))
 }
 
 fn lengths<const N: usize>(top: &Item, key: &str, what: &str, axes: &str) -> Result<[f64; N]> {
     let item = required(top, key)?;
     let found: [f64; N] = item.list(&format!("{what} along {axes}"))?;
-    if found.iter().any(|x| *x <= 0.0) {
-        return Err(item.invalid(format!("{found:?}"), format!("positive lengths in mm along {axes}")));
-    }
+    item.ensure(found.iter().all(|x| *x > 0.0), format!("{found:?}"), format!("positive lengths in mm along {axes}"))?;
     Ok(found)
 }
 
@@ -283,9 +279,7 @@ fn lengths<const N: usize>(top: &Item, key: &str, what: &str, axes: &str) -> Res
 fn check_count(top: &Item, key: &str, views: usize) -> Result<()> {
     let Some(item) = top.get(key)? else { return Ok(()) };
     let said = item.number()?;
-    if said > views as f64 {
-        return Err(item.invalid(said, format!("{views}, as many as there are views")));
-    }
+    item.ensure(said <= views as f64, said, format!("{views}, as many as there are views"))?;
     if said != views as f64 {
         tracing::warn!("{key} is {said}, but there are {views} views: all are read");
     }
@@ -355,7 +349,8 @@ pub fn write_naf(path: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, volu
     if let Some(v) = volume {
         entries.push(("image", Out::Floats(v.data.view().into_dyn())));
     }
-    write_atomic(path, |w| pickle::write(w, &Out::Dict(entries)).map_err(|e| Error::io(path, e)))
+    let content = Out::Dict(entries);
+    write_atomic(path, &mut |w| pickle::write(w, &content).map_err(|e| Error::io(path, e)))
 }
 
 fn views_out<'a>(angles: &'a [f64], projections: &'a Array3<f32>) -> Out<'a> {
@@ -454,9 +449,10 @@ mod tests {
             ("train", views(&[0.0, 1.0], [2, 2, 3], 0.5)),
         ];
         change(&mut entries);
+        let content = Out::Dict(entries);
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.pickle");
-        write_atomic(&path, |w| pickle::write(w, &Out::Dict(entries)).map_err(|e| Error::io(&path, e))).unwrap();
+        write_atomic(&path, &mut |w| pickle::write(w, &content).map_err(|e| Error::io(&path, e))).unwrap();
         (dir, path)
     }
 

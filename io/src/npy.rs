@@ -4,10 +4,10 @@ use crate::file_order::{self, FileOrder};
 use crate::input::Input;
 use crate::memory;
 use crate::number::{self, ByteOrder, Number};
-use conefield_core::finite::stray;
 use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
 use ndarray::{Array, ArrayD, Dimension, IxDyn, ShapeBuilder};
+use serde_json::{Map, Value};
 use std::io::Write;
 use std::path::Path;
 
@@ -28,17 +28,12 @@ pub(crate) struct Header {
 
 /// Reads an array with the named axes as `f32` in C order; refuses values that are not finite.
 pub(crate) fn read(path: &Path, axes: &[&str]) -> Result<ArrayD<f32>> {
-    read_from(&mut Input::open(path)?, Vec::new(), axes)
+    read_counts(&mut Input::open(path)?, &[axes]).map(|(array, _)| array)
 }
 
-/// Reads the rest after `start`, the bytes (at most eight) read from `input` to recognize the format.
-pub(crate) fn read_from(input: &mut Input, start: Vec<u8>, axes: &[&str]) -> Result<ArrayD<f32>> {
-    read_counts(input, start, &[axes]).map(|(array, _)| array)
-}
-
-/// Like [`read_from`], for an array with any of several sets of axes, with the type of the numbers in the file.
-pub(crate) fn read_counts(input: &mut Input, start: Vec<u8>, sets: &[&[&str]]) -> Result<(ArrayD<f32>, Number)> {
-    let header = read_header(input, start)?;
+/// Like [`read`], for an array with any of several sets of axes, with the type of the numbers in the file.
+pub(crate) fn read_counts(input: &mut Input, sets: &[&[&str]]) -> Result<(ArrayD<f32>, Number)> {
+    let header = read_header(input)?;
     array(input, &header, sets)
 }
 
@@ -64,16 +59,13 @@ pub(crate) fn array(input: &mut Input, header: &Header, sets: &[&[&str]]) -> Res
     let array = ArrayD::from_shape_vec(IxDyn(&header.shape).set_f(header.fortran), values)
         .map_err(|e| input.invalid("shape", e, expected()))?;
     let array = memory::in_order(&input.place(), "data", array)?;
-    if let Some((at, x)) = stray(&array) {
-        return Err(input.invalid(format!("data{:?}", at.slice()), x, "a finite number"));
-    }
+    let array = memory::all_finite(&input.place(), array, &|at| format!("data{:?}", at.slice()))?;
     Ok((array, header.number))
 }
 
-/// Shape and numbers, in C order and full precision, of a small array of one or two axes; continues after `start` like
-/// [`read_from`].
-pub(crate) fn read_exact(input: &mut Input, start: Vec<u8>) -> Result<(Vec<usize>, Vec<f64>)> {
-    let header = read_header(input, start)?;
+/// Shape and numbers, in C order and full precision, of a small array of one or two axes.
+pub(crate) fn read_exact(input: &mut Input) -> Result<(Vec<usize>, Vec<f64>)> {
+    let header = read_header(input)?;
     exact(input, &header)
 }
 
@@ -124,160 +116,79 @@ fn header(shape: &[usize]) -> Vec<u8> {
     [MAGIC, &[1, 0], &(text.len() as u16).to_le_bytes(), text.as_bytes()].concat()
 }
 
-/// The shape in the header; continues after `start` like [`read_from`].
-pub(crate) fn shape(input: &mut Input, start: Vec<u8>) -> Result<Vec<usize>> {
-    read_header(input, start).map(|h| h.shape)
+/// The shape in the header.
+pub(crate) fn shape(input: &mut Input) -> Result<Vec<usize>> {
+    read_header(input).map(|h| h.shape)
 }
 
-fn read_header(input: &mut Input, start: Vec<u8>) -> Result<Header> {
-    let mut bytes = start;
-    let mut fill = |input: &mut Input, n: usize| -> Result<Vec<u8>> {
-        if bytes.len() < n {
-            let more = input.exactly(n - bytes.len(), "header")?;
-            bytes.extend(more);
-        }
-        Ok(bytes.drain(..n).collect())
-    };
-    let magic = fill(input, 8)?;
-    if !magic.starts_with(MAGIC) {
-        return Err(input.invalid("magic", format!("{:02x?}", &magic[..6]), "93 4e 55 4d 50 59 (\\x93NUMPY)"));
-    }
+fn read_header(input: &mut Input) -> Result<Header> {
+    let magic = input.exactly(8, "header")?;
+    let expected = "93 4e 55 4d 50 59 (\\x93NUMPY)";
+    input.ensure(magic.starts_with(MAGIC), "magic", format!("{:02x?}", &magic[..6]), expected)?;
     let length = match magic[6] {
-        1 => fill(input, 2)?,
-        2 | 3 => fill(input, 4)?,
+        1 => input.exactly(2, "header")?,
+        2 | 3 => input.exactly(4, "header")?,
         v => return Err(input.invalid("version", v, "1, 2 or 3")),
     };
     let length = length.iter().rev().fold(0usize, |n, b| n << 8 | *b as usize);
-    if length > LONGEST_HEADER {
-        return Err(input.invalid("header length", length, format!("at most {LONGEST_HEADER} bytes")));
-    }
-    let raw = fill(input, length)?;
+    input.ensure(length <= LONGEST_HEADER, "header length", length, format!("at most {LONGEST_HEADER} bytes"))?;
+    let raw = input.exactly(length, "header")?;
     let text = String::from_utf8_lossy(&raw);
-    let (mut descr, mut fortran, mut shape) = (None, None, None);
-    let mut parser = Python { rest: text.trim() };
-    parser
-        .dict(|key, value| {
-            match (key, value) {
-                ("descr", Literal::Text(t)) => descr = Some(t),
-                ("fortran_order", Literal::Bool(b)) => fortran = Some(b),
-                ("shape", Literal::Tuple(s)) => shape = Some(s),
-                _ => return None,
-            }
-            Some(())
-        })
-        .ok_or_else(|| {
-            let shown: String = text.chars().take(200).collect();
-            input.invalid("header", shown.trim(), "{'descr': '<f4', 'fortran_order': False, 'shape': (…), }")
-        })?;
-    let lacks = |field: &str| input.invalid(field, "nothing", "an entry in the header");
-    let descr = descr.ok_or_else(|| lacks("descr"))?;
-    let (number, order) = element(&descr).ok_or_else(|| {
+    let bad = || {
+        let shown: String = text.chars().take(200).collect();
+        input.invalid("header", shown.trim(), "{'descr': '<f4', 'fortran_order': False, 'shape': (…), }")
+    };
+    let entries = entries(&text).filter(|all| all.keys().all(|key| KEYS.contains(&&key[..]))).ok_or_else(bad)?;
+    let [descr, fortran, shape] =
+        KEYS.map(|key| entries.get(key).ok_or_else(|| input.invalid(key, "nothing", "an entry in the header")));
+    let descr = descr?.as_str().ok_or_else(bad)?;
+    let (number, order) = element(descr).ok_or_else(|| {
         input.invalid("descr", format!("'{descr}'"), "real numbers: b1, i1 to i8, u1 to u8, f4 or f8")
     })?;
-    Ok(Header {
-        number,
-        order,
-        fortran: fortran.ok_or_else(|| lacks("fortran_order"))?,
-        shape: shape.ok_or_else(|| lacks("shape"))?,
-    })
+    let fortran = fortran?.as_bool().ok_or_else(bad)?;
+    let length = |n: &Value| usize::try_from(n.as_u64()?).ok();
+    let shape = shape?.as_array().and_then(|all| all.iter().map(length).collect()).ok_or_else(bad)?;
+    Ok(Header { number, order, fortran, shape })
+}
+
+/// The entries of a header.
+const KEYS: [&str; 3] = ["descr", "fortran_order", "shape"];
+
+/// The entries of a dict in the notation that headers use: Python's, which differs from JSON in these characters.
+fn entries(text: &str) -> Option<Map<String, Value>> {
+    let mut json: String = text.split_whitespace().collect();
+    // The last two are Python 2's suffix of long integers.
+    for (python, other) in [
+        ("'", "\""),
+        ("(", "["),
+        (")", "]"),
+        (",]", "]"),
+        (",}", "}"),
+        ("True", "true"),
+        ("False", "false"),
+        ("L,", ","),
+        ("L]", "]"),
+    ] {
+        json = json.replace(python, other);
+    }
+    match serde_json::from_str(&json).ok()? {
+        Value::Object(entries) => Some(entries),
+        _ => None,
+    }
 }
 
 /// Number type and byte order of NumPy's name for a real type, e.g. `<f4`; `None` for any other.
 pub(crate) fn element(descr: &str) -> Option<(Number, ByteOrder)> {
     let (order, kind) = match descr.chars().next()? {
-        '<' => (ByteOrder::Little, &descr[1..]),
+        '<' | '|' => (ByteOrder::Little, &descr[1..]),
         '>' => (ByteOrder::Big, &descr[1..]),
-        '|' => (ByteOrder::Little, &descr[1..]),
         '=' => (if cfg!(target_endian = "big") { ByteOrder::Big } else { ByteOrder::Little }, &descr[1..]),
         _ => (ByteOrder::Little, descr),
     };
-    let number = match kind {
-        "b1" => Number::Bool,
-        "u1" => Number::U8,
-        "i1" => Number::I8,
-        "u2" => Number::U16,
-        "i2" => Number::I16,
-        "u4" => Number::U32,
-        "i4" => Number::I32,
-        "u8" => Number::U64,
-        "i8" => Number::I64,
-        "f4" => Number::F32,
-        "f8" => Number::F64,
-        _ => return None,
-    };
+    let (kind, bytes) = kind.split_at_checked(1)?;
+    let bytes = ["1", "2", "4", "8"].iter().position(|n| *n == bytes)?;
+    let number = Number::of(kind.chars().next()?, 1 << bytes)?;
     Some((number, order))
-}
-
-/// The three kinds of value in a header.
-enum Literal {
-    Text(String),
-    Bool(bool),
-    Tuple(Vec<usize>),
-}
-
-/// Parser of the subset of Python's notation that headers use.
-struct Python<'a> {
-    rest: &'a str,
-}
-
-impl Python<'_> {
-    fn eat(&mut self, token: &str) -> Option<()> {
-        self.rest = self.rest.trim_start().strip_prefix(token)?;
-        Some(())
-    }
-
-    /// Items up to `close`, separated by commas.
-    fn items(&mut self, close: &str, item: &mut dyn FnMut(&mut Self) -> Option<()>) -> Option<()> {
-        while self.eat(close).is_none() {
-            item(self)?;
-            if self.eat(",").is_none() {
-                return self.eat(close);
-            }
-        }
-        Some(())
-    }
-
-    fn dict(&mut self, mut entry: impl FnMut(&str, Literal) -> Option<()>) -> Option<()> {
-        self.eat("{")?;
-        self.items("}", &mut |parser| {
-            let key = parser.text()?;
-            parser.eat(":")?;
-            entry(&key, parser.value()?)
-        })?;
-        self.rest.trim().is_empty().then_some(())
-    }
-
-    fn text(&mut self) -> Option<String> {
-        self.rest = self.rest.trim_start();
-        let quote = self.rest.chars().next().filter(|c| matches!(c, '\'' | '"'))?;
-        let inner = &self.rest[1..];
-        let end = inner.find(quote)?;
-        self.rest = &inner[end + 1..];
-        Some(inner[..end].to_string())
-    }
-
-    fn value(&mut self) -> Option<Literal> {
-        if self.eat("True").is_some() {
-            return Some(Literal::Bool(true));
-        }
-        if self.eat("False").is_some() {
-            return Some(Literal::Bool(false));
-        }
-        if self.eat("(").is_none() {
-            return self.text().map(Literal::Text);
-        }
-        let mut shape = Vec::new();
-        self.items(")", &mut |parser| {
-            parser.rest = parser.rest.trim_start();
-            let end = parser.rest.find(|c: char| !c.is_ascii_digit())?;
-            shape.push(parser.rest[..end].parse().ok()?);
-            parser.rest = &parser.rest[end..];
-            // Python 2's suffix of long integers.
-            let _ = parser.eat("L");
-            Some(())
-        })?;
-        Some(Literal::Tuple(shape))
-    }
 }
 
 #[cfg(test)]
@@ -300,7 +211,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.npy");
         let a = Array3::from_shape_fn((3, 4, 5), |(x, y, z)| (x * 100 + y * 10 + z) as f32 - 7.5);
-        crate::write_atomic(&path, |w| write(w, &path, &a)).unwrap();
+        crate::write_atomic(&path, &mut |w| write(w, &path, &a)).unwrap();
         assert_eq!(read(&path, &["x", "y", "z"]).unwrap(), a.clone().into_dyn());
         // Byte for byte what a library writes, also with fewer axes; an array in another order is converted to C order.
         let bytes = |write: &dyn Fn(&mut Vec<u8>)| {

@@ -6,8 +6,8 @@ use conefield_core::{Error, Result, files};
 use flate2::Crc;
 use flate2::bufread::DeflateDecoder;
 use ndarray::ArrayD;
-use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
-use std::path::{Path, PathBuf};
+use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom};
+use std::path::Path;
 use zip::{CompressionMethod, ZipArchive};
 
 /// The magic bytes of a ZIP archive that is not empty.
@@ -15,17 +15,17 @@ pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
 
 /// Reads the array `name` of the archive (the only one if `None`) with any of the sets of axes, like [`npy::read`].
 pub(crate) fn read(path: &Path, name: Option<&str>, sets: &[&[&str]]) -> Result<ArrayD<f32>> {
-    npy::read_counts(&mut open(path, name)?, Vec::new(), sets).map(|(array, _)| array)
+    npy::read_counts(&mut open(path, name)?, sets).map(|(array, _)| array)
 }
 
 /// Shape and numbers of the small array `name`, like [`npy::read_exact`].
 pub(crate) fn read_exact(path: &Path, name: Option<&str>) -> Result<(Vec<usize>, Vec<f64>)> {
-    npy::read_exact(&mut open(path, name)?, Vec::new())
+    npy::read_exact(&mut open(path, name)?)
 }
 
 /// The shape of the array `name`, from its header.
 pub(crate) fn shape(path: &Path, name: Option<&str>) -> Result<Vec<usize>> {
-    npy::shape(&mut open(path, name)?, Vec::new())
+    npy::shape(&mut open(path, name)?)
 }
 
 fn open(path: &Path, name: Option<&str>) -> Result<Input> {
@@ -66,29 +66,25 @@ fn open(path: &Path, name: Option<&str>) -> Result<Input> {
     })?;
     let mut file = archive.into_inner();
     file.seek(SeekFrom::Start(start)).map_err(io)?;
-    let raw = file.take(packed);
-    let name = PathBuf::from(&place);
-    match method {
-        CompressionMethod::Stored => Ok(Input::within(name, Checked::new(raw, checksum), size)),
-        CompressionMethod::Deflated => Ok(Input::within(name, Checked::new(DeflateDecoder::new(raw), checksum), size)),
-        other => Err(Error::unsupported(place, format!("it is packed as {other}; stored and deflated are read"))),
-    }
+    let raw: Box<dyn BufRead> = Box::new(file.take(packed));
+    let reader: Box<dyn Read> = match method {
+        CompressionMethod::Stored => raw,
+        CompressionMethod::Deflated => Box::new(DeflateDecoder::new(raw)),
+        other => {
+            return Err(Error::unsupported(place, format!("it is packed as {other}; stored and deflated are read")));
+        }
+    };
+    Ok(Input::within(place.into(), Checked { reader, crc: Crc::new(), want: checksum }, size))
 }
 
 /// Verifies the checksum at the end of the data.
-struct Checked<R> {
-    reader: R,
+struct Checked {
+    reader: Box<dyn Read>,
     crc: Crc,
     want: u32,
 }
 
-impl<R> Checked<R> {
-    fn new(reader: R, want: u32) -> Self {
-        Self { reader, crc: Crc::new(), want }
-    }
-}
-
-impl<R: Read> Read for Checked<R> {
+impl Read for Checked {
     fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
         let n = self.reader.read(out)?;
         self.crc.update(&out[..n]);

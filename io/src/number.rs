@@ -38,6 +38,24 @@ pub(crate) enum ByteOrder {
 }
 
 impl Number {
+    /// Numbers of `bytes` bytes: unsigned (`u`) or signed integers (`i`), floats (`f`), or booleans (`b`).
+    pub fn of(kind: char, bytes: usize) -> Option<Self> {
+        Some(match (kind, bytes) {
+            ('b', 1) => Self::Bool,
+            ('u', 1) => Self::U8,
+            ('i', 1) => Self::I8,
+            ('u', 2) => Self::U16,
+            ('i', 2) => Self::I16,
+            ('u', 4) => Self::U32,
+            ('i', 4) => Self::I32,
+            ('u', 8) => Self::U64,
+            ('i', 8) => Self::I64,
+            ('f', 4) => Self::F32,
+            ('f', 8) => Self::F64,
+            _ => return None,
+        })
+    }
+
     /// Bytes per number.
     pub fn bytes(self) -> usize {
         match self {
@@ -59,7 +77,7 @@ impl Number {
     }
 
     /// Appends what `map` makes of the numbers in `raw` (a whole number of them) to `out`.
-    pub fn decode<T>(self, order: ByteOrder, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
+    fn decode<T>(self, order: ByteOrder, raw: &[u8], out: &mut Vec<T>, map: impl Fn(f64) -> T) {
         macro_rules! each {
             ($t:ty) => {{
                 let (raw, _) = raw.as_chunks::<{ size_of::<$t>() }>();

@@ -13,10 +13,10 @@ mod write;
 #[cfg(test)]
 mod tests;
 
-use conefield_core::{Error, Result, files};
+use crate::input::start_of;
+use conefield_core::{Error, Result};
 use numpy::{Array, Dtype, Global};
 use std::collections::HashMap;
-use std::io::Read;
 use std::path::Path;
 use value::{Heap, Node, Refusal, Value};
 
@@ -45,17 +45,14 @@ pub(crate) fn is_start(start: &[u8]) -> bool {
 
 /// Whether the file starts like a pickle of protocol 2 or later.
 pub(crate) fn is_pickle(path: &Path) -> Result<bool> {
-    let mut start = Vec::new();
-    let (file, _) = files::open(path)?;
-    file.take(2).read_to_end(&mut start).map_err(|e| Error::io(path, e))?;
-    Ok(is_start(&start))
+    Ok(is_start(&start_of(path, 2)?))
 }
 
 impl<'a> Pickle<'a> {
     /// Reads `bytes`, the content of the file `place`.
     pub fn parse(place: &str, bytes: &'a [u8]) -> Result<Self> {
         let mut machine = Machine { place, bytes, ..Machine::default() };
-        let top = machine.run()?;
+        let top = machine.run().map_err(|refusal| machine.located(refusal))?;
         machine.heap.check_nesting(top).map_err(|r| Error::invalid(place, "content", r.found, r.expected))?;
         Ok(Self { place: place.to_owned(), heap: machine.heap, top })
     }
@@ -81,11 +78,10 @@ struct Machine<'p, 'a> {
 }
 
 impl<'a> Machine<'_, 'a> {
-    fn run(&mut self) -> Result<Value<'a>> {
+    fn run(&mut self) -> Result<Value<'a>, Refusal> {
         let first = self.byte()?;
-        if first != op::PROTO {
-            return Err(self.wrong(format!("0x{first:02x}"), "0x80, the start of a pickle of protocol 2 or later"));
-        }
+        let expected = "0x80, the start of a pickle of protocol 2 or later";
+        Refusal::unless(first == op::PROTO, format!("0x{first:02x}"), expected)?;
         self.protocol()?;
         loop {
             self.start = self.at;
@@ -95,25 +91,21 @@ impl<'a> Machine<'_, 'a> {
             }
         }
         let top = self.pop()?;
-        if !self.stack.is_empty() || !self.marks.is_empty() {
-            return Err(self.wrong(format!("{} values left over", self.stack.len()), "one value at the end"));
-        }
-        if self.at != self.bytes.len() {
-            let found = format!("{} bytes after the end", self.bytes.len() - self.at);
-            return Err(self.wrong(found, "the end of the file"));
-        }
+        let alone = self.stack.is_empty() && self.marks.is_empty();
+        Refusal::unless(alone, format!("{} values left over", self.stack.len()), "one value at the end")?;
+        Refusal::unless(self.left() == 0, format!("{} bytes after the end", self.left()), "the end of the file")?;
         Ok(top)
     }
 
-    fn protocol(&mut self) -> Result<()> {
+    fn protocol(&mut self) -> Result<(), Refusal> {
         let version = self.byte()?;
         if PROTOCOLS.contains(&version) {
             return Ok(());
         }
-        Err(self.wrong(format!("protocol {version}"), format!("{} to {}", PROTOCOLS.start(), PROTOCOLS.end())))
+        Err(Refusal::new(format!("protocol {version}"), format!("{} to {}", PROTOCOLS.start(), PROTOCOLS.end())))
     }
 
-    fn step(&mut self, code: u8) -> Result<()> {
+    fn step(&mut self, code: u8) -> Result<(), Refusal> {
         match code {
             op::NONE => self.push(Value::None),
             op::NEWTRUE => self.push(Value::Bool(true)),
@@ -179,7 +171,7 @@ impl<'a> Machine<'_, 'a> {
                 let (name, module) = (self.pop()?, self.pop()?);
                 match (self.heap.text(module), self.heap.text(name)) {
                     (Some(module), Some(name)) => self.global(module, name),
-                    _ => Err(self.wrong(self.heap.kind(name), "a module and a name")),
+                    _ => Err(Refusal::new(self.heap.kind(name), "a module and a name")),
                 }
             }
             op::REDUCE => self.reduce(),
@@ -196,108 +188,104 @@ impl<'a> Machine<'_, 'a> {
             | op::OBJ
             | op::NEXT_BUFFER
             | op::READONLY_BUFFER => {
-                Err(self.wrong("an opcode that refers to something outside or makes an object", "data only"))
+                Err(Refusal::new("an opcode that refers to something outside or makes an object", "data only"))
             }
-            op::EMPTY_SET | op::ADDITEMS | op::FROZENSET => Err(self.wrong("a set", "a list, tuple or dict")),
+            op::EMPTY_SET | op::ADDITEMS | op::FROZENSET => Err(Refusal::new("a set", "a list, tuple or dict")),
             op::INT | op::LONG | op::FLOAT | op::STRING | op::UNICODE | op::GET | op::PUT => {
-                Err(self.wrong("an opcode of protocol 0", "protocol 2 or later: write the file with Python 3"))
+                Err(Refusal::new("an opcode of protocol 0", "protocol 2 or later: write the file with Python 3"))
             }
-            other => Err(self.wrong(format!("0x{other:02x}"), "an opcode of protocols 2 to 5")),
+            other => Err(Refusal::new(format!("0x{other:02x}"), "an opcode of protocols 2 to 5")),
         }
     }
 
-    /// An error at the current opcode.
-    fn wrong(&self, found: impl ToString, expected: impl Into<String>) -> Error {
+    /// The error at the current opcode.
+    fn located(&self, refusal: Refusal) -> Error {
         let name = self.bytes.get(self.start).and_then(|c| op::name(*c));
         let field = match name {
             Some(name) => format!("byte {} ({name})", self.start),
             None => format!("byte {}", self.start),
         };
-        Error::invalid(self.place, field, found, expected)
-    }
-
-    fn refuse(&self, refusal: Refusal) -> Error {
-        self.wrong(refusal.found, refusal.expected)
+        Error::invalid(self.place, field, refusal.found, refusal.expected)
     }
 
     fn left(&self) -> usize {
         self.bytes.len() - self.at
     }
 
-    fn within(&self, length: u64) -> Result<()> {
+    fn within(&self, length: u64) -> Result<(), Refusal> {
         if length > self.left() as u64 {
             let found = format!("the end of the file after {} bytes", self.left());
-            return Err(self.wrong(found, format!("{length} bytes")));
+            return Err(Refusal::new(found, format!("{length} bytes")));
         }
         Ok(())
     }
 
-    fn take(&mut self, length: u64) -> Result<&'a [u8]> {
+    fn take(&mut self, length: u64) -> Result<&'a [u8], Refusal> {
         self.within(length)?;
         let taken = &self.bytes[self.at..self.at + length as usize];
         self.at += taken.len();
         Ok(taken)
     }
 
-    fn byte(&mut self) -> Result<u8> {
+    fn byte(&mut self) -> Result<u8, Refusal> {
         self.take(1).map(|raw| raw[0])
     }
 
     /// A number of `bytes` bytes, at most 8.
-    fn unsigned(&mut self, bytes: u64) -> Result<u64> {
+    fn unsigned(&mut self, bytes: u64) -> Result<u64, Refusal> {
         Ok(self.take(bytes)?.iter().rev().fold(0, |n, b| n << 8 | u64::from(*b)))
     }
 
     /// The bytes behind a length of `bytes` bytes.
-    fn counted(&mut self, bytes: u64) -> Result<&'a [u8]> {
+    fn counted(&mut self, bytes: u64) -> Result<&'a [u8], Refusal> {
         let length = self.unsigned(bytes)?;
         self.take(length)
     }
 
-    fn line(&mut self) -> Result<&'a str> {
+    fn line(&mut self) -> Result<&'a str, Refusal> {
         let rest = &self.bytes[self.at..];
-        let end = rest.iter().position(|b| *b == b'\n').ok_or_else(|| self.wrong("the end of the file", "a line"))?;
+        let end = rest.iter().position(|b| *b == b'\n').ok_or_else(|| Refusal::new("the end of the file", "a line"))?;
         self.at += end + 1;
-        std::str::from_utf8(&rest[..end]).map_err(|e| self.wrong(format!("a name that is no UTF-8: {e}"), "a name"))
+        std::str::from_utf8(&rest[..end]).map_err(|e| Refusal::new(format!("a name that is no UTF-8: {e}"), "a name"))
     }
 
-    fn count_value(&mut self) -> Result<()> {
+    fn count_value(&mut self) -> Result<(), Refusal> {
         self.made += 1;
         if self.made > MOST_VALUES {
-            return Err(self.wrong(format!("more than {MOST_VALUES} values"), "long data in NumPy arrays"));
+            return Err(Refusal::new(format!("more than {MOST_VALUES} values"), "long data in NumPy arrays"));
         }
         Ok(())
     }
 
-    fn push(&mut self, value: Value<'a>) -> Result<()> {
+    fn push(&mut self, value: Value<'a>) -> Result<(), Refusal> {
         self.count_value()?;
         self.stack.push(value);
         Ok(())
     }
 
-    fn make(&mut self, node: Node<'a>) -> Result<()> {
+    fn make(&mut self, node: Node<'a>) -> Result<(), Refusal> {
         self.push(Value::Node(self.heap.nodes.len()))?;
         self.heap.nodes.push(node);
         Ok(())
     }
 
     /// The top of the stack; values below an open mark are out of reach.
-    fn peek(&self) -> Result<Value<'a>> {
+    fn peek(&self) -> Result<Value<'a>, Refusal> {
         let floor = self.marks.last().copied().unwrap_or(0);
         match self.stack.last() {
             Some(value) if self.stack.len() > floor => Ok(*value),
-            _ => Err(self.wrong("an empty stack", "a value on it")),
+            _ => Err(Refusal::new("an empty stack", "a value on it")),
         }
     }
 
-    fn pop(&mut self) -> Result<Value<'a>> {
+    fn pop(&mut self) -> Result<Value<'a>, Refusal> {
         let value = self.peek()?;
         self.stack.pop();
         Ok(value)
     }
 
     /// As in Python, POP removes an open mark if nothing lies above it.
-    fn pop_or_mark(&mut self) -> Result<()> {
+    fn pop_or_mark(&mut self) -> Result<(), Refusal> {
         if self.marks.last() == Some(&self.stack.len()) {
             self.marks.pop();
             return Ok(());
@@ -305,24 +293,24 @@ impl<'a> Machine<'_, 'a> {
         self.pop().map(|_| ())
     }
 
-    fn above_mark(&mut self) -> Result<Vec<Value<'a>>> {
+    fn above_mark(&mut self) -> Result<Vec<Value<'a>>, Refusal> {
         match self.marks.pop() {
             Some(mark) if mark <= self.stack.len() => Ok(self.stack.split_off(mark)),
-            _ => Err(self.wrong("no open mark", "a mark")),
+            _ => Err(Refusal::new("no open mark", "a mark")),
         }
     }
 
-    fn tuple(&mut self, n: usize) -> Result<()> {
-        let mut items = (0..n).map(|_| self.pop()).collect::<Result<Vec<_>>>()?;
+    fn tuple(&mut self, n: usize) -> Result<(), Refusal> {
+        let mut items = (0..n).map(|_| self.pop()).collect::<Result<Vec<_>, Refusal>>()?;
         items.reverse();
         self.make(Node::Tuple(items))
     }
 
     /// Pushes an integer in two's complement.
-    fn signed(&mut self, raw: &[u8]) -> Result<()> {
+    fn signed(&mut self, raw: &[u8]) -> Result<(), Refusal> {
         if raw.len() > LONGEST_INTEGER {
             let expected = format!("at most {LONGEST_INTEGER} bytes");
-            return Err(self.wrong(format!("an integer of {} bytes", raw.len()), expected));
+            return Err(Refusal::new(format!("an integer of {} bytes", raw.len()), expected));
         }
         // Sign extension of the last byte.
         let sign = if raw.last().is_some_and(|b| b & 0x80 != 0) { 0xff } else { 0 };
@@ -332,60 +320,58 @@ impl<'a> Machine<'_, 'a> {
     }
 
     /// Pushes a text behind a length of `bytes` bytes.
-    fn text(&mut self, bytes: u64) -> Result<()> {
+    fn text(&mut self, bytes: u64) -> Result<(), Refusal> {
         let raw = self.counted(bytes)?;
-        let text = std::str::from_utf8(raw).map_err(|e| self.wrong(format!("no UTF-8: {e}"), "UTF-8 text"))?;
+        let text = std::str::from_utf8(raw).map_err(|e| Refusal::new(format!("no UTF-8: {e}"), "UTF-8 text"))?;
         self.push(Value::Text(text))
     }
 
-    fn binary(&mut self, bytes: u64) -> Result<()> {
+    fn binary(&mut self, bytes: u64) -> Result<(), Refusal> {
         let raw = self.counted(bytes)?;
         self.push(Value::Bytes(raw))
     }
 
-    fn remember(&mut self, index: u64) -> Result<()> {
+    fn remember(&mut self, index: u64) -> Result<(), Refusal> {
         let value = self.peek()?;
         if self.memo.len() >= MOST_MEMO && !self.memo.contains_key(&index) {
-            return Err(self.wrong(format!("more than {MOST_MEMO} numbered values"), "fewer"));
+            return Err(Refusal::new(format!("more than {MOST_MEMO} numbered values"), "fewer"));
         }
         self.memo.insert(index, value);
         Ok(())
     }
 
-    fn recall(&mut self, index: u64) -> Result<()> {
+    fn recall(&mut self, index: u64) -> Result<(), Refusal> {
         match self.memo.get(&index) {
             Some(value) => self.push(*value),
-            None => Err(self.wrong(format!("number {index}"), "a value that was numbered before")),
+            None => Err(Refusal::new(format!("number {index}"), "a value that was numbered before")),
         }
     }
 
-    fn append(&mut self, items: Vec<Value<'a>>) -> Result<()> {
+    fn append(&mut self, items: Vec<Value<'a>>) -> Result<(), Refusal> {
         let list = self.peek()?;
         match self.node_mut(list) {
             Some(Node::List(all)) => {
                 all.extend(items);
                 Ok(())
             }
-            _ => Err(self.wrong(self.heap.kind(list), "a list to append to")),
+            _ => Err(Refusal::new(self.heap.kind(list), "a list to append to")),
         }
     }
 
-    fn set_items(&mut self, items: Vec<Value<'a>>) -> Result<()> {
+    fn set_items(&mut self, items: Vec<Value<'a>>) -> Result<(), Refusal> {
         let (pairs, rest) = items.as_chunks::<2>();
-        if !rest.is_empty() {
-            return Err(self.wrong("a key without a value", "pairs of key and value"));
-        }
+        Refusal::unless(rest.is_empty(), "a key without a value", "pairs of key and value")?;
         let dict = self.peek()?;
         match self.node_mut(dict) {
             Some(Node::Dict(all)) if all.len() + pairs.len() > MOST_KEYS => {
                 let found = format!("a dict of {} keys or more", all.len() + pairs.len());
-                Err(self.wrong(found, format!("at most {MOST_KEYS}: a scan has a dozen")))
+                Err(Refusal::new(found, format!("at most {MOST_KEYS}: a scan has a dozen")))
             }
             Some(Node::Dict(all)) => {
                 all.extend(pairs.iter().map(|[k, v]| (*k, *v)));
                 Ok(())
             }
-            _ => Err(self.wrong(self.heap.kind(dict), "a dict to add to")),
+            _ => Err(Refusal::new(self.heap.kind(dict), "a dict to add to")),
         }
     }
 
@@ -396,66 +382,56 @@ impl<'a> Machine<'_, 'a> {
         }
     }
 
-    fn global(&mut self, module: &str, name: &str) -> Result<()> {
-        let global = Global::find(module, name).map_err(|r| self.refuse(r))?;
-        self.push(Value::Global(global))
+    fn global(&mut self, module: &str, name: &str) -> Result<(), Refusal> {
+        self.push(Value::Global(Global::find(module, name)?))
     }
 
     /// REDUCE, which calls a function in Python: creates the objects of the few known names.
-    fn reduce(&mut self) -> Result<()> {
+    fn reduce(&mut self) -> Result<(), Refusal> {
         let arguments = self.pop()?;
         let Value::Global(global) = self.pop()? else {
-            return Err(self.wrong("a call of something that is no name", "data only"));
+            return Err(Refusal::new("a call of something that is no name", "data only"));
         };
         match global {
             Global::Reconstruct => match self.heap.tuple(arguments) {
                 Some([Value::Global(Global::Ndarray), _, _]) => self.make(Node::Array(None)),
-                _ => Err(self.wrong(self.heap.kind(arguments), "numpy.ndarray with a shape and a type")),
+                _ => Err(Refusal::new(self.heap.kind(arguments), "numpy.ndarray with a shape and a type")),
             },
-            Global::FromBuffer => {
-                let array = Array::from_buffer(&self.heap, arguments).map_err(|r| self.refuse(r))?;
-                self.make(Node::Array(Some(array)))
-            }
+            Global::FromBuffer => self.make(Node::Array(Some(Array::from_buffer(&self.heap, arguments)?))),
             Global::Dtype => {
                 let name = self.heap.items(arguments).and_then(|a| self.heap.text(*a.first()?));
-                let name = name.ok_or_else(|| self.wrong(self.heap.kind(arguments), "the name of a dtype"))?;
-                let dtype = Dtype::named(name).map_err(|r| self.refuse(r))?;
-                self.make(Node::Dtype(dtype))
+                let name = name.ok_or_else(|| Refusal::new(self.heap.kind(arguments), "the name of a dtype"))?;
+                self.make(Node::Dtype(Dtype::named(name)?))
             }
-            Global::Scalar => {
-                let value = numpy::scalar(&self.heap, arguments).map_err(|r| self.refuse(r))?;
-                self.push(value)
-            }
+            Global::Scalar => self.push(numpy::scalar(&self.heap, arguments)?),
             Global::Encode => self.encode(arguments),
-            Global::Ndarray => Err(self.wrong(format!("a call of {}", global.name()), "data only")),
+            Global::Ndarray => Err(Refusal::new(format!("a call of {}", global.name()), "data only")),
         }
     }
 
     /// Protocol 2 has no bytes: Python writes them as text and decodes it with `_codecs.encode`.
-    fn encode(&mut self, arguments: Value<'a>) -> Result<()> {
+    fn encode(&mut self, arguments: Value<'a>) -> Result<(), Refusal> {
         let text = match self.heap.tuple(arguments) {
             Some([Value::Text(text), codec]) if matches!(self.heap.text(codec), Some("latin1" | "latin-1")) => text,
-            _ => return Err(self.wrong(self.heap.kind(arguments), "a text and \"latin1\"")),
+            _ => return Err(Refusal::new(self.heap.kind(arguments), "a text and \"latin1\"")),
         };
         // Encoding one text repeatedly would create more than the file holds.
         self.encoded += text.len();
-        if self.encoded > self.bytes.len() {
-            return Err(self.wrong("the same text encoded again and again", "every text at most once"));
-        }
+        let once = self.encoded <= self.bytes.len();
+        Refusal::unless(once, "the same text encoded again and again", "every text at most once")?;
         let bytes = text.chars().map(|c| u8::try_from(u32::from(c)).ok()).collect::<Option<Vec<u8>>>();
-        let bytes = bytes.ok_or_else(|| self.wrong("a character past U+00FF", "bytes as text"))?;
+        let bytes = bytes.ok_or_else(|| Refusal::new("a character past U+00FF", "bytes as text"))?;
         self.make(Node::Encoded(bytes))
     }
 
-    fn build(&mut self) -> Result<()> {
+    fn build(&mut self) -> Result<(), Refusal> {
         let state = self.pop()?;
         let object = self.peek()?;
         let built = match self.heap.node(object) {
             Some(Node::Dtype(d)) => d.with_state(&self.heap, state).map(Node::Dtype),
             Some(Node::Array(None)) => Array::from_state(&self.heap, state).map(|a| Node::Array(Some(a))),
             _ => Err(Refusal::new(self.heap.kind(object), "an array or a dtype to set the state of")),
-        };
-        let built = built.map_err(|r| self.refuse(r))?;
+        }?;
         if let Some(node) = self.node_mut(object) {
             *node = built;
         }

@@ -7,6 +7,7 @@
 
 use crate::orbit::{common_orbit, written};
 use crate::scan::DataSet;
+use crate::size::product;
 use crate::text::{self, shortened, unread};
 use crate::unit::{self, Reading, Units};
 use crate::{ScanSize, folder, memory, npy, rays, write_atomic, write_folder_atomic, write_text_atomic};
@@ -17,7 +18,7 @@ use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
 use serde::Deserialize;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 use std::path::Path;
 
 /// The file that describes the folder.
@@ -38,9 +39,6 @@ struct Meta {
 struct Frame {
     file_path: String,
     angle: f64,
-    /// The keys that are not read.
-    #[serde(flatten)]
-    rest: Map<String, Value>,
 }
 
 #[derive(Deserialize)]
@@ -59,9 +57,6 @@ struct Scanner {
     offOrigin: [f64; 3],
     #[serde(default)]
     offDetector: [f64; 2],
-    /// The keys that are not read.
-    #[serde(flatten)]
-    rest: Map<String, Value>,
 }
 
 /// Reads R2-Gaussian's folder: training views, test views if `with_test` says so, and the volume.
@@ -73,7 +68,7 @@ struct Scanner {
 pub(crate) fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
     let meta = text::read(&file)?;
-    text::warn(&file.display().to_string(), unread(&others(&meta)));
+    text::warn(&file.display().to_string(), unread(&others(&text::read(&file)?)));
     described(folder, meta, with_test)
 }
 
@@ -82,12 +77,15 @@ pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
     described(folder, text::read(&folder.join(META))?, false).map(|r| r.volume)
 }
 
-/// Keys of the scanner that do not move source, detector or volume, beside those of noise.
-const STILL: [&str; 4] = ["filter", "accuracy", "totalAngle", "startAngle"];
+/// Keys of the scanner that are read, and those that do not move source, detector or volume, beside those of noise.
+const KNOWN: [&str; 15] = [
+    "mode", "DSD", "DSO", "nDetector", "sDetector", "dDetector", "nVoxel", "sVoxel", "dVoxel", "offOrigin",
+    "offDetector", "filter", "accuracy", "totalAngle", "startAngle",
+];
 
 /// Numbers other than 0 in a description that are not read: of the scanner (TIGRE's `rotDetector` and `COR`, say) and of
 /// single views.
-fn others(meta: &Meta) -> Vec<String> {
+fn others(meta: &Value) -> Vec<String> {
     fn set(value: &Value) -> bool {
         match value {
             Value::Number(n) => n.as_f64() != Some(0.0),
@@ -95,15 +93,20 @@ fn others(meta: &Meta) -> Vec<String> {
             _ => false,
         }
     }
-    let moving = |key: &str| !STILL.contains(&key) && !key.to_lowercase().contains("noise");
+    let moving = |key: &str| !KNOWN.contains(&key) && !key.to_lowercase().contains("noise");
     let mut all = Vec::new();
-    for (key, value) in meta.scanner.rest.iter().filter(|(key, value)| moving(key) && set(value)) {
+    for (key, value) in
+        meta["scanner"].as_object().into_iter().flatten().filter(|(key, value)| moving(key) && set(value))
+    {
         all.push(format!("scanner.{key} = {}", shortened(&value.to_string()).trim_matches('"')));
     }
-    for (split, frames) in [("proj_train", &meta.proj_train), ("proj_test", &meta.proj_test)] {
-        let mut keys = frames.iter().enumerate().flat_map(|(i, f)| f.rest.iter().map(move |(key, v)| (i, key, v)));
-        let stranger = keys.find(|(.., value)| set(value));
-        all.extend(stranger.map(|(i, key, _)| format!("{split}[{i}].{key}")));
+    for split in ["proj_train", "proj_test"] {
+        let stranger = meta[split].as_array().into_iter().flatten().enumerate().find_map(|(i, frame)| {
+            let mut keys = frame.as_object().into_iter().flatten();
+            let (key, _) = keys.find(|(key, value)| !["file_path", "angle"].contains(&&key[..]) && set(value))?;
+            Some(format!("{split}[{i}].{key}"))
+        });
+        all.extend(stranger);
     }
     all
 }
@@ -141,10 +144,9 @@ fn described(folder: &Path, meta: Meta, with_test: bool) -> Result<DataSet> {
 pub(crate) fn size(folder: &Path) -> Result<ScanSize> {
     let file = folder.join(META);
     let meta: Meta = text::read(&file)?;
-    let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
-    let pixels_of = |frames: &[Frame]| product(&meta.scanner.nDetector).saturating_mul(frames.len() as u64);
+    let pixels_of = |frames: &[Frame]| product(meta.scanner.nDetector).saturating_mul(frames.len() as u64);
     let (pixels, test_pixels) = (pixels_of(&meta.proj_train), pixels_of(&meta.proj_test));
-    let voxels = product(&meta.scanner.nVoxel);
+    let voxels = product(meta.scanner.nVoxel);
     let volume = if meta.vol.is_some() { voxels } else { 0 };
     let (reading, views) = (pixels.max(volume).saturating_mul(4), meta.proj_train.len());
     Ok(ScanSize { pixels, voxels, test_pixels, reading, views })
@@ -180,13 +182,8 @@ fn each<const N: usize>(
     one: Option<[f64; N]>,
 ) -> Result<[f64; N]> {
     let fields = |p: &str| format!("scanner.{p}{what}");
-    ensure(
-        n.iter().all(|&n| n > 0),
-        place,
-        &fields("n"),
-        format!("{n:?}"),
-        format!("at least 1 along each of {axes}"),
-    )?;
+    let expected = format!("at least 1 along each of {axes}");
+    ensure(n.iter().all(|&n| n > 0), place, &fields("n"), format!("{n:?}"), expected)?;
     let divided = whole.map(|w| std::array::from_fn(|k| w[k] / n[k] as f64));
     let (field, size): (_, [f64; N]) = match (one, divided) {
         (Some(d), Some(w)) => {
@@ -198,13 +195,9 @@ fn each<const N: usize>(
         (None, Some(w)) => (fields("s"), w),
         (None, None) => return Err(Error::invalid(place, fields("s"), "nothing", format!("lengths along {axes}"))),
     };
-    ensure(
-        size.iter().all(|s| s.is_finite() && *s > 0.0),
-        place,
-        &field,
-        format!("{:?}", one.or(whole).unwrap_or(size)),
-        format!("positive finite lengths along {axes}"),
-    )?;
+    let fits = size.iter().all(|s| s.is_finite() && *s > 0.0);
+    let expected = format!("positive finite lengths along {axes}");
+    ensure(fits, place, &field, format!("{:?}", one.or(whole).unwrap_or(size)), expected)?;
     Ok(size)
 }
 
@@ -245,11 +238,11 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
     let place = folder.display().to_string();
     let (orbit, test_orbit) = common_orbit(&place, "R2-Gaussian's format", train, test, volume)?;
     let known = |n: &str| [META, "proj_train", "proj_test", "vol_gt.npy"].contains(&n);
-    folder::may_replace(folder, "R2-Gaussian folder", known, &[META])?;
+    folder::may_replace(folder, "R2-Gaussian folder", &known, &[META])?;
     for split in ["proj_train", "proj_test"] {
         let known = |n: &str| n.starts_with(&format!("{split}_")) && n.ends_with(".npy");
         let first = format!("{split}_0000.npy");
-        folder::may_replace(&folder.join(split), "R2-Gaussian folder", known, &[&first])?;
+        folder::may_replace(&folder.join(split), "R2-Gaussian folder", &known, &[&first])?;
     }
 
     let mm = train.unit.mm;
@@ -289,13 +282,13 @@ pub fn write_r2(folder: impl AsRef<Path>, train: &Scan, test: Option<&Scan>, vol
     }
     let text = serde_json::to_string_pretty(&meta)
         .map_err(|e| Error::invalid(&place, META, e, "numbers that JSON can hold"))?;
-    write_folder_atomic(folder, |new| {
+    write_folder_atomic(folder, &mut |new| {
         for (split, scan) in [("proj_train", Some(train)), ("proj_test", test)] {
             let sub = new.join(split);
             std::fs::create_dir(&sub).map_err(|e| Error::io(&sub, e))?;
             for (i, view) in scan.iter().flat_map(|s| s.projections.axis_iter(Axis(0))).enumerate() {
                 let path = sub.join(format!("{split}_{i:04}.npy"));
-                write_atomic(&path, |w| npy::write(w, &path, &view.to_owned()))?;
+                write_atomic(&path, &mut |w| npy::write(w, &path, &view.to_owned()))?;
             }
         }
         if let Some(v) = volume {

@@ -34,6 +34,12 @@ pub(crate) struct Projection {
     pub detector: [f64; 2],
 }
 
+/// The names of their elements.
+const NAMES: [&str; 9] = [
+    "SourceToIsocenterDistance", "SourceToDetectorDistance", "GantryAngle", "OutOfPlaneAngle", "InPlaneAngle",
+    "SourceOffsetX", "SourceOffsetY", "ProjectionOffsetX", "ProjectionOffsetY",
+];
+
 /// Converts RTK's axes to conefield's.
 fn ours(p: Vec3) -> Vec3 {
     [p[2], p[0], p[1]]
@@ -44,21 +50,17 @@ fn theirs(p: Vec3) -> Vec3 {
 }
 
 impl Projection {
+    /// The numbers, in the order of [`NAMES`].
+    fn numbers(&mut self) -> [&mut f64; NAMES.len()] {
+        let Self { sid, sdd, gantry, out_of_plane, in_plane, source: [sx, sy], detector: [dx, dy] } = self;
+        [sid, sdd, gantry, out_of_plane, in_plane, sx, sy, dx, dy]
+    }
+
     /// The number that an element of this name sets.
     fn field(&mut self, name: &str) -> Option<&mut f64> {
-        Some(match name {
-            "SourceToIsocenterDistance" => &mut self.sid,
-            "SourceToDetectorDistance" => &mut self.sdd,
-            // The second name is from old files.
-            "GantryAngle" | "Angle" => &mut self.gantry,
-            "OutOfPlaneAngle" => &mut self.out_of_plane,
-            "InPlaneAngle" => &mut self.in_plane,
-            "SourceOffsetX" => &mut self.source[0],
-            "SourceOffsetY" => &mut self.source[1],
-            "ProjectionOffsetX" => &mut self.detector[0],
-            "ProjectionOffsetY" => &mut self.detector[1],
-            _ => return None,
-        })
+        // The second name is from old files.
+        let at = NAMES.iter().position(|n| *n == name || (*n == "GantryAngle" && name == "Angle"))?;
+        self.numbers().into_iter().nth(at)
     }
 
     /// The rotated axes in RTK's world, one per row.
@@ -140,8 +142,7 @@ impl Projection {
 ///
 /// As in RTK, a number that a projection omits is inherited from the projection before. Refuses a matrix that
 /// contradicts the numbers, a cylindrical detector and a parallel beam.
-pub fn read_rtk_geometry(path: impl AsRef<Path>, pixel: [f64; 2], offset: [f64; 2]) -> Result<Vec<View>> {
-    let path = path.as_ref();
+pub fn read_rtk_geometry(path: &Path, pixel: [f64; 2], offset: [f64; 2]) -> Result<Vec<View>> {
     let place = path.display().to_string();
     let text = read_foreign(path, LONGEST)?;
     let document = text::xml(&place, &text, "RTK's geometry")?;
@@ -235,24 +236,14 @@ pub(crate) fn write_rtk_geometry(path: &Path, views: &[View]) -> Result<bool> {
         let all = [view.source, view.detector, view.u, view.v];
         let finite = all.iter().flatten().all(|x| x.is_finite());
         ensure(finite, &place, &field, "a number that is not finite", "finite millimetres")?;
-        let (p, r) = Projection::of(view)
+        let (mut p, r) = Projection::of(view)
             .ok_or_else(|| Error::invalid(&place, &field, "detector axes askew", "rows and columns at right angles"))?;
         if *reversed.get_or_insert(r) != r {
             let expected = "rows that run the same way in every view";
             return Err(Error::invalid(place, field, "rows against those of the first view", expected));
         }
         text.push_str("  <Projection>\n");
-        for (name, x) in [
-            ("SourceToIsocenterDistance", p.sid),
-            ("SourceToDetectorDistance", p.sdd),
-            ("GantryAngle", p.gantry),
-            ("OutOfPlaneAngle", p.out_of_plane),
-            ("InPlaneAngle", p.in_plane),
-            ("SourceOffsetX", p.source[0]),
-            ("SourceOffsetY", p.source[1]),
-            ("ProjectionOffsetX", p.detector[0]),
-            ("ProjectionOffsetY", p.detector[1]),
-        ] {
+        for (name, x) in NAMES.iter().zip(p.numbers()) {
             text.push_str(&format!("    <{name}>{x}</{name}>\n"));
         }
         text.push_str("    <Matrix>\n");

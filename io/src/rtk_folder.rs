@@ -36,7 +36,7 @@ pub fn write_rtk(folder: impl AsRef<Path>, scan: &Scan) -> Result<()> {
         let expected = format!("{pixel:?} mm, as in the first view");
         ensure(same, &place, &format!("views[{i}]: pixel"), format!("{found:?} mm"), expected)?;
     }
-    folder::may_replace(folder, "folder for RTK", |n| [PROJECTIONS, GEOMETRY, SCANNER].contains(&n), &[GEOMETRY])?;
+    folder::may_replace(folder, "folder for RTK", &|n| [PROJECTIONS, GEOMETRY, SCANNER].contains(&n), &[GEOMETRY])?;
     let description = json!({
         "format": scanner::FORMAT,
         "version": scanner::VERSION,
@@ -47,14 +47,14 @@ pub fn write_rtk(folder: impl AsRef<Path>, scan: &Scan) -> Result<()> {
     });
     let text = toml::to_string(&description)
         .map_err(|e| conefield_core::Error::invalid(&place, SCANNER, e, "a description that TOML can hold"))?;
-    write_folder_atomic(folder, |new| {
+    write_folder_atomic(folder, &mut |new| {
         let reversed = rtk::write_rtk_geometry(&new.join(GEOMETRY), views)?;
         let mut data = scan.projections.view();
         if reversed {
             data.invert_axis(Axis(1));
         }
         let (path, mut image) = (new.join(PROJECTIONS), Image { data: data.reversed_axes(), pixel });
-        write_atomic(&path, |w| metaimage::write(w, &path, &mut image))?;
+        write_atomic(&path, &mut |w| metaimage::write(w, &path, &mut image))?;
         write_text_atomic(new.join(SCANNER), &text)
     })
 }

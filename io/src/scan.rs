@@ -37,13 +37,7 @@ pub(crate) enum ScanFile {
 /// (`scanner.toml` or a vendor's file, see [`read_scanner`](crate::read_scanner)). For folders, the path may also
 /// name the description file.
 pub fn read_scan(path: impl AsRef<Path>) -> Result<Stored> {
-    let scan = match find(path.as_ref())? {
-        ScanFile::Own(file) => scan_folder::read(&file),
-        ScanFile::R2(folder) => r2::read(&folder, false).map(|r| r.train),
-        ScanFile::Naf(file) => naf::read(&file, false).map(|r| r.train),
-        ScanFile::Scanner(file) => return scanner::read_scanner(&file, None, None),
-    };
-    scan.map(Stored::Scan)
+    read_data_set(path.as_ref(), Parts { tests: false, volume: false }).map(|set| set.train)
 }
 
 /// What to read beside the training views.
@@ -64,10 +58,13 @@ impl Parts {
 pub fn read_data_set(path: impl AsRef<Path>, parts: Parts) -> Result<DataSet<Stored>> {
     let DataSet { train, test, volume } = match find(path.as_ref())? {
         ScanFile::R2(folder) => r2::read(&folder, parts.tests)?,
-        ScanFile::Naf(file) if parts.tests || parts.volume => naf::read(&file, parts.tests)?,
-        _ => {
-            let volume = if parts.volume { read_truth(&path)? } else { None };
-            return Ok(DataSet { train: read_scan(&path)?, test: None, volume });
+        ScanFile::Naf(file) => naf::read(&file, parts.tests)?,
+        ScanFile::Own(file) => {
+            let volume = if parts.volume { scan_folder::read_truth(&file)? } else { None };
+            DataSet { train: scan_folder::read(&file)?, test: None, volume }
+        }
+        ScanFile::Scanner(file) => {
+            return Ok(DataSet { train: scanner::read_scanner(&file, None, None)?, test: None, volume: None });
         }
     };
     Ok(DataSet { train: Stored::Scan(train), test, volume })

@@ -24,6 +24,7 @@
 
 use crate::folder::{self, folder_of};
 use crate::scanner::MOST_VIEWS;
+use crate::size::product;
 use crate::text::described;
 use crate::{ScanSize, npy, read_volume, write_atomic, write_folder_atomic, write_text_atomic, write_volume};
 use conefield_core::error::ensure;
@@ -155,8 +156,7 @@ pub(crate) fn size(file: &Path) -> Result<ScanSize> {
     let mut d = describe(file)?;
     d.volume.validate(&place)?;
     let views = views(&place, &mut d)?.len();
-    let pixels = [views, d.detector.rows, d.detector.columns];
-    let pixels = pixels.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
+    let pixels = product([views, d.detector.rows, d.detector.columns]);
     Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, test_pixels: 0, reading: 0, views })
 }
 
@@ -185,7 +185,7 @@ pub fn write_scan(folder: impl AsRef<Path>, scan: &Scan, truth: Option<&Volume>)
     let place = folder.display().to_string();
     scan.validate(&place)?;
     let known = |n: &str| ["scan.toml", "scan.json", PROJECTIONS, TRUTH].contains(&n);
-    folder::may_replace(folder, "conefield scan", known, &["scan.toml", "scan.json"])?;
+    folder::may_replace(folder, "conefield scan", &known, &["scan.toml", "scan.json"])?;
     let g = &scan.geometry;
     let orbit = CircularOrbit::fit(&g.views).map(|o| OrbitTable {
         dso: o.dso,
@@ -216,10 +216,10 @@ pub fn write_scan(folder: impl AsRef<Path>, scan: &Scan, truth: Option<&Volume>)
     };
     let text = toml::to_string(&description)
         .map_err(|e| Error::invalid(&place, "scan.toml", e, "a description that TOML can hold"))?;
-    write_folder_atomic(folder, |new| {
+    write_folder_atomic(folder, &mut |new| {
         write_text_atomic(new.join("scan.toml"), &text)?;
         let path = new.join(PROJECTIONS);
-        write_atomic(&path, |w| npy::write(w, &path, &scan.projections))?;
+        write_atomic(&path, &mut |w| npy::write(w, &path, &scan.projections))?;
         truth.map_or(Ok(()), |t| write_volume(new.join(TRUTH), t))
     })
 }

@@ -64,7 +64,7 @@ pub(crate) use vendor::{MOST_VIEWS, is_vendors};
 use crate::hdf5::ScanPart;
 use crate::rtk::read_rtk_geometry;
 use crate::stack::{self, Names, StackAxis, StackLayout};
-use crate::table::{self, Numbers};
+use crate::table::Numbers;
 use crate::text::{self, described};
 use crate::{ScanSize, folder, foreign, memory};
 use conefield_core::error::ensure;
@@ -87,12 +87,23 @@ const VECTOR: usize = 12;
 const GEOMETRIES: &str = "one of [circle], [vectors], [rtk] and [cil]";
 
 /// The open-beam counts if there is no flat field.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(try_from = "Value")]
 pub enum I0 {
     /// The same for every pixel and view, dark value included.
     Number(f64),
     /// Estimated from the border of each view; see [`OpenBeam::Air`].
     Air,
+}
+
+impl TryFrom<Value> for I0 {
+    type Error = String;
+
+    fn try_from(value: Value) -> Result<Self, String> {
+        let number = value.as_f64().map(Self::Number);
+        let air = (value == "air").then_some(Self::Air);
+        number.or(air).ok_or_else(|| text::misfit(&value, "a number of counts or \"air\""))
+    }
 }
 
 /// Source of the open-beam counts. All are as the detector reports them, dark value included.
@@ -198,7 +209,7 @@ impl Description {
 
 /// Refuses a folder or a file of images in place of the text that describes them.
 fn refuse_images(path: &Path) -> Result<()> {
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let extension = folder::extension(path);
     let found = match &extension[..] {
         _ if path.is_dir() => "a folder".to_owned(),
         "tif" | "tiff" | "npy" | "npz" | "mat" | "mha" | "h5" | "hdf5" | "nxs" => {
@@ -260,15 +271,15 @@ struct Circle {
     start_deg: f64,
     step_deg: Option<f64>,
     range_deg: Option<f64>,
-    angles_deg: Option<Numbers<f64>>,
+    angles_deg: Option<Numbers>,
     direction: Direction,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Vectors {
-    cone_vec: Option<Numbers<Vec<f64>>>,
-    parallel_vec: Option<Numbers<Vec<f64>>>,
+    cone_vec: Option<Numbers>,
+    parallel_vec: Option<Numbers>,
 }
 
 #[derive(Deserialize)]
@@ -302,18 +313,11 @@ enum ValueKind {
     LineIntegrals,
 }
 
-#[derive(Deserialize)]
-#[serde(untagged, expecting = "a number of counts or \"air\"")]
-enum I0Text {
-    Number(f64),
-    Word(String),
-}
-
 #[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields, default)]
 struct ValuesTable {
     kind: ValueKind,
-    i0: Option<I0Text>,
+    i0: Option<I0>,
     floor: Option<f64>,
     flat_includes_dark: Option<bool>,
 }
@@ -433,20 +437,12 @@ fn layout(place: &str, table: &LayoutTable) -> Result<StackLayout> {
 
 /// The single open-beam value, or `None` if there is a flat field. Refuses contradictions.
 fn open_beam(place: &str, d: &Description, i0: Option<I0>, floor: Option<f64>) -> Result<Option<I0>> {
-    let said = match &d.values.i0 {
-        None => None,
-        Some(I0Text::Number(n)) => Some(I0::Number(*n)),
-        Some(I0Text::Word(w)) if w == "air" => Some(I0::Air),
-        Some(I0Text::Word(w)) => {
-            let expected = "a number of counts or \"air\"";
-            return Err(Error::invalid(place, "values.i0", format!("\"{w}\""), expected));
-        }
-    };
+    let said = d.values.i0;
     let flat = d.files.flat.is_some();
-    if d.values.flat_includes_dark.is_some() && !(flat && d.files.dark.is_some()) {
-        let found = "a value without both files.flat and files.dark";
-        return Err(Error::invalid(place, "values.flat_includes_dark", found, "both files, or no such value"));
-    }
+    let found = "a value without both files.flat and files.dark";
+    let fits = d.values.flat_includes_dark.is_none() || (flat && d.files.dark.is_some());
+    let expected = "both files, or no such value";
+    ensure(fits, place, "values.flat_includes_dark", found, expected)?;
     if d.values.kind == ValueKind::LineIntegrals {
         let field = match (flat, d.files.dark.is_some(), said.or(i0), floor.or(d.values.floor)) {
             (true, ..) => "files.flat",
@@ -458,9 +454,7 @@ fn open_beam(place: &str, d: &Description, i0: Option<I0>, floor: Option<f64>) -
         let found = "a value beside values.kind = \"line-integrals\"";
         return Err(Error::invalid(place, field, found, "nothing, or kind = \"counts\""));
     }
-    if flat && said.is_some() {
-        return Err(Error::invalid(place, "values.i0", "i0 beside files.flat", "one of them"));
-    }
+    ensure(!(flat && said.is_some()), place, "values.i0", "i0 beside files.flat", "one of them")?;
     if flat && i0.is_some() {
         tracing::info!("{place}: --i0 replaces files.flat, which is not read");
     }
@@ -475,7 +469,7 @@ fn views(folder: &Path, place: &str, d: &Description, count: usize) -> Result<Ve
         (_, None, None, Some(r), None) => {
             lengths(place, "rtk", r.pixel, r.offset)?;
             let file = folder::inside(folder, place, "rtk.file", &r.file)?;
-            ("rtk.file", read_rtk_geometry(file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?)
+            ("rtk.file", read_rtk_geometry(&file, [r.pixel.v, r.pixel.u], [r.offset.v, r.offset.u])?)
         }
         (_, None, None, None, Some(c)) => {
             ("cil.file", cil::views(&folder::inside(folder, place, "cil.file", &c.file)?)?)
@@ -516,13 +510,8 @@ fn vectors(folder: &Path, place: &str, v: &Vectors, volume: &VoxelGrid) -> Resul
             return Err(Error::invalid(place, "vectors", found, "one of cone_vec and parallel_vec"));
         }
     };
-    let rows = match rows {
-        Numbers::List(rows) => rows.clone(),
-        Numbers::File(name) => table::read(folder, place, field, name, VECTOR)?,
-    };
+    let rows = rows.rows(folder, place, field, VECTOR)?;
     let view = |(i, n): (usize, &Vec<f64>)| {
-        let field = format!("{field}[{i}]");
-        ensure(n.len() == VECTOR, place, &field, format!("{} numbers", n.len()), format!("{VECTOR}"))?;
         let part = |k: usize| [n[k], n[k + 1], n[k + 2]];
         let view = View { source: part(0), detector: part(3), u: part(6), v: part(9) };
         if v.cone_vec.is_some() {
@@ -530,7 +519,8 @@ fn vectors(folder: &Path, place: &str, v: &Vectors, volume: &VoxelGrid) -> Resul
         }
         let long = norm(view.source);
         let expected = "a direction: three finite numbers, not all 0";
-        ensure(long.is_finite() && long > 0.0, place, &field, format!("{:?}", view.source), expected)?;
+        let (found, field) = (format!("{:?}", view.source), format!("{field}[{i}]"));
+        ensure(long.is_finite() && long > 0.0, place, &field, found, expected)?;
         Ok(view.parallel(view.source.map(|x| x / long), volume))
     };
     Ok((field, rows.iter().enumerate().map(view).collect::<Result<_>>()?))
@@ -567,24 +557,10 @@ fn lengths(place: &str, table: &str, pixel: Uv, offset: Uv) -> Result<()> {
 
 /// The angles in radians.
 fn angles(folder: &Path, place: &str, c: &Circle, count: usize) -> Result<Vec<f64>> {
-    let finite = |field: &str, x: f64| ensure(x.is_finite(), place, field, x, "a finite number of degrees");
-    finite("circle.start_deg", c.start_deg)?;
     let from_start: Vec<f64> = match (c.step_deg, c.range_deg, &c.angles_deg) {
-        (Some(step), None, None) => {
-            finite("circle.step_deg", step)?;
-            (0..count).map(|i| step * i as f64).collect()
-        }
-        (None, Some(range), None) => {
-            finite("circle.range_deg", range)?;
-            (0..count).map(|i| range * i as f64 / count as f64).collect()
-        }
-        (None, None, Some(Numbers::File(name))) => table::read(folder, place, "circle.angles_deg", name, 1)?.concat(),
-        (None, None, Some(Numbers::List(list))) => {
-            for (i, a) in list.iter().enumerate() {
-                finite(&format!("circle.angles_deg[{i}]"), *a)?;
-            }
-            list.clone()
-        }
+        (Some(step), None, None) => (0..count).map(|i| step * i as f64).collect(),
+        (None, Some(range), None) => (0..count).map(|i| range * i as f64 / count as f64).collect(),
+        (None, None, Some(list)) => list.rows(folder, place, "circle.angles_deg", 1)?.concat(),
         (None, None, None) => {
             let expected = "step_deg, range_deg or angles_deg";
             return Err(Error::invalid(place, "circle.step_deg", "no angles", expected));

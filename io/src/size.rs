@@ -1,8 +1,7 @@
 //! Sizes of scans and volumes, read from their headers before memory is allocated.
 
 use crate::scan::{self, ScanFile};
-use crate::volume::{self, VolumeFile};
-use crate::{dicom, metaimage, nifti, npy, nrrd, r2, scan_folder, scanner, tiff, zarr};
+use crate::{r2, scan_folder, scanner, volume};
 use conefield_core::error::ensure;
 use conefield_core::scan::ScanHeader;
 use conefield_core::{Error, Result};
@@ -68,33 +67,22 @@ fn checked(path: &Path, size: ScanSize) -> Result<ScanSize> {
 /// Number of voxels of a volume, from its header, or for a DICOM series and TIFF files from the headers of the slices.
 pub fn volume_voxels(path: impl AsRef<Path>) -> Result<u64> {
     let path = path.as_ref();
-    let product = |shape: &[usize]| shape.iter().fold(1, |n: u64, &s| n.saturating_mul(s as u64));
-    let voxels = match volume::open(path)? {
-        VolumeFile::Series => dicom::voxels(path)?,
-        VolumeFile::Enhanced => dicom::enhanced::voxels(path)?,
-        VolumeFile::Slices => tiff::folder_voxels(path)?,
-        VolumeFile::Zarr => product(&zarr::shape(path)?),
-        VolumeFile::Npy(mut input, head) => product(&npy::shape(&mut input, head)?),
-        VolumeFile::MetaImage => product(&metaimage::shape(path)?),
-        VolumeFile::Nrrd => product(&nrrd::shape(path)?),
-        VolumeFile::Tiff => tiff::values(path)?,
-        VolumeFile::Nifti(input, head) => product(&nifti::shape_of(&input, &head)?),
-    };
+    let voxels = (volume::open(path)?.voxels)(path)?;
     must_exist(path, "voxels", voxels)?;
     Ok(voxels)
+}
+
+/// Number of values of an array of this shape, at most `u64::MAX`.
+pub(crate) fn product(shape: impl AsRef<[usize]>) -> u64 {
+    shape.as_ref().iter().fold(1, |n: u64, &s| n.saturating_mul(s as u64))
 }
 
 /// More values than any machine holds. Below this, sums of bytes stay far from overflow.
 const MOST: u64 = 1 << 48;
 
 fn must_exist(path: &Path, field: &str, n: u64) -> Result<()> {
-    ensure(
-        n <= MOST,
-        &path.display().to_string(),
-        field,
-        n,
-        format!("at most {MOST}, past which no machine holds them"),
-    )
+    let expected = format!("at most {MOST}, past which no machine holds them");
+    ensure(n <= MOST, &path.display().to_string(), field, n, expected)
 }
 
 pub(crate) fn file_bytes(path: &Path) -> Result<u64> {

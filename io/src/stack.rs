@@ -4,15 +4,17 @@
 use crate::hdf5::{self, ScanPart};
 use crate::input::Input;
 use crate::scanner::Pixels;
+use crate::size::product;
 use crate::{folder, foreign, mat, memory, metaimage, npy, npz, text, tiff};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, ArrayD, Axis, Ix3};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// Bytes of a MetaImage that suffice to recognize it.
-const LINES: usize = 256;
+/// Bytes that suffice to recognize a file: the first lines of a MetaImage.
+const HEAD: usize = 264;
 
 /// One axis of a stack.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -56,10 +58,23 @@ impl StackLayout {
 
 /// One file or several.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "a file name or a list of file names")]
+#[serde(untagged, try_from = "Value")]
 pub(crate) enum Names {
     One(String),
     Many(Vec<String>),
+}
+
+impl TryFrom<Value> for Names {
+    type Error = String;
+
+    fn try_from(value: Value) -> Result<Self, String> {
+        let name = |one: &Value| one.as_str().map(str::to_owned);
+        let names = match &value {
+            Value::Array(all) => all.iter().map(name).collect::<Option<_>>().map(Self::Many),
+            one => name(one).map(Self::One),
+        };
+        names.ok_or_else(|| text::misfit(&value, "a file name or a list of file names"))
+    }
 }
 
 /// A file and, for `.npz`, `.mat` and HDF5, the array in it.
@@ -114,37 +129,28 @@ pub(crate) fn read(
 
 /// Number of values that [`read`] returns, from the headers of its files.
 pub(crate) fn values(folder: &Path, place: &str, field: &str, names: &Names) -> Result<u64> {
-    let product = |all: &[usize]| all.iter().fold(1u64, |n, &s| n.saturating_mul(s as u64));
     let mut sum = 0u64;
     for StackFile { path, array } in sources(folder, place, field, names)?.0 {
-        let mut input = Input::open(&path)?;
-        let head = input.take(8)?;
+        let (head, array) = (Input::open(&path)?.take(HEAD)?, array.as_deref());
         sum = sum.saturating_add(if head.starts_with(npz::MAGIC) {
-            product(&npz::shape(&path, array.as_deref())?)
+            product(npz::shape(&path, array)?)
         } else if tiff::is_tiff(&head) {
             tiff::values(&path)?
         } else if head.starts_with(npy::MAGIC) {
-            product(&npy::shape(&mut input, head)?)
+            product(npy::shape(&mut Input::open(&path)?)?)
         } else if mat::is_mat(&head) {
-            product(&mat::shape(&path, array.as_deref())?)
-        } else if head == hdf5::MAGIC {
-            product(&hdf5::shape(&path, array.as_deref(), ScanPart::Projections)?)
+            product(mat::shape(&path, array)?)
+        } else if head.starts_with(hdf5::MAGIC) {
+            product(hdf5::shape(&path, array, ScanPart::Projections)?)
         } else if let Some(pixels) = Pixels::of(&head) {
-            product(&pixels.shape(&path)?)
-        } else if is_metaimage(&mut input, &head)? {
-            product(&metaimage::shape(&path)?)
+            product(pixels.shape(&path)?)
+        } else if metaimage::is_header(&head) {
+            product(metaimage::shape(&path)?)
         } else {
             0
         });
     }
     Ok(sum)
-}
-
-/// Whether a file that starts with `head` is a MetaImage.
-fn is_metaimage(input: &mut Input, head: &[u8]) -> Result<bool> {
-    let mut lines = head.to_vec();
-    lines.extend(input.take(LINES)?);
-    Ok(metaimage::is_header(&lines))
 }
 
 /// Reads a flat or dark field `[row, column]`: the mean of its images.
@@ -177,8 +183,7 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
         a.into_dimensionality::<Ix3>().map_err(|e| Error::invalid(&place, "shape", e, "two or three axes"))
     };
     let sets: &[&[&str]] = &[&["view", "row", "column"], &["row", "column"]];
-    let mut input = Input::open(path)?;
-    let head = input.take(8)?;
+    let head = Input::open(path)?.take(HEAD)?;
     if head.starts_with(npz::MAGIC) {
         return Ok((three(npz::read(path, source.array.as_deref(), sets)?)?, None));
     }
@@ -194,7 +199,7 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
             _ => a,
         })
     };
-    if head == hdf5::MAGIC {
+    if head.starts_with(hdf5::MAGIC) {
         let (values, views_first) = hdf5::read(path, source.array.as_deref(), part)?;
         let values = three(values)?;
         return Ok((if views_first { pages(values)? } else { values }, None));
@@ -204,7 +209,7 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
         return Err(Error::invalid(place, "array", format!("the name \"{array}\""), expected));
     }
     if head.starts_with(npy::MAGIC) {
-        let (array, numbers) = npy::read_counts(&mut input, head, sets)?;
+        let (array, numbers) = npy::read_counts(&mut Input::open(path)?, sets)?;
         return Ok((three(array)?, Some(numbers.to_string())));
     }
     if tiff::is_tiff(&head) {
@@ -214,14 +219,15 @@ fn raw(source: &StackFile, part: ScanPart, layout: StackLayout) -> Result<(Array
     if let Some(format) = Pixels::of(&head) {
         return Ok((pages(format.read(path, part)?)?, Some(format!("{format:?}"))));
     }
-    if is_metaimage(&mut input, &head)? {
+    if metaimage::is_header(&head) {
         // Columns are its x, rows its y.
         return Ok((pages(metaimage::read(path)?.data.reversed_axes())?, None));
     }
     foreign::refuse(path, &head)?;
     let expected = "TIFF (49 49 2a 00 or 4d 4d 00 2a), NumPy's .npy (93 4e 55 4d) or .npz (50 4b 03 04), \
                     MATLAB's .mat (4d 41 54 4c), HDF5 (89 48 44 46), MetaImage (NDims = 3), HIS, HND, HNC, XIM or TXRM";
-    Err(Error::invalid(place, "format", format!("{head:02x?} at the start"), expected))
+    let start = &head[..head.len().min(8)];
+    Err(Error::invalid(place, "format", format!("{start:02x?} at the start"), expected))
 }
 
 /// The files that `names` stand for, and what is odd about the numbers in the names of folders' files.

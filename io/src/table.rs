@@ -1,23 +1,57 @@
 //! Per-view numbers in a separate file: text (such as CSV), arrays of NumPy or MATLAB, or HDF5.
 
 use crate::input::Input;
-use crate::text::read_foreign;
+use crate::text::{misfit, read_foreign};
 use crate::{folder, hdf5, mat, npy, npz};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use serde::Deserialize;
+use serde_json::Value;
 use std::path::Path;
 
 /// Longest text, in bytes.
 const LONGEST: u64 = 64 << 20;
 
-/// A list, or the name of a file with one.
+/// Rows of numbers, or the name of a file with them.
 #[derive(Deserialize)]
-#[serde(untagged, expecting = "a list of numbers, or the name of a file with them")]
-pub(crate) enum Numbers<T> {
-    /// A list in the description.
-    List(Vec<T>),
+#[serde(try_from = "Value")]
+pub(crate) enum Numbers {
+    /// A list in the description; a row of one number may stand without brackets.
+    List(Vec<Vec<f64>>),
     /// `FILE`, `FILE.npz:ARRAY`, `FILE.mat:ARRAY`, `FILE.h5:/PATH` or `FILE.csv:COLUMN`.
     File(String),
+}
+
+impl TryFrom<Value> for Numbers {
+    type Error = String;
+
+    fn try_from(value: Value) -> Result<Self, String> {
+        let row = |one: &Value| match one {
+            Value::Array(all) => all.iter().map(Value::as_f64).collect(),
+            one => one.as_f64().map(|x| vec![x]),
+        };
+        let rows = match &value {
+            Value::String(name) => return Ok(Self::File(name.clone())),
+            Value::Array(all) => all.iter().map(row).collect::<Option<_>>(),
+            _ => None,
+        };
+        rows.map(Self::List).ok_or_else(|| misfit(&value, "a list of numbers, or the name of a file with them"))
+    }
+}
+
+impl Numbers {
+    /// The rows of `width` numbers, of the entry `field` of a description in `folder`; see [`read`].
+    pub fn rows(&self, folder: &Path, place: &str, field: &str, width: usize) -> Result<Vec<Vec<f64>>> {
+        let rows = match self {
+            Self::List(rows) => rows,
+            Self::File(name) => return read(folder, place, field, name, width),
+        };
+        for (i, row) in rows.iter().enumerate() {
+            let found = format!("{} numbers", row.len());
+            ensure(row.len() == width, place, &format!("{field}[{i}]"), found, width.to_string())?;
+        }
+        Ok(rows.clone())
+    }
 }
 
 /// Reads rows of `width` numbers from the file `name` in `folder`.
@@ -26,11 +60,10 @@ pub(crate) enum Numbers<T> {
 /// without a number are skipped. For rows of one number, `FILE.csv:NAME` selects the column NAME. HDF5 provides the
 /// named data set, or the angles of a scan's projections. Refuses rows of another width and numbers that are not
 /// finite.
-pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: usize) -> Result<Vec<Vec<f64>>> {
+fn read(folder: &Path, place: &str, field: &str, name: &str, width: usize) -> Result<Vec<Vec<f64>>> {
     let (file, part) = folder::split(name);
     let path = folder::inside(folder, place, field, file)?;
-    let mut input = Input::open(&path)?;
-    let head = input.take(8)?;
+    let head = Input::open(&path)?.take(8)?;
     let place = path.display().to_string();
     let rows = if head == hdf5::MAGIC {
         arrayed(&place, hdf5::read_exact(&path, part)?, width)?
@@ -44,7 +77,7 @@ pub(crate) fn read(folder: &Path, place: &str, field: &str, name: &str, width: u
         let expected = "an .npz archive, the only file of NumPy whose arrays have names";
         return Err(Error::invalid(place, "array", format!("the name \"{array}\""), expected));
     } else {
-        arrayed(&place, npy::read_exact(&mut input, head)?, width)?
+        arrayed(&place, npy::read_exact(&mut Input::open(&path)?)?, width)?
     };
     for (i, row) in rows.iter().enumerate() {
         if let Some(x) = row.iter().find(|x| !x.is_finite()) {
@@ -61,11 +94,9 @@ fn arrayed(place: &str, (shape, values): (Vec<usize>, Vec<f64>), width: usize) -
         [_, w] => w == width,
         _ => false,
     };
-    if !fits {
-        let alone = if width == 1 { "[views] or " } else { "" };
-        let expected = format!("{alone}[views, {width}]");
-        return Err(Error::invalid(place, "shape", format!("{shape:?}"), expected));
-    }
+    let alone = if width == 1 { "[views] or " } else { "" };
+    let expected = format!("{alone}[views, {width}]");
+    ensure(fits, place, "shape", format!("{shape:?}"), expected)?;
     Ok(values.chunks(width).map(<[f64]>::to_vec).collect())
 }
 

@@ -91,6 +91,12 @@ pub(crate) fn gzip(bytes: &[u8]) -> Vec<u8> {
     w.write_all(bytes).and_then(|()| w.finish()).unwrap()
 }
 
+/// `bytes` in zlib.
+pub(crate) fn zlib(bytes: &[u8]) -> Vec<u8> {
+    let mut w = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
+    w.write_all(bytes).and_then(|()| w.finish()).unwrap()
+}
+
 /// A file of the shared data, or `None` with a note that the test is skipped.
 pub(crate) fn data(name: &str) -> Option<PathBuf> {
     let root = std::env::var_os("CONEFIELD_DATA")
@@ -141,11 +147,11 @@ fn line_integrals(path: &Path, stored: Stored) -> Result<Scan> {
 
 /// Writes `data` to a file called `name` and reads it: values, grid and affine are the same bits, with the volume
 /// centred and with an affine of its own that turns and mirrors.
-pub(crate) fn comes_back_to_the_bit(name: &str, data: Array3<f32>) {
+pub(crate) fn comes_back_to_the_bit(name: &str, data: Array3<f32>, spacing: [f64; 3]) {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join(name);
     let count = data.len();
-    let mut volume = Volume::centered(data, [1.0 / 3.0, 0.7, 2.0]);
+    let mut volume = Volume::centered(data, spacing);
     write_volume(&path, &volume).unwrap();
     let back = read_volume(&path).unwrap();
     assert_eq!((&back.data, back.grid), (&volume.data, volume.grid));
@@ -154,7 +160,8 @@ pub(crate) fn comes_back_to_the_bit(name: &str, data: Array3<f32>) {
     let centred = back.affine.unwrap();
     let corner = volume.grid.voxel([0; 3]);
     assert_eq!(centred.map(|r| r[3]), [corner[0], corner[1], corner[2], 1.0]);
-    let turned = [[0.0, 0.7, 0.0, 5.1], [-1.0 / 3.0, 0.0, 0.0, 6.0], [0.0, 0.0, -2.0, -7.0], [0.0, 0.0, 0.0, 1.0]];
+    let [x, y, z] = spacing;
+    let turned = [[0.0, y, 0.0, 5.25], [-x, 0.0, 0.0, 6.0], [0.0, 0.0, -z, -7.0], [0.0, 0.0, 0.0, 1.0]];
     for affine in [centred, turned] {
         volume.affine = Some(affine);
         write_volume(&path, &volume).unwrap();

@@ -7,6 +7,7 @@ use conefield_core::{Error, Result, allowance, written};
 use roxmltree::{Document, ParsingOptions};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
+use serde_json::Value;
 use std::path::Path;
 
 /// The keys that identify a description.
@@ -84,6 +85,12 @@ pub(crate) fn unread(keys: &[String]) -> Option<String> {
 /// Warns of the file `place`.
 pub(crate) fn warn(place: &str, remarks: impl IntoIterator<Item = String>) {
     remarks.into_iter().for_each(|r| tracing::warn!("{place}: {r}"));
+}
+
+/// What does not fit about the `value` of a description, as `serde` says it.
+pub(crate) fn misfit(value: &Value, expected: &str) -> String {
+    let shown: String = value.to_string().chars().take(80).collect();
+    format!("{shown}, expected {expected}")
 }
 
 /// A value in quotes, cut to 80 characters for errors.

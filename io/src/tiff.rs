@@ -17,20 +17,24 @@ pub(crate) use write::{check_shape, write};
 use crate::input::must_unpack;
 use crate::number::{ByteOrder, Number};
 use crate::{memory, text};
-use conefield_core::finite::stray;
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result, allowance, files, parallel};
 use entries::AsStored;
 use images::{Calibration, Claim};
 use ndarray::Array3;
-use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::Path;
 use tiff::decoder::{ChunkType, Decoder, DecodingResult, Limits};
 use tiff::tags::Tag;
 use tiff::{ColorType, TiffError};
 
-/// The decoder of an open file.
-type Pages = Decoder<BufReader<AsStored<File>>>;
+/// Bytes that are read from any place: a file, or a page in memory.
+trait Source: Read + Seek {}
+
+impl<R: Read + Seek> Source for R {}
+
+/// The decoder of an open file. It is compiled once for all sources.
+type Pages = Decoder<Box<dyn Source>>;
 
 /// Whether `head`, the first bytes of a file, starts a TIFF or BigTIFF.
 pub(crate) fn is_tiff(head: &[u8]) -> bool {
@@ -39,7 +43,7 @@ pub(crate) fn is_tiff(head: &[u8]) -> bool {
 
 /// Number of values of all images, from the directories.
 pub(crate) fn values(path: &Path) -> Result<u64> {
-    let found = images(path, |_, _| Ok(()))?;
+    let found = images(path, &mut |_, _| Ok(()))?;
     Ok(found.size.iter().fold(found.count as u64, |n, side| n.saturating_mul(*side as u64)))
 }
 
@@ -56,17 +60,16 @@ pub(crate) struct Stack {
 /// Converts 8 to 64 bits per pixel, integers or floats, to `f32`. Refuses other colour types, sizes that the file
 /// cannot hold, values that are not finite and damaged files, and a file that holds more images than are found.
 pub(crate) fn read(path: &Path) -> Result<Stack> {
-    let (values, images) = stack(path, |_| ())?;
+    let (values, images) = stack(path, &mut |_| ())?;
     Ok(Stack { values, numbers: images.sample.to_string() })
 }
 
 /// The values as in [`read`]; `first` gets the decoder at the first page.
-fn stack(path: &Path, first: impl FnOnce(&mut Pages)) -> Result<(Array3<f32>, Images)> {
+fn stack(path: &Path, first: &mut dyn FnMut(&mut Pages)) -> Result<(Array3<f32>, Images)> {
     let place = path.display().to_string();
     let mut values = Vec::<f32>::new();
-    let mut first = Some(first);
-    let images = images(path, |decoder, page| {
-        if let Some(first) = first.take() {
+    let images = images(path, &mut |decoder, page| {
+        if values.is_empty() {
             first(decoder);
         }
         let count = usize::try_from(page.pixels).unwrap_or(usize::MAX);
@@ -101,12 +104,8 @@ fn stack(path: &Path, first: impl FnOnce(&mut Pages)) -> Result<(Array3<f32>, Im
     let [rows, columns] = images.size;
     let all = Array3::from_shape_vec((images.count, rows, columns), values)
         .map_err(|e| Error::invalid(&place, "TIFF", e, format!("{rows} x {columns} values per page")))?;
-    match stray(&all) {
-        Some(((p, r, c), x)) => {
-            Err(Error::invalid(place, format!("page {p}, row {r}, column {c}"), x, "a finite number"))
-        }
-        None => Ok((all, images)),
-    }
+    let all = memory::all_finite(&place, all, &|(p, r, c)| format!("page {p}, row {r}, column {c}"))?;
+    Ok((all, images))
 }
 
 /// How a page stores a number.
@@ -130,19 +129,8 @@ impl Sample {
 
     /// The number; `None` for floats of 16 bits, which only the `tiff` crate decodes, and unknown formats.
     fn number(self) -> Option<Number> {
-        Some(match (self.format, self.bits) {
-            (1, 8) => Number::U8,
-            (1, 16) => Number::U16,
-            (1, 32) => Number::U32,
-            (1, 64) => Number::U64,
-            (2, 8) => Number::I8,
-            (2, 16) => Number::I16,
-            (2, 32) => Number::I32,
-            (2, 64) => Number::I64,
-            (3, 32) => Number::F32,
-            (3, 64) => Number::F64,
-            _ => return None,
-        })
+        let kind = *['u', 'i', 'f'].get(usize::from(self.format).checked_sub(1)?)?;
+        Number::of(kind, usize::from(self.bits / 8))
     }
 }
 
@@ -186,7 +174,7 @@ struct Images {
 }
 
 /// Walks over the pages without decompressing them, and counts the images that have no directory.
-fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> Result<Images> {
+fn images(path: &Path, each: &mut dyn FnMut(&mut Pages, Page) -> Result<()>) -> Result<Images> {
     let place = path.display().to_string();
     let (file, packed) = files::open(path)?;
     let broken = |e: TiffError| broken(&place, &e);
@@ -195,8 +183,8 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
     let mut file = reader.into_inner();
     file.rewind().map_err(|e| Error::io(path, e))?;
     let white = directories.white.len();
-    let mut decoder =
-        Decoder::new(BufReader::new(AsStored { reader: file, white: directories.white, at: 0 })).map_err(broken)?;
+    let source = BufReader::new(AsStored { reader: file, white: directories.white, at: 0 });
+    let mut decoder: Pages = Decoder::new(Box::new(source) as Box<dyn Source>).map_err(broken)?;
     let mut first: Option<(Page, Option<Claim>, Option<Calibration>)> = None;
     let (mut pages, mut claimed, mut stored, mut end) = (0usize, [0u64; 2], 0u64, directories.end);
     loop {
@@ -208,14 +196,10 @@ fn images(path: &Path, mut each: impl FnMut(&mut Pages, Page) -> Result<()>) -> 
             let calibration = Calibration::of(&text).filter(|_| page.sample.is_calibrated());
             (page, images::claimed(&text, page.size.map(|n| n as u64)), calibration)
         });
-        if like.size != page.size {
-            let found = format!("{} x {} pixels", page.size[0], page.size[1]);
-            return Err(Error::invalid(&place, format!("page {pages}"), found, "the size of the first page"));
-        }
-        if like.sample != page.sample {
-            let expected = format!("{}, as on the first page", like.sample);
-            return Err(Error::invalid(&place, format!("page {pages}"), page.sample, expected));
-        }
+        let (at, found) = (format!("page {pages}"), format!("{} x {} pixels", page.size[0], page.size[1]));
+        ensure(like.size == page.size, &place, &at, found, "the size of the first page")?;
+        let expected = format!("{}, as on the first page", like.sample);
+        ensure(like.sample == page.sample, &place, &at, page.sample, expected)?;
         let [offsets, sizes] = pieces(&place, &mut decoder)?;
         for (at, bytes) in offsets.into_iter().zip(sizes) {
             stored = stored.saturating_add(bytes);

@@ -1,9 +1,12 @@
 //! Entry points for volumes: they recognize a file's format, and choose a format for a file name.
 
 use crate::dicom::DicomTemplate;
+use crate::folder::file_name;
 use crate::input::Input;
+use crate::size::product;
 use crate::{dicom, foreign, metaimage, nifti, npy, nrrd, pickle, scan, tiff, write_atomic, zarr};
 use conefield_core::allowance;
+use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Volume};
@@ -22,69 +25,60 @@ use std::path::Path;
 /// converted to `f32` and scaled by NIfTI's or DICOM's slope and intercept; a value that is not finite is refused.
 pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume> {
     let path = path.as_ref();
-    match open(path)? {
-        VolumeFile::Series => dicom::read(path),
-        VolumeFile::Enhanced => dicom::enhanced::read(path),
-        VolumeFile::Zarr => zarr::read(path),
-        VolumeFile::Slices => tiff::read_folder(path),
-        VolumeFile::Npy(mut input, head) => from_numpy(path, npy::read_from(&mut input, head, &["x", "y", "z"])?),
-        VolumeFile::MetaImage => metaimage::read(path),
-        VolumeFile::Nrrd => nrrd::read(path),
-        VolumeFile::Tiff => tiff::read_volume(path),
-        VolumeFile::Nifti(mut input, head) => nifti::read_from(&mut input, &head),
-    }
+    (open(path)?.read)(path)
 }
 
-/// A volume's format, with the open file and the bytes read to recognize it.
-pub(crate) enum VolumeFile {
-    /// A folder of DICOM files.
-    Series,
-    /// One DICOM file with all slices.
-    Enhanced,
-    /// A folder of OME-Zarr.
-    Zarr,
-    /// A folder of TIFF files.
-    Slices,
-    /// Eight bytes have been read.
-    Npy(Input, Vec<u8>),
-    /// The reader opens the file again, as do the next two.
-    MetaImage,
-    Nrrd,
-    Tiff,
-    /// The header has been read.
-    Nifti(Input, Vec<u8>),
+/// How volumes of a format are read.
+pub(crate) struct VolumeFile {
+    read: fn(&Path) -> Result<Volume>,
+    /// The number of voxels, from headers.
+    pub voxels: fn(&Path) -> Result<u64>,
 }
+
+/// A folder of DICOM files.
+const SERIES: VolumeFile = VolumeFile { read: dicom::read, voxels: dicom::voxels };
+/// One DICOM file with all slices.
+const ENHANCED: VolumeFile = VolumeFile { read: dicom::enhanced::read, voxels: dicom::enhanced::voxels };
+/// A folder of OME-Zarr.
+const ZARR: VolumeFile = VolumeFile { read: zarr::read, voxels: |path| zarr::shape(path).map(product) };
+/// A folder of TIFF files.
+const SLICES: VolumeFile = VolumeFile { read: tiff::read_folder, voxels: tiff::folder_voxels };
+const NPY: VolumeFile =
+    VolumeFile { read: read_numpy, voxels: |path| npy::shape(&mut Input::open(path)?).map(product) };
+const METAIMAGE: VolumeFile = VolumeFile { read: metaimage::read, voxels: |path| metaimage::shape(path).map(product) };
+const NRRD: VolumeFile = VolumeFile { read: nrrd::read, voxels: |path| nrrd::shape(path).map(product) };
+const TIFF: VolumeFile = VolumeFile { read: tiff::read_volume, voxels: tiff::values };
+const NIFTI: VolumeFile = VolumeFile { read: nifti::read, voxels: |path| nifti::shape(path).map(product) };
 
 /// Recognizes the format of a volume by its content.
 pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
     if path.is_dir() {
         if zarr::is_zarr(path) {
-            return Ok(VolumeFile::Zarr);
+            return Ok(ZARR);
         }
         let slices = tiff::is_stack(path) && !dicom::is_series(path);
-        return Ok(if slices { VolumeFile::Slices } else { VolumeFile::Series });
+        return Ok(if slices { SLICES } else { SERIES });
     }
     let mut input = Input::open(path)?;
-    let mut head = input.take(8)?;
+    let head = input.take(nifti::HEADER)?;
     if head.starts_with(npy::MAGIC) {
-        return Ok(VolumeFile::Npy(input, head));
+        return Ok(NPY);
     }
-    head.extend(input.take(nifti::HEADER - head.len())?);
     if nifti::is_second_version(&head) {
         let what = format!("{}: a NIfTI-2 file", path.display());
         return Err(Error::unsupported(what, "convert it to NIfTI-1 (.nii or .nii.gz)"));
     }
     if dicom::is_header(&head) {
         if dicom::enhanced::has_frames(path)? {
-            return Ok(VolumeFile::Enhanced);
+            return Ok(ENHANCED);
         }
         let what = format!("{}: one DICOM file", path.display());
         return Err(Error::unsupported(what, "give the folder that holds the files of its series"));
     }
     let found = [
-        (metaimage::is_header(&head), VolumeFile::MetaImage, "a MetaImage"),
-        (nrrd::is_header(&head), VolumeFile::Nrrd, "a NRRD"),
-        (tiff::is_tiff(&head), VolumeFile::Tiff, "a TIFF file"),
+        (metaimage::is_header(&head), METAIMAGE, "a MetaImage"),
+        (nrrd::is_header(&head), NRRD, "a NRRD"),
+        (tiff::is_tiff(&head), TIFF, "a TIFF file"),
     ];
     if let Some((_, file, name)) = found.into_iter().find(|(is, ..)| *is) {
         if input.left().is_none() {
@@ -99,16 +93,15 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
             || format!("a file of {} bytes", head.len()),
             |m| format!("{:02x?} at byte 344 and {:02x?} at the start", m, &head[..6]),
         );
-        let hint = match format_of(path) {
-            Some(VolumeFormat::Npy) => "a NumPy array (93 4e 55 4d 50 59 at the start); a NIfTI-1 header is read too",
-            _ => {
-                "a NIfTI-1 header (6e 2b 31 00 at byte 344), a NumPy array (93 4e 55 4d 50 59 at the start), a \
-                 MetaImage header (NDims = 3), NRRD (4e 52 52 44 at the start) or TIFF (49 49 2a 00 or 4d 4d 00 2a)"
-            }
+        let hint = if file_name(path).to_ascii_lowercase().ends_with(".npy") {
+            "a NumPy array (93 4e 55 4d 50 59 at the start); a NIfTI-1 header is read too"
+        } else {
+            "a NIfTI-1 header (6e 2b 31 00 at byte 344), a NumPy array (93 4e 55 4d 50 59 at the start), a MetaImage \
+             header (NDims = 3), NRRD (4e 52 52 44 at the start) or TIFF (49 49 2a 00 or 4d 4d 00 2a)"
         };
         return Err(input.invalid("format", mark, hint));
     }
-    Ok(VolumeFile::Nifti(input, head))
+    Ok(NIFTI)
 }
 
 /// Whether the file, or the folder of DICOM files, TIFF files or OME-Zarr, looks like a volume; its data is not read.
@@ -140,13 +133,7 @@ pub fn is_volume(path: impl AsRef<Path>) -> bool {
 /// Refuses a name or a number of voxels that [`write_voxels`] would refuse, before the voxels are computed.
 pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
     let path = path.as_ref();
-    match wanted(path)? {
-        VolumeFormat::Nifti | VolumeFormat::NiftiGz => nifti::check_shape(&path.display().to_string(), shape),
-        VolumeFormat::Tiff => tiff::check_shape(&path.display().to_string(), shape),
-        VolumeFormat::Dicom => dicom::check_shape(&path.display().to_string(), shape),
-        VolumeFormat::EnhancedDicom => dicom::enhanced::check_one_file(&path.display().to_string(), shape),
-        _ => Ok(()),
-    }
+    (wanted(path)?.check)(&path.display().to_string(), shape)
 }
 
 /// Writes a volume in the format of its name, in `f32`: `.nii`, `.nii.gz` (with an sform in mm), `.mha` (zlib,
@@ -158,10 +145,9 @@ pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
 /// An affine is kept if its voxel sizes match the grid; without one, the grid's centre is placed at `grid.center`.
 pub fn write_volume(path: impl AsRef<Path>, mut volume: &Volume) -> Result<()> {
     let path = path.as_ref();
-    if volume.data.shape() != volume.grid.shape {
-        let (found, expected) = (format!("{:?}", volume.data.shape()), format!("{:?}", volume.grid.shape));
-        return Err(Error::invalid(path.display().to_string(), "shape of the data", found, expected));
-    }
+    let (found, expected) = (volume.data.shape(), volume.grid.shape);
+    let (place, field) = (path.display().to_string(), "shape of the data");
+    ensure(found == expected, &place, field, format!("{found:?}"), format!("{expected:?}"))?;
     write_voxels(path, &mut volume)
 }
 
@@ -180,26 +166,17 @@ pub fn write_voxels_of(
 ) -> Result<()> {
     let path = path.as_ref();
     let format = wanted(path)?;
-    if template.is_some() && !matches!(format, VolumeFormat::Dicom | VolumeFormat::EnhancedDicom) {
-        let expected = "an end of .dicom or .dcm: other formats have no patient and study for the template";
-        return Err(Error::invalid(path.display().to_string(), "file name", file_name(path), expected));
-    }
+    let fits = template.is_none() || matches!(format.write, Writer::Dicom(_));
+    let expected = "an end of .dicom or .dcm: other formats have no patient and study for the template";
+    ensure(fits, &path.display().to_string(), "file name", file_name(path), expected)?;
     voxels.grid().validate(&path.display().to_string())?;
     let layers = &mut Layers::new(voxels, allowance::room());
-    let write: fn(&mut dyn Write, &Path, &mut dyn Voxels) -> Result<()> = match format {
-        // Its chunks come in an order of their own.
-        VolumeFormat::Zarr => return zarr::write(path, layers.voxels),
-        VolumeFormat::Dicom => return dicom::write(path, layers, template),
-        VolumeFormat::EnhancedDicom => return dicom::enhanced::write(path, layers, template),
-        VolumeFormat::MetaImageHeader => return metaimage::write_raw(path, layers),
-        VolumeFormat::Nifti => nifti::write,
-        VolumeFormat::NiftiGz => nifti::write_packed,
-        VolumeFormat::Npy => npy::write_voxels,
-        VolumeFormat::Nrrd => nrrd::write,
-        VolumeFormat::Tiff => tiff::write,
-        VolumeFormat::MetaImage => metaimage::write,
-    };
-    write_atomic(path, |w| write(w, path, layers))
+    match format.write {
+        Writer::File(write) => write_atomic(path, &mut |w| write(w, path, layers)),
+        Writer::Files(write) => write(path, layers),
+        Writer::Chunks(write) => write(path, layers.voxels),
+        Writer::Dicom(write) => write(path, layers, template),
+    }
 }
 
 /// Voxels that are read layer by layer along z. Lines of a volume run along z, so that one layer of a volume on the
@@ -278,66 +255,74 @@ impl Write for Counting {
 }
 
 /// A NumPy array as a volume of 1 mm voxels.
-pub(crate) fn from_numpy(path: &Path, array: ndarray::ArrayD<f32>) -> Result<Volume> {
-    let data: Array3<f32> = array
+fn read_numpy(path: &Path) -> Result<Volume> {
+    let data: Array3<f32> = npy::read(path, &["x", "y", "z"])?
         .into_dimensionality::<Ix3>()
         .map_err(|e| Error::invalid(path.display().to_string(), "shape", e, "three axes (x, y, z)"))?;
-    let s = data.shape();
-    let grid = VoxelGrid { shape: [s[0], s[1], s[2]], spacing: [1.0; 3], center: [0.0; 3] };
+    let grid = VoxelGrid { shape: data.dim().into(), spacing: [1.0; 3], center: [0.0; 3] };
     Ok(Volume { data, grid, affine: None })
 }
 
 /// The format for a file name; refuses an unknown extension.
-fn wanted(path: &Path) -> Result<VolumeFormat> {
+fn wanted(path: &Path) -> Result<&'static VolumeFormat> {
     let (place, expected) =
         (path.display().to_string(), "an end of .nii, .nii.gz, .mha, .mhd, .nrrd, .npy, .tif, .zarr, .dicom or .dcm");
     format_of(path).ok_or_else(|| Error::invalid(place, "file name", file_name(path), expected))
 }
 
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum VolumeFormat {
-    Nifti,
-    NiftiGz,
-    Npy,
-    MetaImage,
-    /// With the voxels in another file.
-    MetaImageHeader,
-    Nrrd,
-    Tiff,
-    Zarr,
-    /// A folder.
-    Dicom,
-    /// One file.
-    EnhancedDicom,
+/// How volumes of a format are written.
+struct VolumeFormat {
+    /// The end of file names.
+    end: &'static str,
+    /// Refuses a shape that the format cannot hold.
+    check: fn(&str, [usize; 3]) -> Result<()>,
+    write: Writer,
 }
 
-fn file_name(path: &Path) -> String {
-    path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
+enum Writer {
+    /// Writes one file, layer by layer.
+    File(fn(&mut dyn Write, &Path, &mut dyn Voxels) -> Result<()>),
+    /// Creates its files itself, layer by layer.
+    Files(fn(&Path, &mut dyn Voxels) -> Result<()>),
+    /// Creates its files itself; its chunks come in an order of their own.
+    Chunks(fn(&Path, &mut dyn Voxels) -> Result<()>),
+    /// Creates its files itself, layer by layer, with the patient and study of a template.
+    Dicom(fn(&Path, &mut dyn Voxels, Option<&DicomTemplate>) -> Result<()>),
 }
 
-fn format_of(path: &Path) -> Option<VolumeFormat> {
+const fn format(end: &'static str, check: fn(&str, [usize; 3]) -> Result<()>, write: Writer) -> VolumeFormat {
+    VolumeFormat { end, check, write }
+}
+
+fn any_shape(_: &str, _: [usize; 3]) -> Result<()> {
+    Ok(())
+}
+
+const FORMATS: &[VolumeFormat] = &[
+    format(".nii.gz", nifti::check_shape, Writer::File(nifti::write_packed)),
+    format(".nii", nifti::check_shape, Writer::File(nifti::write)),
+    format(".npy", any_shape, Writer::File(npy::write_voxels)),
+    format(".mha", any_shape, Writer::File(metaimage::write)),
+    format(".mhd", any_shape, Writer::Files(metaimage::write_raw)),
+    format(".nrrd", any_shape, Writer::File(nrrd::write)),
+    format(".tif", tiff::check_shape, Writer::File(tiff::write)),
+    format(".tiff", tiff::check_shape, Writer::File(tiff::write)),
+    format(".zarr", any_shape, Writer::Chunks(zarr::write)),
+    format(".dicom", dicom::check_shape, Writer::Dicom(dicom::write)),
+    format(".dcm", dicom::enhanced::check_one_file, Writer::Dicom(dicom::enhanced::write)),
+];
+
+fn format_of(path: &Path) -> Option<&'static VolumeFormat> {
     let name = file_name(path).to_ascii_lowercase();
-    let ends = [
-        (".nii.gz", VolumeFormat::NiftiGz),
-        (".nii", VolumeFormat::Nifti),
-        (".npy", VolumeFormat::Npy),
-        (".mha", VolumeFormat::MetaImage),
-        (".mhd", VolumeFormat::MetaImageHeader),
-        (".nrrd", VolumeFormat::Nrrd),
-        (".tif", VolumeFormat::Tiff),
-        (".tiff", VolumeFormat::Tiff),
-        (".zarr", VolumeFormat::Zarr),
-        (".dicom", VolumeFormat::Dicom),
-        (".dcm", VolumeFormat::EnhancedDicom),
-    ];
-    ends.into_iter().find(|(end, _)| name.ends_with(end)).map(|(_, format)| format)
+    FORMATS.iter().find(|format| name.ends_with(format.end))
 }
 
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::nifti::tests::header;
     use crate::number::Number;
-    use crate::testing::{comes_back_to_the_bit, says};
+    use crate::testing::{comes_back_to_the_bit, file, npy_bytes, says, zlib};
     use conefield_core::parts::Part;
 
     /// Two numbers of each type, with their bytes in both orders, little-endian first.
@@ -369,9 +354,62 @@ pub(crate) mod tests {
     fn what_is_written_comes_back_to_the_bit() {
         let data = |shape| Array3::from_shape_fn(shape, |(x, y, z)| (x + 10 * y + 100 * z) as f32 / 7.0);
         // For Zarr, more than one chunk along x and z.
-        comes_back_to_the_bit("a.zarr", data((70, 5, 66)));
+        let spacing = [1.0 / 3.0, 0.7, 2.0];
+        comes_back_to_the_bit("a.zarr", data((70, 5, 66)), spacing);
         for name in ["a.mha", "a.mhd", "a.nrrd", "a.tif"] {
-            comes_back_to_the_bit(name, data((4, 3, 2)));
+            comes_back_to_the_bit(name, data((4, 3, 2)), spacing);
+        }
+        // NIfTI has 32-bit numbers.
+        for name in ["a.nii", "a.nii.gz", "B.NII.GZ"] {
+            comes_back_to_the_bit(name, data((4, 3, 2)), [0.5, 0.75, 2.0]);
+        }
+    }
+
+    #[test]
+    fn every_type_is_read_in_both_orders() {
+        let all = two_of_each();
+        // NIfTI's code, and the names of MetaImage, NRRD and NumPy.
+        for (number, code, met, nrrd, kind) in [
+            (Number::I8, 256, "CHAR", "int8", "i1"),
+            (Number::U8, 2, "UCHAR", "unsigned char", "u1"),
+            (Number::I16, 4, "SHORT", "short int", "i2"),
+            (Number::U16, 512, "USHORT", "uint16_t", "u2"),
+            (Number::I32, 8, "INT", "int", "i4"),
+            (Number::U32, 768, "UINT", "unsigned int", "u4"),
+            (Number::I32, 8, "LONG", "signed int", "i4"),
+            (Number::U32, 768, "ULONG", "uint32", "u4"),
+            (Number::I64, 1024, "LONG_LONG", "long long int", "i8"),
+            (Number::U64, 1280, "ULONG_LONG", "ulonglong", "u8"),
+            (Number::F32, 16, "FLOAT", "float", "f4"),
+            (Number::F64, 64, "DOUBLE", "double", "f8"),
+        ] {
+            let (_, values, bytes) = all.iter().find(|(n, ..)| *n == number).unwrap();
+            for (big, bytes) in [false, true].into_iter().zip(bytes) {
+                let [order, msb, sign] = if big { ["big", "True", ">"] } else { ["little", "False", "<"] };
+                let met =
+                    format!("NDims = 3\nBinaryDataByteOrderMSB = {msb}\nDimSize = 1 2 1\nElementType = MET_{met}\n");
+                let packed = format!("{met}CompressedData = True\nElementDataFile = LOCAL\n");
+                let nrrd = format!("type: {nrrd}\ndimension: 3\nsizes: 1 2 1\nencoding: raw\nendian: {order}\n\n");
+                for (head, data, [slope, intercept]) in [
+                    (header(big, [code, 8 * number.bytes() as i16], [1.0; 4], [0.5, -8.0]), bytes, [0.5, -8.0]),
+                    (format!("{met}ElementDataFile = LOCAL\n").into_bytes(), bytes, [1.0, 0.0]),
+                    (packed.into_bytes(), &zlib(bytes), [1.0, 0.0]),
+                    (format!("NRRD0004\n{nrrd}").into_bytes(), bytes, [1.0, 0.0]),
+                    (npy_bytes(&format!("{sign}{kind}"), false, "(1, 2, 1)", &[]), bytes, [1.0, 0.0]),
+                ] {
+                    let found = read_volume(&file("a", &[&head, data]).1).unwrap().data;
+                    let want = values.map(|x| (slope * x + intercept) as f32);
+                    assert_eq!(
+                        found.as_slice().unwrap(),
+                        want,
+                        "{number}, {order}: {}",
+                        String::from_utf8_lossy(&head)
+                    );
+                }
+                let list = npy_bytes(&format!("{sign}{kind}"), false, "(2,)", bytes);
+                let exact = npy::read_exact(&mut Input::open(&file("a.npy", &[&list]).1).unwrap()).unwrap();
+                assert_eq!(exact, (vec![2], values.to_vec()), "{number}, {order}");
+            }
         }
     }
 

@@ -31,8 +31,8 @@ const SIDE: usize = 64;
 /// Writes the folder `path`; an existing folder is replaced only if it holds nothing but such a pyramid.
 pub(crate) fn write(path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
     let known = |name: &str| [".zattrs", ".zgroup"].contains(&name) || name.bytes().all(|b| b.is_ascii_digit());
-    folder::may_replace(path, "OME-Zarr", known, &[".zattrs"])?;
-    write_folder_atomic(path, |folder| {
+    folder::may_replace(path, "OME-Zarr", &known, &[".zattrs"])?;
+    write_folder_atomic(path, &mut |folder| {
         let shapes = shapes(voxels.grid().shape);
         let file = |name: &str, value: &Value| write_text_atomic(folder.join(name), &format!("{value:#}\n"));
         file(".zgroup", &json!({ "zarr_format": 2 }))?;
@@ -138,10 +138,12 @@ impl Pyramid<'_> {
         if let Some(folder) = file.parent() {
             fs::create_dir_all(folder).map_err(io)?;
         }
-        let mut packed = ZlibEncoder::new(Vec::new(), Compression::fast());
-        number::write(&mut packed, whole.as_slice().unwrap_or_default()).map_err(io)?;
+        let mut packed = Vec::new();
+        let mut encoder = ZlibEncoder::new(&mut packed as &mut dyn Write, Compression::fast());
+        number::write(&mut encoder, whole.as_slice().unwrap_or_default()).map_err(io)?;
+        encoder.finish().map_err(io)?;
         let mut to = File::create(&file).map_err(io)?;
-        to.write_all(&packed.finish().map_err(io)?).and_then(|()| to.sync_all()).map_err(io)
+        to.write_all(&packed).and_then(|()| to.sync_all()).map_err(io)
     }
 }
 

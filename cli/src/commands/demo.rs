@@ -109,7 +109,7 @@ impl DemoArgs {
 
         signals::listen()?;
         let path = folder.join("fast.safetensors");
-        conefield_io::write_atomic(&path, |w| w.write_all(specs::FAST_WEIGHTS).map_err(|e| Error::io(&path, e)))?;
+        conefield_io::write_atomic(&path, &mut |w| w.write_all(specs::FAST_WEIGHTS).map_err(|e| Error::io(&path, e)))?;
         let shared = Shared { folder, seed: self.seed, scan: Arc::new(scan), truth: &truth };
         let voxels = shared.compete("smooth-tv", "smooth-tv", voxels)?;
         let field = shared.compete("fast (LN, MCI)", "fast", field)?;

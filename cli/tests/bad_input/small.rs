@@ -16,8 +16,8 @@ fn field(d: &Path, spec: &str, attenuation: &str, unit_mm: &str, masks: &str) {
          \"unit_mm\":{unit_mm},\"masks\":{masks}}}"
     );
     let notes = [("spec", spec), ("placement", &placement)].map(|(k, v)| (k.to_owned(), v.to_owned()));
-    let tensors = [("encoder.table", vec![4], &[0.0f32; 4][..])];
-    conefield_io::write_weights(d.join("w.safetensors"), &tensors, &BTreeMap::from(notes)).unwrap();
+    let tensors = [("encoder.table", &[4][..], &[0.0f32; 4][..])];
+    conefield_io::write_weights(&d.join("w.safetensors"), &tensors, &BTreeMap::from(notes)).unwrap();
 }
 
 /// Weights whose notes name a network of 137 GB.

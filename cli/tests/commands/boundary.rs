@@ -192,8 +192,8 @@ fn a_checkpoint_of_which_a_bit_is_changed_is_refused() {
     let mut standing: serde_json::Value = serde_json::from_str(&file.notes["standing"]).unwrap();
     standing["step"] = u64::MAX.into();
     file.notes.insert("standing".into(), standing.to_string());
-    let tensors: Vec<_> = file.tensors.iter().map(|(name, (shape, values))| (name, shape, &values[..])).collect();
-    conefield_io::write_checkpoint(&path, &tensors, &file.notes).unwrap();
+    let tensors = file.tensors.iter().map(|(name, (shape, values))| (&name[..], &shape[..], &values[..]));
+    conefield_io::write_checkpoint(&path, &tensors.collect::<Vec<_>>(), &file.notes).unwrap();
     refused_whole(&d, &resume, &["step: found 18446744073709551615"]);
 }
 

@@ -3,11 +3,20 @@
 use super::node::{At, Entry, Is, Node};
 use super::suggest;
 use crate::error::Error;
-use serde::de::value::{MapAccessDeserializer, StrDeserializer};
-use serde::de::{DeserializeSeed, IntoDeserializer, MapAccess, SeqAccess, Visitor};
+use serde::de::value::{BorrowedStrDeserializer, MapAccessDeserializer, StrDeserializer};
+use serde::de::{DeserializeSeed, MapAccess, SeqAccess, Unexpected, Visitor};
 use serde::{Deserializer, de, forward_to_deserialize_any};
-use serde_spanned::de::{SpannedDeserializer, is_spanned};
+use serde_spanned::de::is_spanned;
 use std::fmt;
+
+/// The names of the fields of `serde_spanned`'s type. It takes borrowed names only.
+const SPANNED: [&str; 3] =
+    ["$__serde_spanned_private_start", "$__serde_spanned_private_end", "$__serde_spanned_private_value"];
+
+/// The field of `serde_spanned`'s type that `key` is, if it is one.
+fn spanned_field(key: &str) -> Option<&'static str> {
+    SPANNED.into_iter().find(|field| *field == key)
+}
 
 /// An error of a value, which learns where the value stands.
 #[derive(Debug)]
@@ -39,9 +48,16 @@ impl Misfit {
         self
     }
 
-    fn below(mut self, step: &dyn fmt::Display) -> Self {
-        self.path.push(step.to_string());
-        self
+    /// The error of the value at `at`, which is `step` of a table or list.
+    #[inline(never)]
+    fn below(self, at: &At, step: &dyn fmt::Display) -> Self {
+        let mut new = self.at(at);
+        let step = step.to_string();
+        // No key of the text.
+        if spanned_field(&step).is_none() {
+            new.path.push(step);
+        }
+        new
     }
 
     /// The error in the text whose value stands at `root`.
@@ -69,7 +85,38 @@ impl Misfit {
     }
 }
 
-impl<'de> Deserializer<'de> for &'de Node {
+impl Node {
+    /// What errors call the value.
+    fn unexpected(&self) -> Unexpected<'_> {
+        match &self.kind {
+            Is::Null => Unexpected::Unit,
+            Is::Bool(b) => Unexpected::Bool(*b),
+            Is::Number(n) => match (n.as_u64(), n.as_i64()) {
+                (Some(n), _) => Unexpected::Unsigned(n),
+                (_, Some(n)) => Unexpected::Signed(n),
+                _ => Unexpected::Float(n.as_f64().unwrap_or(f64::NAN)),
+            },
+            Is::String(s) | Is::Date(s) => Unexpected::Str(s),
+            Is::Array(_) => Unexpected::Seq,
+            Is::Table(_) => Unexpected::Map,
+        }
+    }
+
+    /// The table from which `serde_spanned` reads the value and its place.
+    fn spanned(&self) -> Self {
+        let offset = || Is::Number(self.at.offset().unwrap_or(0).into());
+        let [start, end, value] = SPANNED;
+        let table = [(start, offset()), (end, offset()), (value, self.kind.clone())].map(|(name, kind)| {
+            let value = Self { at: self.at.clone(), kind };
+            Entry { key: name.into(), at: self.at.clone(), value }
+        });
+        Self { at: self.at.clone(), kind: Is::Table(table.into()) }
+    }
+}
+
+/// Visitors are generic: every type that is read has its own copy of each function here that calls one. A type with fields
+/// is read from a table only.
+impl<'de> Deserializer<'de> for &Node {
     type Error = Misfit;
 
     fn deserialize_any<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Misfit> {
@@ -107,11 +154,17 @@ impl<'de> Deserializer<'de> for &'de Node {
         _: &'static [&'static str],
         visitor: V,
     ) -> Result<V::Value, Misfit> {
-        if is_spanned(name) {
-            let offset = self.at.offset().unwrap_or(0);
-            return visitor.visit_map(SpannedDeserializer::new(self, offset..offset));
+        let spanned;
+        let node = if is_spanned(name) {
+            spanned = self.spanned();
+            &spanned
+        } else {
+            self
+        };
+        match &node.kind {
+            Is::Table(entries) => visitor.visit_map(Entries { rest: entries, value: None }),
+            _ => Err(de::Error::invalid_type(node.unexpected(), &visitor)),
         }
-        self.deserialize_any(visitor)
     }
 
     fn deserialize_enum<V: Visitor<'de>>(
@@ -135,13 +188,6 @@ impl<'de> Deserializer<'de> for &'de Node {
     }
 }
 
-impl<'de> IntoDeserializer<'de, Misfit> for &'de Node {
-    type Deserializer = Self;
-    fn into_deserializer(self) -> Self {
-        self
-    }
-}
-
 /// The items of a list.
 struct Items<'a> {
     all: &'a [Node],
@@ -157,12 +203,12 @@ impl Items<'_> {
     }
 }
 
-impl<'de> SeqAccess<'de> for Items<'de> {
+impl<'de> SeqAccess<'de> for Items<'_> {
     type Error = Misfit;
     fn next_element_seed<T: DeserializeSeed<'de>>(&mut self, seed: T) -> Result<Option<T::Value>, Misfit> {
         let Some(node) = self.all.get(self.next) else { return Ok(None) };
         self.next += 1;
-        seed.deserialize(node).map(Some).map_err(|e: Misfit| e.at(&node.at).below(&(self.next - 1)))
+        seed.deserialize(node).map(Some).map_err(|e: Misfit| e.below(&node.at, &(self.next - 1)))
     }
     fn size_hint(&self) -> Option<usize> {
         Some(self.all.len() - self.next)
@@ -176,15 +222,19 @@ struct Entries<'a> {
     value: Option<&'a Entry>,
 }
 
-impl<'de> MapAccess<'de> for Entries<'de> {
+impl<'de> MapAccess<'de> for Entries<'_> {
     type Error = Misfit;
     fn next_key_seed<K: DeserializeSeed<'de>>(&mut self, seed: K) -> Result<Option<K::Value>, Misfit> {
         let Some((entry, rest)) = self.rest.split_first() else { return Ok(None) };
         (self.rest, self.value) = (rest, Some(entry));
-        seed.deserialize(StrDeserializer::new(&entry.key)).map(Some).map_err(|e: Misfit| e.at(&entry.at))
+        let key = match spanned_field(&entry.key) {
+            Some(field) => seed.deserialize(BorrowedStrDeserializer::new(field)),
+            None => seed.deserialize(StrDeserializer::new(&entry.key)),
+        };
+        key.map(Some).map_err(|e: Misfit| e.at(&entry.at))
     }
     fn next_value_seed<V: DeserializeSeed<'de>>(&mut self, seed: V) -> Result<V::Value, Misfit> {
         let Some(entry) = self.value.take() else { return Err(de::Error::custom("a value without a key")) };
-        seed.deserialize(&entry.value).map_err(|e: Misfit| e.at(&entry.value.at).below(&entry.key))
+        seed.deserialize(&entry.value).map_err(|e: Misfit| e.below(&entry.value.at, &entry.key))
     }
 }

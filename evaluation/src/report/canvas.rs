@@ -114,7 +114,7 @@ impl Canvas {
 
 /// Writes a picture as PNG.
 pub(crate) fn write_png(path: &Path, picture: &Pixels) -> Result<()> {
-    write_atomic(path, |w| picture.write_png(w, path))
+    write_atomic(path, &mut |w| picture.write_png(w, path))
 }
 
 /// A round number that bounds all but half a percent of `sizes`.

@@ -150,7 +150,7 @@ impl Page {
     pub fn write(&self, path: impl AsRef<Path>) -> Result<u64> {
         let path = path.as_ref();
         let mut written = 0;
-        write_atomic(path, |out| {
+        write_atomic(path, &mut |out| {
             self.pieces(&path.display().to_string(), &mut |piece| {
                 written += piece.len() as u64;
                 out.write_all(piece.as_bytes()).map_err(|e| Error::io(path, e))

@@ -60,11 +60,8 @@ pub(crate) fn write(path: &Path, voxels: &mut dyn Voxels, template: Option<&Dico
     check_one_file(&path.display().to_string(), voxels.grid().shape)?;
     let mut series = Series::new(path, voxels, template, ENHANCED)?;
     series.values.rewind().map_err(|e| Error::io(path, e))?;
-    let object = whole(&series, frames);
-    write_atomic(path, |w| {
-        series.head(path, w, object, &series.digest.uid("image"), frames)?;
-        series.pixels(path, w, frames)
-    })
+    let head = series.head(path, whole(&series, frames), &series.digest.uid("image"), frames)?;
+    write_atomic(path, &mut |w| series.pixels(path, &head, w, frames))
 }
 
 fn sequence(object: &mut InMemDicomObject, tag: Tag, items: Vec<InMemDicomObject>) {
@@ -201,9 +198,8 @@ impl Head {
         let frames = e.within(FRAMES, None, |n| n > 0, "a number above 0")?;
         let items = self.object.get(PER_FRAME).and_then(|e| e.items()).map_or(0, <[_]>::len);
         let name: Attribute = (PER_FRAME, "PerFrameFunctionalGroupsSequence");
-        if frames as usize != items {
-            return Err(e.invalid(name, format!("{items} items"), &format!("{frames}, as NumberOfFrames says")));
-        }
+        let expected = format!("{frames}, as NumberOfFrames says");
+        e.ensure(frames as usize == items, name, format!("{items} items"), &expected)?;
         Ok(items)
     }
 

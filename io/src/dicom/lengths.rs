@@ -5,6 +5,7 @@
 
 use super::slice::PIXEL_DATA;
 use crate::input::must_unpack;
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result, files};
 use dicom_core::VR;
 use dicom_core::dictionary::{DataDictionary, DataDictionaryEntry};
@@ -48,11 +49,8 @@ impl PixelStorage {
             Self::Plain(n) => (n, n == want || n == want + 1),
             Self::Packed(n) => (n, must_unpack(n, want, count).is_ok()),
         };
-        if ok {
-            return Ok(());
-        }
         let expected = format!("{want} bytes, as Rows, Columns and BitsAllocated say");
-        Err(Error::invalid(place, "PixelData", format!("{bytes} bytes"), expected))
+        ensure(ok, place, "PixelData", format!("{bytes} bytes"), expected)
     }
 }
 
@@ -61,6 +59,20 @@ impl PixelStorage {
 struct Coding {
     explicit: bool,
     big: bool,
+}
+
+impl Coding {
+    fn half(self, b: [u8; 2]) -> u16 {
+        if self.big { u16::from_be_bytes(b) } else { u16::from_le_bytes(b) }
+    }
+
+    fn word(self, b: [u8; 4]) -> u32 {
+        if self.big { u32::from_be_bytes(b) } else { u32::from_le_bytes(b) }
+    }
+
+    fn tag(self, [a, b, c, d]: [u8; 4]) -> Tag {
+        Tag(self.half([a, b]), self.half([c, d]))
+    }
 }
 
 enum Level {
@@ -106,17 +118,19 @@ impl ElementWalk {
                 return Ok((PixelStorage::None, self.at));
             }
             self.refuse_endless(stack.len())?;
-            if !in_rest && self.peek_group()? != 2 {
+            let start = self.at;
+            let (tag, rest) = (self.read()?, self.read()?);
+            if !in_rest && self.coding.tag(tag).group() != 2 {
                 in_rest = true;
-                self.refuse_other_end(description_end)?;
+                self.refuse_other_end(start, description_end)?;
                 self.coding = coding(&self.place, syntax.as_deref())?;
             }
-            let tag = self.tag()?;
+            let tag = self.coding.tag(tag);
             if tag.group() == 0xfffe {
-                self.delimiter(tag, &mut stack)?;
+                self.delimiter(tag, self.coding.word(rest), &mut stack)?;
                 continue;
             }
-            let (kind, length) = self.kind_and_length(tag)?;
+            let (kind, length) = self.kind_and_length(tag, rest)?;
             if tag == PIXEL_DATA.0 && stack.is_empty() {
                 return match length {
                     UNDEFINED => self.pieces(),
@@ -150,18 +164,14 @@ impl ElementWalk {
 
     /// Refuses a file meta group that ends elsewhere than its length says. `dicom-object` trusts that length, and
     /// anything it took for part of the group would go unchecked.
-    fn refuse_other_end(&self, description_end: u64) -> Result<()> {
-        if self.at == description_end {
-            return Ok(());
-        }
+    fn refuse_other_end(&self, start: u64, description_end: u64) -> Result<()> {
         let found = format!("an end at byte {description_end}");
-        let expected = format!("{}, where other elements begin", self.at);
-        Err(self.invalid("FileMetaInformationGroupLength", found, &expected))
+        let expected = format!("{start}, where other elements begin");
+        ensure(start == description_end, &self.place, "FileMetaInformationGroupLength", found, expected)
     }
 
     /// Handles the start or end of an item or sequence.
-    fn delimiter(&mut self, tag: Tag, stack: &mut Vec<Level>) -> Result<()> {
-        let length = self.u32()?;
+    fn delimiter(&mut self, tag: Tag, length: u32, stack: &mut Vec<Level>) -> Result<()> {
         match (tag, stack.last()) {
             (ITEM, Some(Level::Pieces)) => self.skip(tag, length)?,
             (ITEM, _) if length == UNDEFINED => stack.push(Level::Delimited(self.coding)),
@@ -201,37 +211,29 @@ impl ElementWalk {
     fn syntax(&mut self, length: u32) -> Result<String> {
         self.end(SYNTAX, length)?;
         let mut text = vec![0; length.min(64) as usize];
-        self.read(&mut text)?;
+        self.reader.read_exact(&mut text).map_err(|e| Error::io(&self.place, e))?;
+        self.at += text.len() as u64;
         self.skip(SYNTAX, length - text.len() as u32)?;
         Ok(String::from_utf8_lossy(&text).trim_end_matches(['\0', ' ']).to_owned())
     }
 
     /// End of the file meta group, from its first element.
     fn description_end(&mut self) -> Result<u64> {
-        let start = self.at;
-        let mut head = [0; 12];
-        self.read(&mut head)?;
-        self.back(12)?;
-        let [.., a, b, c, d] = head;
-        if head[..8] != [2, 0, 0, 0, b'U', b'L', 4, 0] {
-            let found = format!("{:02x?}", &head[..8]);
-            return Err(self.invalid(
-                "FileMetaInformationGroupLength",
-                found,
-                "02 00 00 00 55 4c 04 00, then a length",
-            ));
-        }
-        Ok(start + 12 + u64::from(u32::from_le_bytes([a, b, c, d])))
+        let (head, length) = (self.read::<8>()?, self.read()?);
+        let (found, expected) = (format!("{head:02x?}"), "02 00 00 00 55 4c 04 00, then a length");
+        let fits = head == [2, 0, 0, 0, b'U', b'L', 4, 0];
+        ensure(fits, &self.place, "FileMetaInformationGroupLength", found, expected)?;
+        Ok(self.at + u64::from(u32::from_le_bytes(length)))
     }
 
     /// Walks over the fragments of a compressed image, up to their delimiter or the end of the file.
     fn pieces(mut self) -> Result<(PixelStorage, u64)> {
         let start = self.at;
         while self.at < self.size {
-            let tag = self.tag()?;
-            let length = self.u32()?;
+            let tag = self.read()?;
+            let (tag, length) = (self.coding.tag(tag), self.read()?);
             match tag {
-                ITEM => self.skip(tag, length)?,
+                ITEM => self.skip(tag, self.coding.word(length))?,
                 SEQUENCE_END => break,
                 _ => {
                     return Err(self.invalid(
@@ -245,24 +247,25 @@ impl ElementWalk {
         Ok((PixelStorage::Packed(self.at - start), self.at))
     }
 
-    /// The value representation of an element and its length, which must be a whole number of values.
-    fn kind_and_length(&mut self, tag: Tag) -> Result<(VR, u32)> {
+    /// The value representation of an element and its length, which must be a whole number of values; `rest` follows its
+    /// tag.
+    fn kind_and_length(&mut self, tag: Tag, rest: [u8; 4]) -> Result<(VR, u32)> {
         let (kind, length) = if self.coding.explicit {
-            let mut kind = [0; 2];
-            self.read(&mut kind)?;
+            let [a, b, c, d] = rest;
+            let kind = [a, b];
             if !kind.iter().all(u8::is_ascii_uppercase) {
                 return Err(self.invalid(&format!("element {tag}"), format!("the kind {kind:02x?}"), "two letters"));
             }
             let kind = VR::from_binary(kind).unwrap_or(VR::UN);
             if SHORT.split(' ').any(|short| short == kind.to_string()) {
-                (kind, u32::from(self.u16()?))
+                (kind, u32::from(self.coding.half([c, d])))
             } else {
-                self.read(&mut [0; 2])?;
-                (kind, self.u32()?)
+                let length = self.read()?;
+                (kind, self.coding.word(length))
             }
         } else {
             let kind = StandardDataDictionary.by_tag(tag).map_or(VR::UN, |e| e.vr().relaxed());
-            (kind, self.u32()?)
+            (kind, self.coding.word(rest))
         };
         let size = match kind {
             VR::US | VR::SS | VR::OW => 2,
@@ -298,48 +301,21 @@ impl ElementWalk {
         if length < 8 {
             return Ok(false);
         }
-        let tag = self.tag()?;
-        self.back(4)?;
-        Ok(tag == ITEM)
+        let tag = self.read()?;
+        self.at -= 4;
+        self.reader.seek_relative(-4).map_err(|e| Error::io(&self.place, e))?;
+        Ok(self.coding.tag(tag) == ITEM)
     }
 
-    fn peek_group(&mut self) -> Result<u16> {
-        let group = self.u16()?;
-        self.back(2)?;
-        Ok(group)
-    }
-
-    fn back(&mut self, bytes: u32) -> Result<()> {
-        self.at -= u64::from(bytes);
-        self.reader.seek_relative(-i64::from(bytes)).map_err(|e| Error::io(&self.place, e))
-    }
-
-    fn read(&mut self, out: &mut [u8]) -> Result<()> {
-        if self.size - self.at < out.len() as u64 {
-            return Err(self.invalid(
-                "elements",
-                format!("the end of the file at byte {}", self.size),
-                "whole elements",
-            ));
+    fn read<const N: usize>(&mut self) -> Result<[u8; N]> {
+        if self.size - self.at < N as u64 {
+            let found = format!("the end of the file at byte {}", self.size);
+            return Err(self.invalid("elements", found, "whole elements"));
         }
-        self.at += out.len() as u64;
-        self.reader.read_exact(out).map_err(|e| Error::io(&self.place, e))
-    }
-
-    fn tag(&mut self) -> Result<Tag> {
-        Ok(Tag(self.u16()?, self.u16()?))
-    }
-
-    fn u16(&mut self) -> Result<u16> {
-        let mut b = [0; 2];
-        self.read(&mut b)?;
-        Ok(if self.coding.big { u16::from_be_bytes(b) } else { u16::from_le_bytes(b) })
-    }
-
-    fn u32(&mut self) -> Result<u32> {
-        let mut b = [0; 4];
-        self.read(&mut b)?;
-        Ok(if self.coding.big { u32::from_be_bytes(b) } else { u32::from_le_bytes(b) })
+        self.at += N as u64;
+        let mut out = [0; N];
+        self.reader.read_exact(&mut out).map_err(|e| Error::io(&self.place, e))?;
+        Ok(out)
     }
 
     fn invalid(&self, field: &str, found: impl ToString, expected: &str) -> Error {

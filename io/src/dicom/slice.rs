@@ -2,6 +2,8 @@
 
 use super::lengths::{self, PixelStorage};
 use super::pixels::{self, PixelFormat};
+use crate::folder::file_name;
+use conefield_core::error::ensure;
 use conefield_core::geometry::{dot, norm};
 use conefield_core::{Error, Result, allowance, files};
 use dicom_object::{DefaultDicomObject, InMemDicomObject, OpenFileOptions, Tag};
@@ -63,6 +65,10 @@ pub(super) struct Elements<'a> {
 impl Elements<'_> {
     pub fn invalid(&self, field: Attribute, found: impl ToString, expected: &str) -> Error {
         Error::invalid(self.place, field.1, found, expected)
+    }
+
+    pub fn ensure(&self, ok: bool, field: Attribute, found: impl ToString, expected: &str) -> Result<()> {
+        ensure(ok, self.place, field.1, found, expected)
     }
 
     fn text(&self, field: Attribute) -> Option<String> {
@@ -129,9 +135,8 @@ impl Elements<'_> {
         let six = self.required::<6>(ORIENTATION)?;
         let axes = [[six[0], six[1], six[2]], [six[3], six[4], six[5]]];
         // Files round the numbers: each axis is normalized again.
-        if axes.iter().any(|a| (norm(*a) - 1.0).abs() > 1e-2) || dot(axes[0], axes[1]).abs() > 1e-2 {
-            return Err(self.invalid(ORIENTATION, format!("{six:?}"), "two orthogonal unit vectors"));
-        }
+        let fits = axes.iter().all(|a| (norm(*a) - 1.0).abs() <= 1e-2) && dot(axes[0], axes[1]).abs() <= 1e-2;
+        self.ensure(fits, ORIENTATION, format!("{six:?}"), "two orthogonal unit vectors")?;
         Ok(axes.map(|a| a.map(|x| x / norm(a))))
     }
 }
@@ -159,9 +164,7 @@ impl Slice {
         let modality = e.text(MODALITY).unwrap_or_default();
         let about = format!("{modality}, {}", e.text(SERIES_NAME).unwrap_or_else(|| "no description".into()));
         let spacing = e.required::<2>(SPACING)?;
-        if spacing.iter().any(|s| *s <= 0.0) {
-            return Err(e.invalid(SPACING, format!("{spacing:?}"), "millimetres above 0"));
-        }
+        e.ensure(spacing.iter().all(|s| *s > 0.0), SPACING, format!("{spacing:?}"), "millimetres above 0")?;
         let between = e.numbers::<1>(BETWEEN)?.map(|[x]| x.abs());
         let thickness = between.or(e.numbers::<1>(THICKNESS)?.map(|[x]| x)).filter(|x| *x > 0.0);
         let [slope] = e.numbers(SLOPE)?.unwrap_or([1.0]);
@@ -185,7 +188,7 @@ impl Slice {
 
     /// The file's name.
     pub fn name(&self) -> String {
-        self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
+        file_name(&self.path)
     }
 
     /// Refuses a slice of another size, pixel size or orientation than `first`.
@@ -226,10 +229,8 @@ impl Slice {
     pub fn rescaled(&self, stored: impl IntoIterator<Item = f64>) -> Result<Vec<f32>> {
         let [slope, intercept] = self.rescale;
         let rescaled: Vec<f32> = stored.into_iter().map(|v| (slope * v + intercept) as f32).collect();
-        if rescaled.iter().any(|x| !x.is_finite()) {
-            let expected = "a factor that keeps values in the range of 32-bit floats";
-            return Err(Error::invalid(self.path.display().to_string(), SLOPE.1, slope, expected));
-        }
+        let expected = "a factor that keeps values in the range of 32-bit floats";
+        ensure(rescaled.iter().all(|x| x.is_finite()), &self.path.display().to_string(), SLOPE.1, slope, expected)?;
         Ok(rescaled)
     }
 }

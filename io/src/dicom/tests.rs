@@ -11,7 +11,7 @@ use std::path::Path;
 const PIXELS: Tag = Tag(0x7fe0, 0x0010);
 const POSITION: Tag = Tag(0x0020, 0x0032);
 
-const EXPLICIT: &str = "1.2.840.10008.1.2.1";
+pub(super) const EXPLICIT: &str = "1.2.840.10008.1.2.1";
 const IMPLICIT: &str = "1.2.840.10008.1.2";
 const BIG: &str = "1.2.840.10008.1.2.2";
 const RUN_LENGTH: &str = "1.2.840.10008.1.2.5";
@@ -37,7 +37,7 @@ fn slice(k: usize) -> InMemDicomObject {
     o
 }
 
-fn write(path: &Path, object: InMemDicomObject, syntax: &str) {
+pub(super) fn write(path: &Path, object: InMemDicomObject, syntax: &str) {
     let meta = FileMetaTableBuilder::new()
         .transfer_syntax(syntax)
         .media_storage_sop_class_uid("1.2.840.10008.5.1.4.1.1.2")
@@ -131,6 +131,8 @@ fn series_that_are_no_volume_are_refused() {
     refused(&put(POSITION, VR::DS, 4, "-10\\29\\30"), &["slices missing: 2 between 6.dcm and 5.dcm", "1.5000 mm"]);
     refused(&put(POSITION, VR::DS, 4, "-10\\26"), &["5.dcm", "ImagePositionPatient", "2 numbers"]);
     refused(&put(POSITION, VR::DS, 4, "a\\b\\c"), &["5.dcm", "ImagePositionPatient"]);
+    let words = ["SeriesInstanceUID", "1.2.3 (CT, thin, 4 files)", "1.2.4 (CT, thin, 1 files)"];
+    refused(&put(Tag(0x0020, 0x000e), VR::UI, 3, "1.2.4"), &words);
     let e = "ImageOrientationPatient";
     refused(&put(Tag(0x0020, 0x0037), VR::DS, 3, "1\\0\\0\\0\\1\\0"), &["6.dcm", e, "as in"]);
     refused(&put(Tag(0x0020, 0x0037), VR::DS, 3, "1\\0\\0\\1\\0\\0"), &["6.dcm", e, "orthogonal"]);

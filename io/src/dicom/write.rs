@@ -87,9 +87,9 @@ fn is_slice(name: &str) -> bool {
 pub(crate) fn write(path: &Path, voxels: &mut dyn Voxels, template: Option<&DicomTemplate>) -> Result<()> {
     let place = path.display().to_string();
     check_shape(&place, voxels.grid().shape)?;
-    folder::may_replace(path, "DICOM series", is_slice, &["0001.dcm", "00001.dcm"])?;
-    let series = Series::new(path, voxels, template, CT_IMAGE)?;
-    write_folder_atomic(path, |folder| series.write(folder))
+    folder::may_replace(path, "DICOM series", &is_slice, &["0001.dcm", "00001.dcm"])?;
+    let mut series = Series::new(path, voxels, template, CT_IMAGE)?;
+    write_folder_atomic(path, &mut |folder| series.write(folder))
 }
 
 /// A series whose values are known.
@@ -153,14 +153,14 @@ impl Series {
         word(o, Tag(0x0028, 0x0011), self.shape[0] as u16);
     }
 
-    fn write(mut self, folder: &Path) -> Result<()> {
+    fn write(&mut self, folder: &Path) -> Result<()> {
         let width = self.shape[2].to_string().len().max(4);
         self.values.rewind().map_err(|e| Error::io(folder, e))?;
         for k in 0..self.shape[2] {
             let path = folder.join(format!("{:0width$}.dcm", k + 1));
             let mut file = BufWriter::new(File::create(&path).map_err(|e| Error::io(&path, e))?);
-            self.head(&path, &mut file, self.slice(k), &self.digest.uid(&format!("slice {k}")), 1)?;
-            self.pixels(&path, &mut file, 1)?;
+            let head = self.head(&path, self.slice(k), &self.digest.uid(&format!("slice {k}")), 1)?;
+            self.pixels(&path, &head, &mut file, 1)?;
             let file = file.into_inner().map_err(|e| Error::io(&path, e.into_error()))?;
             file.sync_all().map_err(|e| Error::io(&path, e))?;
         }
@@ -182,15 +182,8 @@ impl Series {
         std::array::from_fn(|i| self.first[i] + k as f64 * self.spacing[2] * self.axes[2][i])
     }
 
-    /// Writes `object` with the identifier `uid`, up to the values of `slices` slices.
-    pub fn head(
-        &self,
-        path: &Path,
-        w: &mut dyn Write,
-        mut object: InMemDicomObject,
-        uid: &str,
-        slices: usize,
-    ) -> Result<()> {
+    /// The bytes of `object` with the identifier `uid`, up to the values of `slices` slices.
+    pub fn head(&self, path: &Path, mut object: InMemDicomObject, uid: &str, slices: usize) -> Result<Vec<u8>> {
         text(&mut object, Tag(0x0008, 0x0018), VR::UI, uid);
         let class = object.get(CLASS).and_then(|e| e.to_str().ok()).unwrap_or_default().into_owned();
         let meta = FileMetaTableBuilder::new()
@@ -204,11 +197,12 @@ impl Series {
         let length = 2 * slices * self.shape[0] * self.shape[1];
         bytes.extend([0xe0, 0x7f, 0x10, 0, b'O', b'W', 0, 0]);
         bytes.extend((length as u32).to_le_bytes());
-        w.write_all(&bytes).map_err(|e| Error::io(path, e))
+        Ok(bytes)
     }
 
-    /// Writes the stored values of the next `slices` slices.
-    pub fn pixels(&mut self, path: &Path, w: &mut dyn Write, slices: usize) -> Result<()> {
+    /// Writes `head` and the stored values of the next `slices` slices.
+    pub fn pixels(&mut self, path: &Path, head: &[u8], w: &mut dyn Write, slices: usize) -> Result<()> {
+        w.write_all(head).map_err(|e| Error::io(path, e))?;
         let mut raw = vec![0; 4 * self.shape[0] * self.shape[1]];
         let stored = |bytes: &[u8; 4]| (f64::from(f32::from_le_bytes(*bytes)) / self.slope).round() as i16;
         for _ in 0..slices {

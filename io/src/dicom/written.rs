@@ -1,6 +1,7 @@
 //! Tests of written series: read back by this crate's reader and, element by element, by `dicom-object`.
 
-use super::{DicomTemplate, files};
+use super::write::text;
+use super::{DicomTemplate, files, tests};
 use crate::affine;
 use crate::testing::says;
 use crate::{read_volume, write_volume, write_voxels_of};
@@ -9,7 +10,7 @@ use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Volume};
 use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
-use dicom_object::{FileMetaTableBuilder, InMemDicomObject, open_file};
+use dicom_object::{InMemDicomObject, open_file};
 use ndarray::{Array3, ArrayViewMut3};
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -146,13 +147,9 @@ fn a_template_gives_patient_and_study_and_a_wrong_one_is_refused() {
             (Tag(0x0020, 0x000d), VR::UI, study),
             (Tag(0x0020, 0x000e), VR::UI, "1.2.9"),
         ] {
-            o.put(DataElement::new(tag, vr, PrimitiveValue::from(value)));
+            text(&mut o, tag, vr, value);
         }
-        let meta = FileMetaTableBuilder::new()
-            .transfer_syntax("1.2.840.10008.1.2.1")
-            .media_storage_sop_class_uid("1.2.840.10008.5.1.4.1.1.2")
-            .media_storage_sop_instance_uid("1.2.3.4");
-        o.with_meta(meta).unwrap().write_to_file(&template).unwrap();
+        tests::write(&template, o, tests::EXPLICIT);
     };
     write("1.2.3");
     let read = DicomTemplate::read(&template).unwrap();

@@ -7,6 +7,7 @@ use crate::input::Input;
 use crate::number::{ByteOrder, Number};
 use crate::text::{self, shortened, without_mark};
 use conefield_core::Result;
+use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use std::path::Path;
@@ -58,9 +59,8 @@ fn read_header(input: &mut Input) -> Result<Header> {
 /// Voxels along x, y and z.
 fn voxels(header: &Header) -> Result<[usize; 3]> {
     let text = header.required("dimension")?;
-    if text != "3" {
-        return Err(header.invalid("dimension", shortened(text), "3: one volume, one number per voxel"));
-    }
+    let expected = "3: one volume, one number per voxel";
+    ensure(text == "3", &header.place, "dimension", shortened(text), expected)?;
     let text = header.required("sizes")?;
     let sizes: Option<Vec<usize>> = text.split_ascii_whitespace().map(|t| t.parse().ok()).collect();
     match sizes.as_deref() {
@@ -175,10 +175,8 @@ fn place_of_voxels(header: &Header) -> Result<([f64; 3], Option<Affine>)> {
     };
     let first = vectors(header, "space origin")?.map_or([0.0; 3], |[first]| first);
     let stored = affine::from_columns(axes.map(|a| a.map(|x| x * mm)), first.map(|x| x * mm));
-    if !affine::is_regular(&stored) {
-        let text = shortened(header.required(name)?);
-        return Err(header.invalid(name, text, "three independent voxel axes"));
-    }
+    let text = shortened(header.required(name)?);
+    ensure(affine::is_regular(&stored), &header.place, name, text, "three independent voxel axes")?;
     // Spaces that are not the patient's count as LPS, as in ITK.
     let [x, y, z, w] = affine::flip(stored);
     let affine = match header.text("space")?.map(str::to_ascii_lowercase).as_deref() {

@@ -62,26 +62,22 @@ pub(super) struct Dtype {
 impl Dtype {
     /// From NumPy's name of the type, e.g. `f4`.
     pub fn named(name: &str) -> Result<Self, Refusal> {
-        if name.trim_start_matches(['|', '<', '>', '=']).starts_with('O') {
-            let expected = "numbers: objects would have to be made by calls";
-            return Err(Refusal::new(format!("the object dtype \"{name}\""), expected));
-        }
-        match element(name) {
-            Some((number, order)) => Ok(Self { number, order }),
-            None => {
-                let shown: String = name.chars().take(20).collect();
-                Err(Refusal::new(format!("the dtype \"{shown}\""), "real numbers: b1, i1 to i8, u1 to u8, f4 or f8"))
-            }
-        }
+        // Cut: a file may hold a text of any length.
+        let shown: String = name.chars().take(20).collect();
+        let object = name.trim_start_matches(['|', '<', '>', '=']).starts_with('O');
+        let expected = "numbers: objects would have to be made by calls";
+        Refusal::unless(!object, format!("the object dtype \"{shown}\""), expected)?;
+        let expected = "real numbers: b1, i1 to i8, u1 to u8, f4 or f8";
+        let (number, order) = element(name).ok_or_else(|| Refusal::new(format!("the dtype \"{shown}\""), expected))?;
+        Ok(Self { number, order })
     }
 
     /// Applies the state that NumPy adds: (version, byte order, subarray, names, fields, ...).
     pub fn with_state<'a>(self, heap: &Heap<'a>, state: Value<'a>) -> Result<Self, Refusal> {
         let wrong = || Refusal::new(heap.kind(state), "the state of a dtype of plain numbers");
         let Some([_, order, subarray, names, fields, ..]) = heap.items(state) else { return Err(wrong()) };
-        if [subarray, names, fields].iter().any(|v| !matches!(v, Value::None)) {
-            return Err(Refusal::new("a dtype with fields or a subarray", "a dtype of plain numbers"));
-        }
+        let plain = [subarray, names, fields].iter().all(|v| matches!(v, Value::None));
+        Refusal::unless(plain, "a dtype with fields or a subarray", "a dtype of plain numbers")?;
         let order = match heap.text(*order) {
             Some("<") => ByteOrder::Little,
             Some(">") => ByteOrder::Big,
@@ -173,10 +169,8 @@ impl<'a> Array<'a> {
             _ => lengths(heap, shape)?,
         };
         let bytes = stored.iter().try_fold(dtype.number.bytes(), |n, &s| n.checked_mul(s));
-        if bytes != Some(raw.len()) {
-            let claim = format!("{stored:?} numbers of {} bytes", dtype.number.bytes());
-            return Err(Refusal::new(format!("{} bytes of data", raw.len()), format!("what {claim} take")));
-        }
+        let expected = format!("what {stored:?} numbers of {} bytes take", dtype.number.bytes());
+        Refusal::unless(bytes == Some(raw.len()), format!("{} bytes of data", raw.len()), expected)?;
         let mut axes: Vec<usize> = (0..stored.len()).collect();
         if fortran {
             stored.reverse();
@@ -191,10 +185,8 @@ pub(super) fn scalar<'a>(heap: &Heap<'a>, arguments: Value<'a>) -> Result<Value<
     let wrong = || Refusal::new(heap.kind(arguments), "dtype and data of a number");
     let [dtype, data] = heap.tuple(arguments).ok_or_else(wrong)?;
     let (Some(Node::Dtype(dtype)), Some(raw)) = (heap.node(dtype), heap.bytes(data)) else { return Err(wrong()) };
-    if raw.len() != dtype.number.bytes() {
-        let expected = format!("{} bytes for one number", dtype.number.bytes());
-        return Err(Refusal::new(format!("{} bytes", raw.len()), expected));
-    }
+    let (found, wanted) = (raw.len(), dtype.number.bytes());
+    Refusal::unless(found == wanted, format!("{found} bytes"), format!("{wanted} bytes for one number"))?;
     let mut out = Vec::new();
     dtype.number.doubles(dtype.order, raw, &mut out);
     match (dtype.number, out.first()) {

@@ -5,7 +5,6 @@
 
 use super::numpy::{Array, Dtype, Global};
 use crate::memory;
-use conefield_core::finite::stray;
 use conefield_core::{Error, Result};
 use ndarray::{ArrayD, Dimension};
 
@@ -47,6 +46,11 @@ pub(super) struct Refusal {
 }
 
 impl Refusal {
+    /// A refusal unless `ok`.
+    pub fn unless(ok: bool, found: impl ToString, expected: impl ToString) -> Result<(), Self> {
+        if ok { Ok(()) } else { Err(Self::new(found, expected)) }
+    }
+
     pub fn new(found: impl ToString, expected: impl ToString) -> Self {
         Self { found: found.to_string(), expected: expected.to_string() }
     }
@@ -202,6 +206,11 @@ impl<'p, 'a> Item<'p, 'a> {
         Error::invalid(&self.pickle.place, self.key(), found, expected)
     }
 
+    /// An error about this value unless `ok`.
+    pub fn ensure(&self, ok: bool, found: impl ToString, expected: impl Into<String>) -> Result<()> {
+        if ok { Ok(()) } else { Err(self.invalid(found, expected)) }
+    }
+
     /// An error about the value at `key`, here or below.
     pub fn invalid_at(&self, key: String, found: impl ToString, expected: impl Into<String>) -> Error {
         Error::invalid(&self.pickle.place, key, found, expected)
@@ -294,10 +303,7 @@ impl<'p, 'a> Item<'p, 'a> {
         let values = ArrayD::from_shape_vec(&array.stored[..], values).map_err(|e| self.invalid(e, expected()))?;
         let values = values.permuted_axes(&array.axes[..]);
         let values = memory::in_order(&self.pickle.place, self.key(), values)?;
-        match stray(&values) {
-            Some((at, x)) => Err(self.invalid_at(format!("{}{:?}", self.key(), at.slice()), x, "a finite number")),
-            None => Ok(values),
-        }
+        memory::all_finite(&self.pickle.place, values, &|at| format!("{}{:?}", self.key(), at.slice()))
     }
 
     fn numeric(&self, value: Value<'a>) -> Option<f64> {

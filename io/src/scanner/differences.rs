@@ -40,12 +40,8 @@ pub(super) fn unpack(place: &str, size: [usize; 2], table: &[u8], packed: &[u8])
             [a, b] => i32::from(i16::from_le_bytes([a, b])),
             [a, b, c, d] => i32::from_le_bytes([a, b, c, d]),
             _ => {
-                return Err(Error::invalid(
-                    place,
-                    "lookup table",
-                    "the code 3",
-                    "0, 1 or 2 for one, two or four bytes",
-                ));
+                let expected = "0, 1 or 2 for one, two or four bytes";
+                return Err(Error::invalid(place, "lookup table", "the code 3", expected));
             }
         };
         let [here, above] = [values.len(), values.len() - columns];

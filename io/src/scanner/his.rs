@@ -43,9 +43,7 @@ pub(super) const I0: f32 = 65536.0;
 fn open(path: &Path) -> Result<([usize; 3], Input)> {
     let mut input = Input::open_plain(path)?;
     let header = input.exactly(HEADER, "header")?;
-    if !header.starts_with(MAGIC) {
-        return Err(input.invalid("format", format!("{:02x?} at the start", &header[..4]), "00 70 44 00"));
-    }
+    input.ensure(header.starts_with(MAGIC), "format", format!("{:02x?} at the start", &header[..4]), "00 70 44 00")?;
     let word = |at: usize| usize::from(u16::from_le_bytes([header[at], header[at + 1]]));
     let [left, top, right, bottom] = [12, 14, 16, 18].map(word);
     let side = |field: &str, from: usize, to: usize| {

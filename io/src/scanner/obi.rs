@@ -61,10 +61,9 @@ fn open(path: &Path) -> Result<(Head, Input)> {
     let mut input = Input::open_plain(path)?;
     let header = input.exactly(HNC_HEADER, "header")?;
     let compressed = header.starts_with(HND);
-    if !compressed && !header.starts_with(HNC) {
-        let found = String::from_utf8_lossy(&header[..32]).trim_end_matches('\0').escape_debug().to_string();
-        return Err(input.invalid("format", found, "VARIAN_VA_INTERNAL_HND or VARIAN_VA_INTERNAL_HNC"));
-    }
+    let found = String::from_utf8_lossy(&header[..32]).trim_end_matches('\0').escape_debug().to_string();
+    let expected = "VARIAN_VA_INTERNAL_HND or VARIAN_VA_INTERNAL_HNC";
+    input.ensure(compressed || header.starts_with(HNC), "format", found, expected)?;
     let whole = |at: usize| u32::from_le_bytes(std::array::from_fn(|k| header[at + k])) as usize;
     let number = |field: &str, at: usize| {
         let found = f64::from_le_bytes(std::array::from_fn(|k| header[at + k]));

@@ -20,6 +20,7 @@ use crate::folder;
 use crate::folder::folder_of;
 use crate::stack::Names;
 use crate::text::{shortened, unread};
+use conefield_core::error::ensure;
 use conefield_core::orbit::CircularOrbit;
 use conefield_core::{Error, Result};
 use std::path::Path;
@@ -62,10 +63,7 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
     }
     let [rows, columns] = [keys.whole(ROWS, MOST_PIXELS)?, keys.whole(COLUMNS, MOST_PIXELS)?];
     let [dso, dsd] = [keys.length(OBJECT)?, keys.length(CAMERA)?];
-    if dsd <= dso {
-        let expected = format!("more than the {dso} of {OBJECT}");
-        return Err(keys.invalid(CAMERA, dsd, expected));
-    }
+    ensure(dsd > dso, keys.place(), CAMERA, dsd, format!("more than the {dso} of {OBJECT}"))?;
     // In micrometres, at the axis.
     let at_axis = keys.length(PIXEL)? / 1000.0;
     let pixel = at_axis * dsd / dso;

@@ -160,12 +160,15 @@ fn hostile_descriptions_are_refused_in_words() {
     edit("[volume]", "[layout]\naxes = [\"view\", \"row\", \"row\"]\n[volume]", &["layout.axes", "once"]);
     edit("[volume]", "[layout]\naxes = [\"view\"]\n[volume]", &["layout.axes", "two of them"]);
     edit("[volume]", "[layout]\naxes = [\"view\", \"row\"]\n[volume]", &["shape", "two axes, as layout.axes says"]);
-    edit("[volume]", "[values]\ni0 = \"dark\"\n[volume]", &["values.i0", "\"dark\"", "\"air\""]);
+    edit("[volume]", "[values]\ni0 = \"dark\"\n[volume]", &["values.i0: found \"dark\", expected a number of counts"]);
     edit("[volume]", "[values]\ni0 = 7\n[volume]", &["values.i0", "files.flat", "one of them"]);
     edit("[volume]", "[values]\nkind = \"line-integrals\"\n[volume]", &["files.flat", "line-integrals"]);
     edit("[volume]", "[values]\nflat_includes_dark = true\n[volume]", &["values.flat_includes_dark", "files.dark"]);
     edit("flat = \"flat.tif\"", "", &["files.flat", "nothing", "--i0"]);
-    edit("\"views\"", "3", &["projections", "a file name or a list of file names"]);
+    edit("\"views\"", "3", &["files.projections: found 3, expected a file name or a list of file names"]);
+    let numbers = "circle.angles_deg: found true, expected a list of numbers, or the name of a file with them";
+    edit("step_deg = 14.4", "angles_deg = true", &[numbers]);
+    edit("step_deg = 14.4", "angles_deg = [[0, 1]]", &["circle.angles_deg[0]: found 2 numbers, expected 1"]);
     edit("\"flat.tif\"", "\"flat.tif:a\"", &["flat.tif: array", "the name \"a\""]);
     let circle = &text[text.find("[circle]").unwrap()..text.find("[volume]").unwrap()];
     edit(circle, "", &["circle", "nothing", "one of [circle]"]);

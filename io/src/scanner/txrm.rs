@@ -12,18 +12,18 @@
 use super::Description;
 use super::turning::TurningObject;
 use super::vendor::{MOST_VIEWS, Open, field_of_view};
+use crate::folder::file_name;
 use crate::hdf5::ScanPart;
+use crate::input::read_up_to;
 use crate::memory;
 use crate::number::{ByteOrder, Number};
 use crate::stack::Names;
 use cfb::CompoundFile;
 use conefield_core::error::ensure;
-use conefield_core::finite::stray;
 use conefield_core::geometry::View;
 use conefield_core::{Error, Result, files};
 use ndarray::Array3;
 use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 /// The start of every OLE compound file.
@@ -63,12 +63,9 @@ impl Txrm {
 
     /// The first `bytes` bytes of a stream, which must hold as many.
     fn bytes(&mut self, name: &str, bytes: usize) -> Result<Vec<u8>> {
-        if !self.has(name) {
-            return Err(self.invalid(name, "nothing", format!("{bytes} bytes")));
-        }
-        let mut raw = Vec::new();
-        let read = self.file.open_stream(name).and_then(|s| s.take(bytes as u64).read_to_end(&mut raw));
-        read.map_err(|e| self.invalid(name, e, "a stream that can be read"))?;
+        ensure(self.has(name), &self.place, name, "nothing", format!("{bytes} bytes"))?;
+        let read = self.file.open_stream(name).and_then(|mut stream| read_up_to(&mut stream, bytes as u64));
+        let raw = read.map_err(|e| self.invalid(name, e, "a stream that can be read"))?;
         ensure(raw.len() == bytes, &self.place, name, format!("{} bytes", raw.len()), format!("{bytes} bytes"))?;
         Ok(raw)
     }
@@ -122,7 +119,7 @@ impl Txrm {
     fn images(
         &mut self,
         count: usize,
-        name: impl Fn(usize) -> String,
+        name: &dyn Fn(usize) -> String,
         number: Number,
         [rows, columns]: [usize; 2],
     ) -> Result<Array3<f32>> {
@@ -139,12 +136,7 @@ impl Txrm {
         }
         let all = Array3::from_shape_vec((count, rows, columns), values)
             .map_err(|e| self.invalid("images", e, "as many pixels as rows and columns say"))?;
-        match stray(&all) {
-            Some(((i, r, c), x)) => {
-                Err(self.invalid(&format!("{}, row {r}, column {c}", name(i)), x, "a finite number"))
-            }
-            None => Ok(all),
-        }
+        memory::all_finite(&self.place, all, &|(i, r, c)| format!("{}, row {r}, column {c}", name(i)))
     }
 }
 
@@ -161,11 +153,11 @@ pub(super) fn read(path: &Path, part: ScanPart) -> Result<Array3<f32>> {
     match part {
         ScanPart::Projections => {
             let number = txrm.number("ImageInfo/DataType")?;
-            txrm.images(count, |i| format!("ImageData{}/Image{}", i / FOLDER + 1, i + 1), number, size)
+            txrm.images(count, &|i| format!("ImageData{}/Image{}", i / FOLDER + 1, i + 1), number, size)
         }
         ScanPart::Flat => {
             let number = txrm.number("ReferenceData/DataType")?;
-            txrm.images(1, |_| FLAT.to_owned(), number, size)
+            txrm.images(1, &|_| FLAT.to_owned(), number, size)
         }
         ScanPart::Dark => Err(txrm.invalid("dark", "no dark field", "a file that has one")),
     }
@@ -208,7 +200,7 @@ pub(super) fn scan(path: &Path) -> Result<Description> {
         ..w
     };
     let views = rest.views(angles.iter().map(|a| -a)).into_iter().zip(x.iter().zip(&y)).map(shifted).collect();
-    let own = Names::One(path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default());
+    let own = Names::One(file_name(path));
     let open = if txrm.has(FLAT) {
         Open::Flat(own.clone())
     } else {

@@ -1,7 +1,8 @@
 //! The files with which vendors describe a scan, and what they give in common: views, the names of the images, the open
 //! beam and a volume, as a [`Description`].
 
-use super::{Description, Files, I0Text, LayoutTable, ValueKind, ValuesTable, his, obi, skyscan, txrm, xim, xtekct};
+use super::{Description, Files, I0, LayoutTable, ValueKind, ValuesTable, his, obi, skyscan, txrm, xim, xtekct};
+use crate::folder::extension;
 use crate::input::LONGEST_TEXT;
 use crate::rtk::Projection;
 use crate::stack::Names;
@@ -37,7 +38,7 @@ const READERS: [(&str, &str, Reader); 6] = [
 
 /// The reader of the vendor that describes a scan in the file `path`.
 pub(super) fn reader(path: &Path) -> Option<Reader> {
-    let extension = path.extension()?.to_string_lossy().to_lowercase();
+    let extension = extension(path);
     let mut readers = READERS.iter().filter(|(end, ..)| *end == extension).peekable();
     let text = match readers.peek()? {
         (_, "", _) => String::new(),
@@ -96,8 +97,8 @@ impl Description {
     ) -> Self {
         let (flat, i0) = match open {
             Open::Flat(names) => (Some(names), None),
-            Open::Number(n) => (None, Some(I0Text::Number(n))),
-            Open::Air => (None, Some(I0Text::Word("air".into()))),
+            Open::Number(n) => (None, Some(I0::Number(n))),
+            Open::Air => (None, Some(I0::Air)),
         };
         Self {
             _format: String::new(),

@@ -69,9 +69,7 @@ impl Head {
 fn open(path: &Path) -> Result<(Input, [usize; 2], Option<usize>)> {
     let mut input = Input::open_plain(path)?;
     let found = input.take(8)?;
-    if !found.starts_with(MAGIC) {
-        return Err(input.invalid("format", format!("{found:02x?} at the start"), "VMS.XI"));
-    }
+    input.ensure(found.starts_with(MAGIC), "format", format!("{found:02x?} at the start"), "VMS.XI")?;
     let [_, columns, rows, _, bytes, compressed] = [
         integer(&mut input, "version")?,
         integer(&mut input, "columns")?,
@@ -94,9 +92,8 @@ fn integer(input: &mut Input, field: &str) -> Result<usize> {
 fn length(input: &mut Input, field: &str) -> Result<usize> {
     let found = integer(input, field)?;
     let left = input.left().unwrap_or(0);
-    if found as u64 > left {
-        return Err(input.invalid(field, format!("{found} bytes"), format!("at most the {left} left in the file")));
-    }
+    let expected = format!("at most the {left} left in the file");
+    input.ensure(found as u64 <= left, field, format!("{found} bytes"), expected)?;
     Ok(found)
 }
 
@@ -119,9 +116,8 @@ pub(super) fn head(path: &Path) -> Result<Head> {
     // Each takes bytes of the file, which ends.
     for _ in 0..integer(&mut input, "properties")? {
         let longest = integer(&mut input, "length of a property's name")?;
-        if longest > LONGEST_NAME {
-            return Err(input.invalid("length of a property's name", longest, format!("at most {LONGEST_NAME}")));
-        }
+        let expected = format!("at most {LONGEST_NAME}");
+        input.ensure(longest <= LONGEST_NAME, "length of a property's name", longest, expected)?;
         let name = String::from_utf8_lossy(&input.exactly(longest, "name of a property")?).into_owned();
         let kind = integer(&mut input, &name)?;
         match kind {

@@ -3,6 +3,7 @@
 //! The `tiff` crate allocates what an entry claims, on the first page up to 256 MiB whatever the file's size, and
 //! prints an overlong text to standard error. This check keeps claims within the file's size.
 
+use super::Source;
 use conefield_core::{Error, Result};
 use std::collections::HashSet;
 use std::io::{Read, Seek, SeekFrom};
@@ -32,8 +33,8 @@ const PHOTOMETRIC: u64 = 262;
 /// Entries that point to other directories: SubIFDs, Exif, GPS, interoperability.
 const POINTERS: [u64; 4] = [330, 34_665, 34_853, 40_965];
 
-struct EntryWalk<'a, R> {
-    reader: &'a mut R,
+struct EntryWalk<'a> {
+    reader: &'a mut dyn Source,
     little: bool,
     big_tiff: bool,
     found: Directories,
@@ -41,7 +42,7 @@ struct EntryWalk<'a, R> {
 
 /// Walks over the directories; refuses an entry longer than the `size` of the whole file. The reader reports other
 /// damage.
-pub(super) fn check(place: &str, reader: &mut (impl Read + Seek), size: u64) -> Result<Directories> {
+pub(super) fn check(place: &str, reader: &mut dyn Source, size: u64) -> Result<Directories> {
     let mut mark = [0; 4];
     let found = Directories { bytes: 0, end: 0, white: Vec::new(), others: false };
     if reader.rewind().and_then(|()| reader.read_exact(&mut mark)).is_err() {
@@ -65,7 +66,7 @@ pub(super) fn check(place: &str, reader: &mut (impl Read + Seek), size: u64) -> 
     Ok(walk.found)
 }
 
-impl<R: Read + Seek> EntryWalk<'_, R> {
+impl EntryWalk<'_> {
     /// Offset of the first directory.
     fn first(&mut self) -> Option<u64> {
         if self.big_tiff {

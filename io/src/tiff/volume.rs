@@ -4,16 +4,15 @@
 //! has added it.
 
 use super::images::entry;
-use super::{stack, values};
+use super::{Pages, stack, values};
 use crate::affine::{self, Affine};
 use crate::{file_order, folder, text};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result, allowance};
 use ndarray::{Array3, s};
-use std::io::{Read, Seek};
 use std::path::Path;
-use tiff::decoder::{Decoder, ifd::Value};
+use tiff::decoder::ifd::Value;
 use tiff::tags::Tag;
 
 /// Key of the affine in the text of the first page: twelve numbers, row by row, RAS in mm.
@@ -24,7 +23,7 @@ pub(super) const AFFINE: &str = "affine";
 pub(crate) fn read_volume(path: &Path) -> Result<Volume> {
     let place = path.display().to_string();
     let mut text = StackText::default();
-    let (pages, images) = stack(path, |decoder| text = StackText::of(decoder))?;
+    let (pages, images) = stack(path, &mut |decoder| text = StackText::of(decoder))?;
     let (slices, rows, columns) = pages.dim();
     if let Some(n) = images.claim.map(|c| c.volumes).filter(|n| *n > 1) {
         let found = format!("{n} channels or points in time");
@@ -60,7 +59,7 @@ pub(crate) fn read_folder(folder: &Path) -> Result<Volume> {
     let (mut data, mut sample) = (None::<Array3<f32>>, None);
     for (z, name) in names.iter().enumerate() {
         let path = folder::inside(folder, &place, "slices", name)?;
-        let (slice, images) = stack(&path, |decoder| {
+        let (slice, images) = stack(&path, &mut |decoder| {
             if z == 0 {
                 text = StackText::of(decoder);
             }
@@ -117,7 +116,7 @@ struct StackText {
 
 impl StackText {
     /// A tag that is damaged or of another type counts as absent: the slices do not depend on it.
-    fn of(decoder: &mut Decoder<impl Read + Seek>) -> Self {
+    fn of(decoder: &mut Pages) -> Self {
         let mut tag = |tag| decoder.find_tag(tag).ok().flatten();
         let text = tag(Tag::ImageDescription).and_then(|v| v.into_string().ok());
         let ratio = |v: Option<Value>| match v? {

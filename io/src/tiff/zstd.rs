@@ -3,10 +3,12 @@
 //! `ruzstd` decompresses the strips or tiles. The `tiff` crate reads them from a file in memory that holds nothing but
 //! the page, uncompressed.
 
-use super::{Page, Pages, append, broken, pieces, tags};
+use super::{Page, Pages, Source, append, broken, pieces, tags};
+use crate::input::read_up_to;
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result, allowance};
 use ruzstd::decoding::FrameDecoder;
-use std::io::{Cursor, Read, Seek, SeekFrom};
+use std::io::{Cursor, SeekFrom};
 use tiff::TiffError;
 use tiff::decoder::{ChunkType, Decoder, Limits};
 use tiff::encoder::TiffEncoder;
@@ -35,10 +37,9 @@ pub(super) fn read(place: &str, decoder: &mut Pages, page: &Page, out: &mut Vec<
     let all = offsets.len() as u64 * bytes as u64;
     let all = all.saturating_mul(u64::from(width)).saturating_mul(u64::from(height));
     // Tiles no larger than the page cover at most four times its pixels.
-    if tiled && all > page.bytes.saturating_mul(4).max(TILES) {
-        let found = format!("{} strips or tiles of {height} x {width} pixels", offsets.len());
-        return Err(Error::invalid(place, "StripOffsets", found, "those that make up the page"));
-    }
+    let found = format!("{} strips or tiles of {height} x {width} pixels", offsets.len());
+    let expected = "those that make up the page";
+    ensure(!tiled || all <= page.bytes.saturating_mul(4).max(TILES), place, "StripOffsets", found, expected)?;
     // The file in memory, with header and directory, and the page that is read from it.
     let held = (if tiled { all } else { page.bytes }).saturating_add(4096 + 16 * offsets.len() as u64);
     allowance::memory(place, "page", held.saturating_add(page.bytes))?;
@@ -80,23 +81,19 @@ pub(super) fn read(place: &str, decoder: &mut Pages, page: &Page, out: &mut Vec<
     directory.write_tag(sizes, &lengths[..]).map_err(broken)?;
     directory.finish().map_err(broken)?;
     plain.set_position(0);
-    let mut page = Decoder::new(plain).map_err(broken)?.with_limits(Limits::unlimited());
+    let mut page: Pages = Decoder::new(Box::new(plain) as Box<dyn Source>).map_err(broken)?;
+    page = page.with_limits(Limits::unlimited());
     append(out, page.read_image().map_err(broken)?);
     Ok(())
 }
 
 /// The `size` bytes at byte `at` of the file.
-fn stored(place: &str, reader: &mut (impl Read + Seek), at: u64, size: u64) -> Result<Vec<u8>> {
-    let mut packed = Vec::new();
-    let read = reader.seek(SeekFrom::Start(at)).and_then(|_| reader.take(size).read_to_end(&mut packed));
-    match read {
-        Ok(n) if n as u64 == size => Ok(packed),
-        Ok(n) => {
-            let expected = format!("{size}, as StripByteCounts says");
-            Err(Error::invalid(place, "TIFF", format!("{n} bytes at byte {at}"), expected))
-        }
-        Err(e) => Err(Error::invalid(place, "TIFF", e, "a file that can be read")),
-    }
+fn stored(place: &str, reader: &mut dyn Source, at: u64, size: u64) -> Result<Vec<u8>> {
+    let packed = reader.seek(SeekFrom::Start(at)).and_then(|_| read_up_to(reader, size));
+    let packed = packed.map_err(|e| Error::invalid(place, "TIFF", e, "a file that can be read"))?;
+    let (found, expected) = (packed.len(), format!("{size}, as StripByteCounts says"));
+    ensure(found as u64 == size, place, "TIFF", format!("{found} bytes at byte {at}"), expected)?;
+    Ok(packed)
 }
 
 /// The `want` bytes of a strip or tile.

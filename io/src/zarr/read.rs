@@ -7,6 +7,7 @@ use crate::input::{Input, must_unpack};
 use crate::npy;
 use crate::number::{ByteOrder, Number};
 use crate::text::{self, shortened};
+use conefield_core::error::ensure;
 use conefield_core::finite::stray;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::Volume;
@@ -70,10 +71,8 @@ impl Multiscale {
     /// Millimetres per unit of length.
     fn unit(&self, place: &str) -> Result<f64> {
         let names: Vec<&str> = self.axes.iter().map(|a| a.name.as_str()).collect();
-        if names != ["z", "y", "x"] {
-            let expected = "[\"z\", \"y\", \"x\"]: one volume, one number per voxel";
-            return Err(Error::invalid(place, "multiscales[0].axes", format!("{names:?}"), expected));
-        }
+        let expected = "[\"z\", \"y\", \"x\"]: one volume, one number per voxel";
+        ensure(names == ["z", "y", "x"], place, "multiscales[0].axes", format!("{names:?}"), expected)?;
         let unit = self.axes[0].unit.as_deref();
         let known = match unit {
             None | Some("millimeter") => Some(1.0),
@@ -139,20 +138,15 @@ impl Stored {
         let file = folder.join(".zarray");
         let place = file.display().to_string();
         let array: LevelArray = text::read(&file)?;
-        let invalid = |field: &str, found: String, expected: &str| Error::invalid(&place, field, found, expected);
-        if array.zarr_format != 2 {
-            return Err(invalid("zarr_format", array.zarr_format.to_string(), "2"));
-        }
+        ensure(array.zarr_format == 2, &place, "zarr_format", array.zarr_format, "2")?;
         let names = [array.shape, array.chunks].concat();
-        if names.contains(&0) {
-            let found = format!("{:?} in chunks of {:?}", array.shape, array.chunks);
-            return Err(invalid("shape", found, "at least one voxel along each axis"));
-        }
+        let found = format!("{:?} in chunks of {:?}", array.shape, array.chunks);
+        ensure(!names.contains(&0), &place, "shape", found, "at least one voxel along each axis")?;
         // Unlike NumPy, Zarr always states the byte order.
         let element = npy::element(&array.dtype).filter(|_| array.dtype.starts_with(['<', '>', '|']));
         let (number, order) = element.ok_or_else(|| {
             let expected = "a real number of 8 to 64 bits such as \"<f4\" or \"|u1\"";
-            invalid("dtype", shortened(&array.dtype), expected)
+            Error::invalid(&place, "dtype", shortened(&array.dtype), expected)
         })?;
         let unpack: fn(Input) -> Input = match array.compressor.as_ref().map(|c| c.id.as_str()) {
             None => |plain| plain,
@@ -160,18 +154,14 @@ impl Stored {
             Some("gzip") => Input::gunzip,
             Some(other) => {
                 let expected = "zlib, gzip or none (rewrite the array with one of them)";
-                return Err(invalid("compressor.id", shortened(other), expected));
+                return Err(Error::invalid(place, "compressor.id", shortened(other), expected));
             }
         };
-        if let Some(filters) = array.filters.as_ref().filter(|f| !f.is_empty()) {
-            return Err(invalid("filters", format!("{} filters", filters.len()), "none"));
-        }
-        if array.order != "C" {
-            return Err(invalid("order", shortened(&array.order), "C"));
-        }
-        if !["/", "."].contains(&array.dimension_separator.as_str()) {
-            return Err(invalid("dimension_separator", shortened(&array.dimension_separator), "/ or ."));
-        }
+        let filters = array.filters.as_ref().map_or(0, Vec::len);
+        ensure(filters == 0, &place, "filters", format!("{filters} filters"), "none")?;
+        ensure(array.order == "C", &place, "order", shortened(&array.order), "C")?;
+        let separator = &array.dimension_separator;
+        ensure(["/", "."].contains(&&separator[..]), &place, "dimension_separator", shortened(separator), "/ or .")?;
         Ok(Self { folder, place, array, number, order, unpack })
     }
 

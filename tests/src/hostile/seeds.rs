@@ -368,23 +368,19 @@ pub fn scan_json(dir: &Path) {
     put(&dir.join("scan/scan.json"), value.to_string().as_bytes());
 }
 
-fn tensors() -> Vec<(&'static str, Vec<usize>, &'static [f32])> {
-    vec![
-        ("encoder.table", vec![4], &[0.5, -1.0, 2.0, 0.0]),
-        ("field.0.weight", vec![2, 3], &[1.0, -2.0, 3.5, 0.0, 1e-38, 7.0]),
-    ]
-}
+const TENSORS: [conefield_io::Tensor<'static>; 2] =
+    [("encoder.table", &[4], &[0.5, -1.0, 2.0, 0.0]), ("field.0.weight", &[2, 3], &[1.0, -2.0, 3.5, 0.0, 1e-38, 7.0])];
 
 /// `w.safetensors`.
 pub fn weights(dir: &Path) {
     let text = BTreeMap::from([("made by".to_owned(), "a test".to_owned())]);
-    written(conefield_io::write_weights(dir.join("w.safetensors"), &tensors(), &text));
+    written(conefield_io::write_weights(&dir.join("w.safetensors"), &TENSORS, &text));
 }
 
 /// `c.safetensors`.
 pub fn checkpoint(dir: &Path) {
     let text = BTreeMap::from([("standing".to_owned(), "{}".to_owned())]);
-    written(conefield_io::write_checkpoint(dir.join("c.safetensors"), &tensors(), &text));
+    written(conefield_io::write_checkpoint(&dir.join("c.safetensors"), &TENSORS, &text));
 }
 
 /// `spec.toml`: the shipped `naf`.
