@@ -105,7 +105,7 @@ impl<R: Real> Op for Forward<'_, VoxelGridStage, R> {
             for i in 0..n {
                 [z[i]] = located.gather(i, &offsets, table);
             }
-            activate(s, self.stage.output, &mut z[..n], &mut self.y.data[at..at + n]);
+            activate(self.stage.output, &mut z[..n], &mut self.y.data[at..at + n]);
         }
     }
 }
@@ -136,7 +136,7 @@ impl<R: Real> Op for Backward<'_, VoxelGridStage, R> {
                 for i in 0..n {
                     [slope[i]] = located.gather(i, &offsets, table);
                 }
-                activate(s, self.stage.output, &mut slope[..n], &mut value[..n]);
+                activate(self.stage.output, &mut slope[..n], &mut value[..n]);
             }
             for i in 0..n {
                 slope[i] *= self.dy.data[at + i];

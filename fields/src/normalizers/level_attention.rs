@@ -88,7 +88,7 @@ impl<R: Real> Op for Forward<'_, LevelAttentionStage, R> {
     fn call<S: Simd>(mut self, s: S) {
         let (stage, n) = (self.stage, self.x.rows);
         let bias = &self.params[stage.weights()..];
-        affine(s, stage.matrix(self.params), Some(bias), self.x.data, self.tape.data, n);
+        affine(stage.matrix(self.params), Some(bias), self.x.data, self.tape.data, n);
         let number = |v: f64| V::<S, R>::splat(s, R::of(v));
         let mut i = 0;
         while i < n {
@@ -151,9 +151,9 @@ impl<R: Real> Op for Backward<'_, LevelAttentionStage, R> {
         debug_assert_eq!(self.grads.range, 0..self.params.len());
         let (dw, db) = self.grads.values.split_at_mut(stage.weights());
         let dz = &*self.tape.data;
-        affine_weights(s, dz, self.x.data, dw, stage.width(), 0, Some(db), n);
+        affine_weights(dz, self.x.data, dw, stage.width(), 0, Some(db), n);
         if let Some(dx) = self.dx {
-            affine_input(s, stage.matrix(self.params), dz, dx.data, Into::Add, n);
+            affine_input(stage.matrix(self.params), dz, dx.data, Into::Add, n);
         }
     }
 }
