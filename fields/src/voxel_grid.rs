@@ -145,10 +145,14 @@ impl<R: Real> Op for Backward<'_, VoxelGridStage, R> {
                 located.scatter(i, &offsets, &[slope[i]], self.grads.values, &own);
             }
             if let Some(dx) = &mut self.dx {
-                for i in 0..n {
-                    let corners = offsets.map(|o| table[located.base(i) + o][0]);
-                    for (d, v) in located.slopes(i, corners).into_iter().enumerate() {
-                        dx.channel(d)[at + i] = v * slope[i];
+                for d in 0..3 {
+                    let (mut near, mut far) = (located.clone(), located.clone());
+                    near.move_to(d, R::ZERO);
+                    far.move_to(d, R::ONE);
+                    for i in 0..n {
+                        let [[near], [far]] = [&near, &far].map(|moved| moved.gather(i, &offsets, table));
+                        let stretch = self.stage.grid.stretch(d, self.x.channel(d)[at + i]);
+                        dx.channel(d)[at + i] = (far - near) * stretch * slope[i];
                     }
                 }
             }
