@@ -1,11 +1,10 @@
 //! Line integrals of voxel volumes and their adjoint.
 
 use super::elements::fill;
-use super::launch::{Room, Task, each};
+use super::launch::{Room, Task};
 use super::{Array, parts, plane};
 use crate::Shared;
-use crate::source::validate;
-use conefield_core::device::{Access, Source, fragment_of};
+use conefield_core::device::{Access, fragment_of};
 use conefield_core::error::Result;
 use conefield_core::geometry::{Geometry, cross, dot, norm, sub};
 use conefield_core::place::ViewRays;
@@ -67,33 +66,30 @@ impl<'a> Walks<'a> {
         Ok(Self { shared, name, fragment })
     }
 
-    fn kernel(&self, forward: bool) -> Source {
+    fn task(&self, forward: bool) -> Task<'_> {
         let atomics = self.shared.gpu.adapter.atomics;
-        let mut source = Source::default();
-        source.add("projection", include_str!("../kernels/project.wgsl"));
-        source.bind("projection", Access::Uniform, "Projection");
-        source.bind("views", Access::Read, "array<ProjectedView>");
-        let (what, begin, end) = if forward {
-            source.bind("volume", Access::Read, "array<f32>");
-            source.bind("lines", Access::Write, "array<f32>");
-            ("value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[line] += value;")
+        let label = if forward { "forward projection" } else { "adjoint of projection" };
+        let task = Task::new(label, include_str!("../kernels/project.wgsl"), "projection", "Projection");
+        let task = task.bind("views", Access::Read, "ProjectedView");
+        let (task, what, begin, end) = if forward {
+            let task = task.bind("volume", Access::Read, "f32").bind("lines", Access::Write, "f32");
+            (task, "value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[line] += value;")
         } else {
-            source.bind("volume", Access::Write, &format!("array<atomic<{}>>", atomics.number()));
-            source.bind("lines", Access::Read, "array<f32>");
+            let task = task.bind("volume", Access::Write, &format!("atomic<{}>", atomics.number()));
             let begin = "value = lines[line];\n        if value == 0.0 { continue; }";
-            (format!("let v = weight * value;\n{}", atomics.sum("volume[i]")), begin, "")
+            let what = format!("let v = weight * value;\n{}", atomics.sum("volume[i]"));
+            (task.bind("lines", Access::Read, "f32"), what, begin, "")
         };
-        source.add("visit", &include_str!("../kernels/visit.wgsl").replace("WHAT", &what));
-        source.add(&self.name, &self.fragment.named("walk_"));
         let body =
             format!("let line = line_of(i);\n        {begin}\n        walk_walk(projected(line));\n        {end}");
-        source.add("rays", &each("projection", &body));
-        source
+        task.add("visit", &include_str!("../kernels/visit.wgsl").replace("WHAT", &what))
+            .add(&self.name, &self.fragment.named("walk_"))
+            .each(&body)
     }
 
     /// Refuses invalid WGSL.
     pub(super) fn validate(&self) -> Result<()> {
-        [true, false].into_iter().try_for_each(|forward| validate(&self.kernel(forward)))
+        [true, false].into_iter().try_for_each(|forward| self.task(forward).validate())
     }
 
     /// Overwrites `images` if `forward`, else adds to `volume`.
@@ -107,15 +103,14 @@ impl<'a> Walks<'a> {
     ) -> Result<()> {
         if forward {
             // Line integrals are added up part by part of the volume.
-            fill(self.shared, room, images, 0.0)?;
+            fill(room, images, 0.0)?;
         }
         let pixels = plane(images.shape());
-        let label = if forward { "forward projection" } else { "adjoint of projection" };
-        let source = &self.kernel(forward);
+        let task = self.task(forward);
         for part in parts(images) {
             let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
             let data: Vec<f32> = some.iter().flat_map(|&v| projected(geometry, v)).flatten().collect();
-            room.write(&self.shared.gpu, "views", &data)?;
+            room.write("views", &data)?;
             let count = (some.len() * pixels) as u32;
             for held in parts(volume) {
                 let whole = Projection {
@@ -129,8 +124,7 @@ impl<'a> Walks<'a> {
                     ..Projection::default()
                 };
                 let bind = [("volume", &held.buffer), ("lines", &part.buffer)];
-                let uniform = ("projection", |begin, end| Projection { begin, end, ..whole });
-                room.run(self.shared, Task { label, source, bind: &bind }, uniform, count)?;
+                room.run(&task, &bind, |begin, end| Projection { begin, end, ..whole }, count)?;
             }
         }
         Ok(())
