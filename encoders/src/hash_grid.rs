@@ -477,10 +477,14 @@ mod tests {
         let (x, rows) = ([-0.3, 0.4, 0.45, 0.7, 1.4, 0.9], 2);
         let dy = vec![1.0; info.output * rows];
         let (mut grads, mut dx) = (vec![0.0; info.params], vec![0.0; 3 * rows]);
-        let into = Grads { values: &mut grads, range: 0..info.params };
-        let kernel: &dyn Kernel<f64> = &stage;
-        let (tape, into_x) = (TileMut::new(&mut [], rows), Some(TileMut::new(&mut dx, rows)));
-        kernel.backward(&params, Tile::new(&x, rows), tape, Tile::new(&dy, rows), into, into_x);
+        stage.backward(Backward {
+            params: &params,
+            x: Tile::new(&x, rows),
+            tape: TileMut::new(&mut [], rows),
+            dy: Tile::new(&dy, rows),
+            grads: Grads::all(&mut grads),
+            dx: Some(TileMut::new(&mut dx, rows)),
+        });
         assert_eq!([dx[0], dx[4]], [0.0, 0.0]);
         assert!([dx[1], dx[2], dx[3], dx[5]].iter().all(|g| *g != 0.0), "{dx:?}");
     }

@@ -445,15 +445,7 @@ impl<L: Level, R: Real> Kernel<R> for Levels<L> {
         self.encode(parts, params, x, y, None);
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, dy, grads, dx, .. }: Backward<'_, R>) {
         if let Some(dx) = dx {
             self.slopes(params, x, dy, dx);
         }

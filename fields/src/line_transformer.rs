@@ -145,15 +145,7 @@ impl<R: Real> Kernel<R> for LineTransformerStage {
         activate(settings.output, tape.last, y.data);
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        mut dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, tape, dy, grads, mut dx }: Backward<'_, R>) {
         debug_assert_eq!(grads.range, 0..params.len());
         let (Self { first, skip, last, .. }, n, grads) = (self, x.rows, grads.values);
         let mut tape = Tape::of(self, tape);
@@ -176,10 +168,15 @@ impl<R: Real> Kernel<R> for LineTransformerStage {
             let (before, from) = tape.blocks.split_at_mut(k);
             let [output, own] = &mut from[0];
             let input: &[R] = if let Some([output, _]) = before.last() { output } else { features };
-            let of = Grads::all(&mut grads[self.of_block(start)]);
-            // The block's output is no longer needed: `∂L` of its input replaces it.
-            let (own, to) = (TileMut::new(own, n), Some(TileMut::new(output, n)));
-            self.block.backward(&params[self.of_block(start)], Tile::new(input, n), own, Tile::new(d, n), of, to);
+            self.block.backward(Backward {
+                params: &params[self.of_block(start)],
+                x: Tile::new(input, n),
+                tape: TileMut::new(own, n),
+                dy: Tile::new(d, n),
+                grads: Grads::all(&mut grads[self.of_block(start)]),
+                // The block's output is no longer needed: `∂L` of its input replaces it.
+                dx: Some(TileMut::new(output, n)),
+            });
             d.copy_from_slice(output);
         }
         multiply(d_first, d);

@@ -133,15 +133,7 @@ impl<R: Real> Kernel<R> for MlpStage {
         }
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        mut dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, tape, dy, grads, mut dx }: Backward<'_, R>) {
         let n = x.rows;
         let last = self.layers.len() - 1;
         debug_assert_eq!(grads.range, 0..params.len());

@@ -207,15 +207,7 @@ impl<R: Real> Kernel<R> for LayerNormStage {
         run(Forward { stage: self, params, x, y, tape });
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, tape, dy, grads, dx }: Backward<'_, R>) {
         let tape = Tile::new(tape.data, tape.rows);
         run(LayerNormBackward { stage: self, params, x, tape, dy, grads, dx });
     }

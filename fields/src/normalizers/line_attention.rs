@@ -398,35 +398,33 @@ impl<R: Real> Kernel<R> for LineAttentionStage {
         self.feed(params, y, &mut tape);
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, tape, dy, grads, mut dx }: Backward<'_, R>) {
         debug_assert_eq!(grads.range, 0..params.len());
         let (n, [first, second], grads) = (x.rows, self.at.norms.clone(), grads.values);
         let mut tape = Tape::of(self, tape);
         self.feed_back(params, dy, grads, &mut tape);
         let Tape { norm, normed, sum, d_sum, .. } = &mut tape;
-        let of = Grads::all(&mut grads[second.clone()]);
-        let (z, kept) = (Tile::new(sum, n), TileMut::new(norm[1], n));
-        let d = Some(TileMut::new(d_sum, n));
-        self.norm.backward(&params[second], z, kept, Tile::new(normed[1], n), of, d);
+        self.norm.backward(Backward {
+            params: &params[second.clone()],
+            x: Tile::new(sum, n),
+            tape: TileMut::new(norm[1], n),
+            dy: Tile::new(normed[1], n),
+            grads: Grads::all(&mut grads[second]),
+            dx: Some(TileMut::new(d_sum, n)),
+        });
         add(d_sum, dy.data);
         self.attend_back(params, n, grads, &mut tape);
         let Tape { norm, normed, d_sum, .. } = &mut tape;
-        let of = Grads::all(&mut grads[first.clone()]);
-        let (kept, d) = (TileMut::new(norm[0], n), Tile::new(normed[0], n));
-        match dx {
-            Some(dx) => {
-                self.norm.backward(&params[first], x, kept, d, of, Some(TileMut::new(dx.data, n)));
-                add(dx.data, d_sum);
-            }
-            None => self.norm.backward(&params[first], x, kept, d, of, None),
+        self.norm.backward(Backward {
+            params: &params[first.clone()],
+            x,
+            tape: TileMut::new(norm[0], n),
+            dy: Tile::new(normed[0], n),
+            grads: Grads::all(&mut grads[first]),
+            dx: dx.as_mut().map(|dx| TileMut::new(dx.data, n)),
+        });
+        if let Some(dx) = dx {
+            add(dx.data, d_sum);
         }
     }
 
