@@ -81,6 +81,12 @@ pub fn spread(times: &mut [f64]) -> [f64; 3] {
     [times[0], times[times.len() / 2], times[times.len() - 1]]
 }
 
+/// `n` things in each of these seconds, in millions, for a line of a report; `of` says what the median is of.
+pub fn millions(n: f64, [low, median, high]: [f64; 3], things: &str, of: &str) -> String {
+    let [slow, middle, fast] = [high, median, low].map(|t| n / t / 1e6);
+    format!("{middle:.2} M {things}/s ({of}; {slow:.2} to {fast:.2})")
+}
+
 /// Minimum, median and maximum of some runs, in seconds.
 pub fn times(runs: usize, mut f: impl FnMut()) -> [f64; 3] {
     let mut all: Vec<f64> = (0..runs)
