@@ -107,12 +107,6 @@ impl MlpStage {
     }
 }
 
-/// Splits `data` into `[..at]` and the channels `range` after it.
-fn split<R>(data: &mut [R], range: Range<usize>, rows: usize) -> (&[R], &mut [R]) {
-    let (before, rest) = data.split_at_mut(range.start * rows);
-    (before, &mut rest[..range.len() * rows])
-}
-
 impl<R: Real> Kernel<R> for MlpStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         let n = x.rows;
@@ -122,7 +116,8 @@ impl<R: Real> Kernel<R> for MlpStage {
             // The linear map is written where its derivative will be stored; the activation then reads it in place.
             let from = if last { self.slope(i).start } else { self.hidden(i).start };
             let until = self.slope(i).end;
-            let (before, both) = split(tape.data, from..until, n);
+            let (before, rest) = tape.data.split_at_mut(from * n);
+            let both = &mut rest[..(until - from) * n];
             let (h, z) = if last { (&mut y.data[..], both) } else { both.split_at_mut(layer.output * n) };
             let input = if i == 0 { x.data } else { &before[self.hidden(i - 1).start * n..self.hidden(i - 1).end * n] };
             affine(layer.matrix(params, layer.skip), Some(&params[layer.bias()]), input, z, n);

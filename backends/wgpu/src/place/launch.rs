@@ -5,7 +5,6 @@ use crate::Shared;
 use crate::compose::GROUP;
 use crate::kernel::Buffers;
 use crate::pace::Pace;
-use crate::source::validate;
 use crate::wave::MOST_GROUPS;
 use conefield_core::device::{Access, Source};
 use conefield_core::error::Result;
@@ -30,7 +29,7 @@ const SUMS: u32 = 4096;
 pub(super) struct Task<'a> {
     /// Its name for messages.
     label: &'a str,
-    source: Source,
+    pub(super) source: Source,
     /// The uniform buffer that says where a launch begins and ends.
     uniform: &'a str,
     /// Arrays by the names of their parts in the kernel.
@@ -91,11 +90,6 @@ impl<'a> Task<'a> {
         };
         let text = include_str!("../kernels/summing.wgsl").replace("LAUNCH", self.uniform).replace("BODY", body);
         self.bind("sums", Access::Write, "vec2<f32>").add("sums", &text.replace("ADD", add).replace("MERGE", merge))
-    }
-
-    /// Refuses invalid WGSL.
-    pub(super) fn validate(&self) -> Result<()> {
-        validate(&self.source)
     }
 
     /// The buffers of the arrays' k-th parts.

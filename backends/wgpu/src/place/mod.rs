@@ -98,7 +98,7 @@ impl Place for DevicePlace {
     }
 
     fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
-        rays::Walks::new(&self.shared, projector)?.validate()
+        rays::admits(&self.shared, projector)
     }
 
     fn holds(&self, bytes: u64) -> bool {
@@ -206,11 +206,11 @@ impl Place for DevicePlace {
     }
 
     fn forward(&self, rays: ViewRays<'_>, volume: &Array, images: &mut Array) -> Result<()> {
-        rays::Walks::new(&self.shared, rays.projector)?.run(&mut self.room(), true, rays, volume, images)
+        rays::project(&mut self.room(), true, rays, volume, images)
     }
 
     fn adjoint(&self, rays: ViewRays<'_>, images: &Array, volume: &mut Array) -> Result<()> {
-        rays::Walks::new(&self.shared, rays.projector)?.run(&mut self.room(), false, rays, volume, images)
+        rays::project(&mut self.room(), false, rays, volume, images)
     }
 
     fn compare(&self, by: &Weighing<'_>, views: &[usize], images: &mut Array) -> Result<[f64; 2]> {

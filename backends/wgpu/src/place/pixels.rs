@@ -29,57 +29,50 @@ fn indices(part: &Chunk, wanted: &[usize]) -> Option<Vec<u32>> {
     all.iter().any(|i| *i != NONE).then_some(all)
 }
 
-/// Images with the measured ones, and what has a value for every pixel of the scan: shadow and weights.
-struct Sources<'a> {
-    place: &'a DevicePlace,
-    by: &'a Weighing<'a>,
-}
-
-impl Sources<'_> {
-    /// Calls `launch` for each part of the images with its buffers and number of pixels.
-    fn run(
-        &self,
-        views: &[usize],
-        images: &Array,
-        launch: &mut dyn FnMut(&mut Room, &[(&str, &wgpu::Buffer)], u32) -> Result<()>,
-    ) -> Result<()> {
-        let (place, by) = (self.place, self.by);
-        let pixels = plane(images.shape());
-        for part in parts(images) {
-            let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
-            let mut loaded;
-            let (measured, wanted): (_, Vec<usize>) = match &by.views.here {
-                Some(here) => (parts(here), some.to_vec()),
-                // Measured views that are not on the device come for each use.
-                None => {
-                    loaded = place.zeros([some.len(), images.shape()[1], images.shape()[2]])?;
-                    for (i, &view) in some.iter().enumerate() {
-                        place.load(by.views.measured.slice(s![view..view + 1, .., ..]), &mut loaded, i)?;
-                    }
-                    (parts(&loaded), (0..some.len()).collect())
+/// Calls `launch` for each part of the images with its number of pixels and its buffers: images, measured ones, and what has a
+/// value for every pixel of the scan, shadow and weights.
+fn over(
+    place: &DevicePlace,
+    by: &Weighing<'_>,
+    views: &[usize],
+    images: &Array,
+    launch: &mut dyn FnMut(&mut Room, &[(&str, &wgpu::Buffer)], u32) -> Result<()>,
+) -> Result<()> {
+    let pixels = plane(images.shape());
+    for part in parts(images) {
+        let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
+        let mut loaded;
+        let (measured, wanted): (_, Vec<usize>) = match &by.views.here {
+            Some(here) => (parts(here), some.to_vec()),
+            // Measured views that are not on the device come for each use.
+            None => {
+                loaded = place.zeros([some.len(), images.shape()[1], images.shape()[2]])?;
+                for (i, &view) in some.iter().enumerate() {
+                    place.load(by.views.measured.slice(s![view..view + 1, .., ..]), &mut loaded, i)?;
                 }
-            };
-            let of_all = by.shadow.map(parts).or_else(|| by.weights.map(parts));
-            for held in measured {
-                let Some(at) = indices(held, &wanted) else { continue };
-                for k in 0..of_all.map_or(1, <[Chunk]>::len) {
-                    let at_all = match of_all {
-                        Some(all) => indices(&all[k], some),
-                        None => Some(at.clone()),
-                    };
-                    let Some(at_all) = at_all else { continue };
-                    let index: Vec<[u32; 2]> = at.iter().zip(at_all).map(|(&a, b)| [a, b]).collect();
-                    let mut bind = vec![("images", &part.buffer), ("measured", &held.buffer)];
-                    bind.extend(by.shadow.map(|shadow| ("shadow", &parts(shadow)[k].buffer)));
-                    bind.extend(by.weights.map(|weights| ("weights", &parts(weights)[k].buffer)));
-                    let mut room = place.room();
-                    room.write("index", &index)?;
-                    launch(&mut room, &bind, (some.len() * pixels) as u32)?;
-                }
+                (parts(&loaded), (0..some.len()).collect())
+            }
+        };
+        let of_all = by.shadow.map(parts).or_else(|| by.weights.map(parts));
+        for held in measured {
+            let Some(at) = indices(held, &wanted) else { continue };
+            for k in 0..of_all.map_or(1, <[Chunk]>::len) {
+                let at_all = match of_all {
+                    Some(all) => indices(&all[k], some),
+                    None => Some(at.clone()),
+                };
+                let Some(at_all) = at_all else { continue };
+                let index: Vec<[u32; 2]> = at.iter().zip(at_all).map(|(&a, b)| [a, b]).collect();
+                let mut bind = vec![("images", &part.buffer), ("measured", &held.buffer)];
+                bind.extend(by.shadow.map(|shadow| ("shadow", &parts(shadow)[k].buffer)));
+                bind.extend(by.weights.map(|weights| ("weights", &parts(weights)[k].buffer)));
+                let mut room = place.room();
+                room.write("index", &index)?;
+                launch(&mut room, &bind, (some.len() * pixels) as u32)?;
             }
         }
-        Ok(())
     }
+    Ok(())
 }
 
 /// A kernel with the bindings of pixels.
@@ -119,7 +112,7 @@ pub(super) fn compare(
     let body = include_str!("../kernels/compare.wgsl").replace("INSIDE", &inside).replace("WEIGHT", weight);
     let task = task("data term", by, term)?.summing(&body.replace("DERIVATIVE", derivative), false);
     let mut sums = [0.0; 2];
-    Sources { place, by }.run(views, images, &mut |room, bind, count| {
+    over(place, by, views, images, &mut |room, bind, count| {
         let found = room.sum(&task, bind, uniform(images), count, false)?;
         sums = std::array::from_fn(|k| sums[k] + found[k]);
         Ok(())
@@ -140,5 +133,5 @@ pub(super) fn weigh(
     let (label, value) = if spread { ("noise", "term_spread") } else { ("curvature", "term_curve") };
     let body = include_str!("../kernels/weigh.wgsl").replace("VALUE", value);
     let task = task(label, by, Some(term))?.each(&body);
-    Sources { place, by }.run(views, images, &mut |room, bind, count| room.run(&task, bind, uniform(images), count))
+    over(place, by, views, images, &mut |room, bind, count| room.run(&task, bind, uniform(images), count))
 }

@@ -10,7 +10,7 @@ use Access::{Read, Write};
 use conefield_core::device::{Access, fragment_of};
 use conefield_core::error::Result;
 use conefield_core::place::{ProximalStep, Slab, VariationSlope};
-use conefield_core::regularizer::{Bounds, Dual, Guide, Kernels};
+use conefield_core::regularizer::{Dual, Guide, Kernels};
 
 /// `Stencil` in `kernels/stencil.wgsl`.
 #[repr(C)]
@@ -86,22 +86,6 @@ impl Volume {
     fn new(x: &Array) -> Self {
         let shape = x.shape();
         Self { shape, whole: Stencil { shape: shape.map(|n| n as u32), ..Stencil::default() } }
-    }
-
-    /// With bounds of the result of the proximal map.
-    fn within(mut self, bounds: Bounds) -> Self {
-        // A shader need not know infinity.
-        let [low, high] = [bounds.low, bounds.high].map(|x| x.clamp(f32::MIN, f32::MAX));
-        self.whole = Stencil { low, high, ..self.whole };
-        self
-    }
-
-    /// With the factors of dual steps.
-    fn of_dual(mut self, dual: &Dual<'_>, tau: f32) -> Self {
-        let bound = Dual::bound(dual.weights);
-        self.whole.down = dual.weights.map(|g| g * tau);
-        self.whole.up = dual.weights.map(|g| g / (bound * tau));
-        self
     }
 
     fn uniform(&self, part: &Chunk) -> impl Fn(u32, u32) -> Stencil {
@@ -206,7 +190,7 @@ pub(super) fn prox(room: &mut Room, (v, iterate): (&Array, &Array), tau: f32, ke
 /// Makes the dual steps of the proximal map of `v`, for which `iterate` is overwritten, and runs the kernel `end` on its
 /// result: `body` takes the result at voxel i in WGSL. Without a penalty the map only clips.
 fn finish(
-    volume: Volume,
+    mut volume: Volume,
     room: &mut Room,
     (kernels, tau): (Kernels<'_>, f32),
     [v, iterate]: [&Array; 2],
@@ -214,12 +198,15 @@ fn finish(
     body: &dyn Fn(&str) -> String,
 ) -> Result<()> {
     let (Kernels::Clip(bounds) | Kernels::Dual(Dual { bounds, .. })) = kernels;
-    let volume = volume.within(bounds);
+    // A shader need not know infinity.
+    [volume.whole.low, volume.whole.high] = [bounds.low, bounds.high].map(|x| x.clamp(f32::MIN, f32::MAX));
     let dual = match kernels {
         Kernels::Dual(dual) if tau >= f32::MIN_POSITIVE => dual,
         _ => return volume.run(room, &end.each(&body(CLIPPED)), v, None),
     };
-    let volume = volume.of_dual(&dual, tau);
+    let bound = Dual::bound(dual.weights);
+    volume.whole.down = dual.weights.map(|g| g * tau);
+    volume.whole.up = dual.weights.map(|g| g / (bound * tau));
     dual_steps(&volume, room, &dual, [v, iterate])?;
     volume.run(room, &end.with_primal(&dual).each(&body("primal_of(i)")), v, Some(&*dual.p[0]))
 }
