@@ -4,7 +4,7 @@
 //! `cargo bench -p conefield-benches --bench plugin`
 
 use conefield_backend_cpu::Cpu;
-use conefield_benches::{RAYS, SAMPLES, Training, published, published_with, rays, spread};
+use conefield_benches::{RAYS, SAMPLES, Training, millions, published, published_with, rays, spread};
 use conefield_core::registry::read;
 use conefield_core::settings::EncoderSpec;
 use conefield_plugins::{Place, Plugins};
@@ -38,15 +38,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
     }
     let same = *built_in.model.arena.params == *plugin.model.arena.params;
-    let samples = (RAYS * SAMPLES) as f64 / 1e6;
     for (name, times) in ["built in", "plugin"].iter().zip(&mut times) {
-        let [low, median, high] = spread(times);
-        println!(
-            "{name:<9} {:.2} M samples/s (median step; {:.2} to {:.2})",
-            samples / median,
-            samples / high,
-            samples / low
-        );
+        println!("{name:<9} {}", millions((RAYS * SAMPLES) as f64, spread(times), "samples", "median step"));
     }
     let [low, ratio, high] = spread(&mut ratios);
     println!("a step takes {ratio:.3} times as long (median of pairs; {low:.3} to {high:.3})");

@@ -7,7 +7,9 @@
 //! PyTorch beside it.
 
 use conefield_backend_cpu::Cpu;
-use conefield_benches::{RAYS, SAMPLES, Training, multiply_adds, points, published, random_reads, rays, spread, times};
+use conefield_benches::{
+    RAYS, SAMPLES, Training, millions, multiply_adds, points, published, random_reads, rays, spread, times,
+};
 use conefield_core::backend::Backend;
 use std::error::Error;
 use std::time::Instant;
@@ -35,13 +37,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
     }
     let samples = (RAYS * SAMPLES) as f64;
-    let [low, step, high] = spread(&mut total);
-    println!(
-        "training             {:.2} M samples/s (median step; {:.2} to {:.2})",
-        samples / step / 1e6,
-        samples / high / 1e6,
-        samples / low / 1e6
-    );
+    let total = spread(&mut total);
+    let [_, step, _] = total;
+    println!("training             {}", millions(samples, total, "samples", "median step"));
     for (name, part) in [("forward and dense", &mut dense), ("table gradients", &mut scatter), ("adam", &mut adam)] {
         let [_, t, _] = spread(part);
         println!("  {name:<18} {:5.1} % ({:.1} ms)", 100.0 * t / step, t * 1e3);
@@ -50,15 +48,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     let points = points(128);
     let (mut out, mut failed) = (vec![0.0; points.len()], None);
     let Training { model, exe } = &mut training;
-    let [low, export, high] = times(7, || failed = exe.evaluate(model, &points, &mut out).err());
+    let export = times(7, || failed = exe.evaluate(model, &points, &mut out).err());
     failed.map_or(Ok(()), Err)?;
-    let n = points.len() as f64;
-    println!(
-        "export               {:.2} M points/s (median; {:.2} to {:.2})",
-        n / export / 1e6,
-        n / high / 1e6,
-        n / low / 1e6
-    );
+    println!("export               {}", millions(points.len() as f64, export, "points", "median"));
 
     // Forward once, backward twice (gradients of inputs and of weights), for all but the interpolation.
     let (peak, reads) = (multiply_adds(), random_reads());

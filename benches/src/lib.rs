@@ -7,7 +7,6 @@ use conefield_core::pages::Pages;
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::random::{mix, unit};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec, ProjectorSpec};
-use conefield_core::simd::{Op, Simd, run};
 use conefield_core::stage::{Encoder, UnitRay};
 use conefield_encoders::hash_grid::HashGrid;
 use conefield_fields::mlp::Mlp;
@@ -82,6 +81,12 @@ pub fn spread(times: &mut [f64]) -> [f64; 3] {
     [times[0], times[times.len() / 2], times[times.len() - 1]]
 }
 
+/// `n` things in each of these seconds, in millions, for a line of a report; `of` says what the median is of.
+pub fn millions(n: f64, [low, median, high]: [f64; 3], things: &str, of: &str) -> String {
+    let [slow, middle, fast] = [high, median, low].map(|t| n / t / 1e6);
+    format!("{middle:.2} M {things}/s ({of}; {slow:.2} to {fast:.2})")
+}
+
 /// Minimum, median and maximum of some runs, in seconds.
 pub fn times(runs: usize, mut f: impl FnMut()) -> [f64; 3] {
     let mut all: Vec<f64> = (0..runs)
@@ -96,15 +101,6 @@ pub fn times(runs: usize, mut f: impl FnMut()) -> [f64; 3] {
 
 /// Multiply-adds a second of all threads, in dense layers that stay in the first-level cache.
 pub fn multiply_adds() -> f64 {
-    struct Layer<'a>(&'a [f32], &'a [f32], &'a mut [f32]);
-    impl Op for Layer<'_> {
-        type Number = f32;
-        type Out = ();
-        #[inline(always)]
-        fn call<S: Simd>(self, s: S) {
-            affine(s, WeightMatrix { data: self.0, ld: 64, column: 0 }, None, self.1, self.2, 64);
-        }
-    }
     let rounds = 4000;
     let threads = rayon::current_num_threads();
     let (w, x) = (vec![0.01; 64 * 64], vec![0.02; 64 * 64]);
@@ -112,7 +108,7 @@ pub fn multiply_adds() -> f64 {
         (0..threads).into_par_iter().for_each(|_| {
             let mut y = vec![0.0; 64 * 64];
             for _ in 0..rounds {
-                run(Layer(&w, &x, &mut y));
+                affine(WeightMatrix { data: &w, ld: 64, column: 0 }, None, &x, &mut y, 64);
             }
         });
     });

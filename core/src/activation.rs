@@ -1,6 +1,6 @@
 //! Element-wise activations with their derivatives.
 
-use crate::simd::{Real, Select, Simd, SimdBase, SimdFloat, V, load, store};
+use crate::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -118,11 +118,23 @@ const AT_ONCE: usize = 4;
 
 /// `h = f(z)`, `z = f'(z)`.
 #[inline(never)]
-pub fn activate<S: Simd, R: Real>(s: S, act: Activation, z: &mut [R], h: &mut [R]) {
-    s.vectorize(
-        #[inline(always)]
-        || activate_all(s, act, z, h),
-    );
+pub fn activate<R: Real>(act: Activation, z: &mut [R], h: &mut [R]) {
+    run(Activate { act, z, h });
+}
+
+struct Activate<'a, R> {
+    act: Activation,
+    z: &'a mut [R],
+    h: &'a mut [R],
+}
+
+impl<R: Real> Op for Activate<'_, R> {
+    type Number = R;
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        activate_all(s, self.act, self.z, self.h);
+    }
 }
 
 #[inline(always)]

@@ -8,7 +8,8 @@ use crate::error::{Error, Result, ensure};
 use crate::lanes::{Lanes, Vectors};
 use crate::simd::{Op, Real, Simd, run};
 use crate::stage::{
-    Encoder, Field, GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+    Backward, Encoder, Field, GradKind, Grads, Info, Kernel, Normalizer, Parameter, Reduced, Scope, Stage, Tile,
+    TileMut,
 };
 use crate::wgsl::Fragment;
 use std::ops::Range;
@@ -240,45 +241,41 @@ impl<T: RowMap, R: Real> Op for Forward<'_, T, R> {
     }
 }
 
-struct Backward<'a, T, R> {
+struct Back<'a, T, R> {
     stage: &'a ByRow<T>,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
+    pass: Backward<'a, R>,
 }
 
-impl<T: RowMap, R: Real> Backward<'_, T, R> {
+impl<T: RowMap, R: Real> Back<'_, T, R> {
     /// As [`Forward::rows`]; `nowhere` is for the gradients of inputs that nobody asks for.
     #[inline(always)]
     fn rows<S: Simd, const K: usize>(&mut self, s: S, from: usize, to: usize, nowhere: &[Option<usize>]) {
         let (zero, ByRow { map, inputs, outputs }) = (Vectors::<S, R, K>::splat(s, R::ZERO), self.stage);
         for row in (from..to).step_by(Vectors::<S, R, K>::ROWS) {
-            let x = Channels { tile: self.x, places: inputs, row, zero };
-            let dy = Channels { tile: self.dy, places: outputs, row, zero };
-            let (tile, places) = match &mut self.dx {
+            let x = Channels { tile: self.pass.x, places: inputs, row, zero };
+            let dy = Channels { tile: self.pass.dy, places: outputs, row, zero };
+            let (tile, places) = match &mut self.pass.dx {
                 Some(dx) => (TileMut::new(dx.data, dx.rows), &inputs[..]),
                 None => (TileMut::new(&mut [], 0), nowhere),
             };
-            let params = Grads { values: self.grads.values, range: self.grads.range.clone() };
+            let params = Grads { values: self.pass.grads.values, range: self.pass.grads.range.clone() };
             let inputs = ChannelsMut { tile, places, row, zero };
             let rows = Vectors::<S, R, K>::ROWS.min(to - row);
-            map.backward(self.params, x, dy, &mut Gradients { params, rows, inputs });
+            map.backward(self.pass.params, x, dy, &mut Gradients { params, rows, inputs });
         }
     }
 }
 
-impl<T: RowMap, R: Real> Op for Backward<'_, T, R> {
+impl<T: RowMap, R: Real> Op for Back<'_, T, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(mut self, s: S) {
         let nowhere = vec![None; self.stage.inputs.len()];
-        if let Some(dx) = &mut self.dx {
+        if let Some(dx) = &mut self.pass.dx {
             dx.data.fill(R::ZERO);
         }
-        let (rows, most) = (self.x.rows, Vectors::<S, R, AT_ONCE>::ROWS);
+        let (rows, most) = (self.pass.x.rows, Vectors::<S, R, AT_ONCE>::ROWS);
         let whole = rows - rows % most;
         self.rows::<S, AT_ONCE>(s, 0, whole, &nowhere);
         self.rows::<S, 1>(s, whole, rows, &nowhere);
@@ -290,16 +287,8 @@ impl<T: RowMap, R: Real> Kernel<R> for ByRow<T> {
         run(Forward { stage: self, params, x, y });
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        run(Backward { stage: self, params, x, dy, grads, dx });
+    fn backward(&self, pass: Backward<'_, R>) {
+        run(Back { stage: self, pass });
     }
 }
 

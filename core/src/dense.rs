@@ -5,9 +5,10 @@
 //! (weight gradient).
 //!
 //! The three products are compiled once for each set of instructions, and called: a copy of all their blocks in each
-//! stage would be most of what a crate with dense layers compiles.
+//! stage would be most of what a crate with dense layers compiles. They choose the instructions themselves, so that a
+//! stage that only calls them is compiled once.
 
-use crate::simd::{Real, Select, Simd, SimdBase, SimdFloat, V, WIDEST, load, store};
+use crate::simd::{Op, Real, Select, Simd, SimdBase, SimdFloat, V, WIDEST, load, run, store};
 
 /// The part of a weight matrix that a product uses.
 #[derive(Clone, Copy)]
@@ -31,13 +32,30 @@ pub enum Output {
     Multiply,
 }
 
+/// A product with its arguments. The last one is the number of rows.
+enum Product<'a, R> {
+    Affine(WeightMatrix<'a, R>, Option<&'a [R]>, &'a [R], &'a mut [R], usize),
+    Input(WeightMatrix<'a, R>, &'a [R], &'a mut [R], Output, usize),
+    Weights([&'a [R]; 2], &'a mut [R], [usize; 2], Option<&'a mut [R]>, usize),
+}
+
+impl<R: Real> Op for Product<'_, R> {
+    type Number = R;
+    type Out = ();
+    #[inline(always)]
+    fn call<S: Simd>(self, s: S) {
+        match self {
+            Self::Affine(w, bias, x, y, n) => affine_blocks(s, w, bias, x, y, n),
+            Self::Input(w, dy, dx, out, n) => input_blocks(s, w, dy, dx, out, n),
+            Self::Weights([dy, x], dw, [ld, column], db, n) => weights_blocks(s, dy, x, dw, ld, column, db, n),
+        }
+    }
+}
+
 /// `y = W[:, column..column + k]·x + bias`, or `y += …` without a bias.
 #[inline(never)]
-pub fn affine<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, bias: Option<&[R]>, x: &[R], y: &mut [R], n: usize) {
-    s.vectorize(
-        #[inline(always)]
-        || affine_blocks(s, w, bias, x, y, n),
-    );
+pub fn affine<R: Real>(w: WeightMatrix<'_, R>, bias: Option<&[R]>, x: &[R], y: &mut [R], n: usize) {
+    run(Product::Affine(w, bias, x, y, n));
 }
 
 #[inline(always)]
@@ -139,11 +157,8 @@ fn write<S: Simd, R: Real, const FULL: bool>(v: V<S, R>, y: &mut [R], i: usize, 
 
 /// `dx = W[:, column..column + k]ᵀ·dy`, set, added or multiplied into `dx`.
 #[inline(never)]
-pub fn affine_input<S: Simd, R: Real>(s: S, w: WeightMatrix<'_, R>, dy: &[R], dx: &mut [R], out: Output, n: usize) {
-    s.vectorize(
-        #[inline(always)]
-        || input_blocks(s, w, dy, dx, out, n),
-    );
+pub fn affine_input<R: Real>(w: WeightMatrix<'_, R>, dy: &[R], dx: &mut [R], out: Output, n: usize) {
+    run(Product::Input(w, dy, dx, out, n));
 }
 
 #[inline(always)]
@@ -218,8 +233,7 @@ fn input_block<S: Simd, R: Real, const K: usize, const C: usize, const FULL: boo
 
 /// `dW[:, column..column + k] += dy·xᵀ`, and `db += Σ dy` where `db` is given.
 #[inline(never)]
-pub fn affine_weights<S: Simd, R: Real>(
-    s: S,
+pub fn affine_weights<R: Real>(
     dy: &[R],
     x: &[R],
     dw: &mut [R],
@@ -228,10 +242,7 @@ pub fn affine_weights<S: Simd, R: Real>(
     db: Option<&mut [R]>,
     n: usize,
 ) {
-    s.vectorize(
-        #[inline(always)]
-        || weights_blocks(s, dy, x, dw, ld, column, db, n),
-    );
+    run(Product::Weights([dy, x], dw, [ld, column], db, n));
 }
 
 #[inline(always)]
@@ -375,34 +386,6 @@ pub fn total<S: Simd, R: Real>(s: S, x: &[R]) -> R {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::{Op, run};
-
-    struct All<'a, R> {
-        w: &'a [R],
-        x: &'a [R],
-        dy: &'a [R],
-        n: usize,
-        ld: usize,
-        column: usize,
-    }
-
-    impl<R: Real> Op for All<'_, R> {
-        type Number = R;
-        type Out = [Vec<R>; 4];
-        #[inline(always)]
-        fn call<S: Simd>(self, s: S) -> Self::Out {
-            let Self { w, x, dy, n, ld, column } = self;
-            let m = dy.len() / n;
-            let bias: Vec<R> = (0..m).map(|i| R::of(i as f64)).collect();
-            let (mut y, mut dx) = (vec![R::ZERO; dy.len()], vec![R::ONE; x.len()]);
-            let (mut dw, mut db) = (vec![R::ONE; w.len()], vec![R::ZERO; m]);
-            let weights = WeightMatrix { data: w, ld, column };
-            affine(s, weights, Some(&bias), x, &mut y, n);
-            affine_input(s, weights, dy, &mut dx, Output::Add, n);
-            affine_weights(s, dy, x, &mut dw, ld, column, Some(&mut db), n);
-            [y, dx, dw, db]
-        }
-    }
 
     #[test]
     fn products_agree_with_plain_loops_for_every_size() {
@@ -412,7 +395,12 @@ mod tests {
             let w: Vec<f32> = (0..m * ld).map(|i| f(i) as f32).collect();
             let x: Vec<f32> = (0..k * n).map(|i| f(i + 5) as f32).collect();
             let dy: Vec<f32> = (0..m * n).map(|i| f(i + 11) as f32).collect();
-            let [y, dx, dw, db] = run(All { w: &w, x: &x, dy: &dy, n, ld, column });
+            let bias: Vec<f32> = (0..m).map(|i| i as f32).collect();
+            let (mut y, mut dx, mut dw, mut db) = (vec![0.0; m * n], vec![1.0; k * n], vec![1.0; m * ld], vec![0.0; m]);
+            let weights = WeightMatrix { data: &w, ld, column };
+            affine(weights, Some(&bias), &x, &mut y, n);
+            affine_input(weights, &dy, &mut dx, Output::Add, n);
+            affine_weights(&dy, &x, &mut dw, ld, column, Some(&mut db), n);
             let close = |a: f32, b: f64| (f64::from(a) - b).abs() <= 2e-4 * (1.0 + b.abs());
             let at = |v: &[f32], i: usize| f64::from(v[i]);
             for o in 0..m {

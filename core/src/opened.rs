@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result, ensure};
 use crate::simd::Real;
-use crate::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Precision, Stage, Tile, TileMut};
+use crate::stage::{Backward, Encoder, GradKind, Grads, Info, Kernel, Parameter, Precision, Stage, Tile, TileMut};
 use crate::wgsl::{Fragment, functions, hosted};
 use std::ops::Range;
 use std::sync::Arc;
@@ -70,20 +70,13 @@ impl<R: Precision> Kernel<R> for Opened {
         }
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, tape, dy, grads, dx }: Backward<'_, R>) {
         let range = grads.range.start.min(self.params)..grads.range.end.min(self.params);
         let Some(kernel) = R::kernel(&*self.open).filter(|_| !range.is_empty() || dx.is_some()) else { return };
         let values = &mut grads.values[..range.len()];
         let dy = Tile::new(dy.channels(0..self.channels), x.rows);
-        kernel.backward(&params[..self.params], x, tape, dy, Grads { values, range }, dx);
+        let grads = Grads { values, range };
+        kernel.backward(Backward { params: &params[..self.params], x, tape, dy, grads, dx });
     }
 }
 

@@ -6,7 +6,7 @@ use crate::opened::Opened;
 use crate::scene::Scene;
 use crate::simd::Real;
 use crate::stage::{
-    Encoder, Field, Grads, Info, Kernel, Lengths, Normalizer, Parameter, Projector, Samples, Scope, Stage, Tile,
+    Backward, Encoder, Field, Info, Kernel, Lengths, Normalizer, Parameter, Projector, Samples, Scope, Stage, Tile,
     TileMut, UnitRay,
 };
 use std::ops::Range;
@@ -256,15 +256,7 @@ impl<R: Real> Kernel<R> for Positions {
         y.data.copy_from_slice(x.data);
     }
 
-    fn backward(
-        &self,
-        _: &[R],
-        _: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        _: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { dy, dx, .. }: Backward<'_, R>) {
         if let Some(dx) = dx {
             dx.data.copy_from_slice(dy.data);
         }

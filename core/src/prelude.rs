@@ -18,8 +18,8 @@ pub use crate::settings::{
 pub use crate::simd::Real;
 pub use crate::space::Space;
 pub use crate::stage::{
-    Encoder, Field, GradKind, Grads, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Samples, Scope, Stage,
-    Tile, TileMut, UnitRay,
+    Backward, Encoder, Field, GradKind, Grads, Info, Kernel, Normalizer, Parameter, Projector, Reduced, Samples, Scope,
+    Stage, Tile, TileMut, UnitRay,
 };
 pub use crate::stage_type;
 pub use crate::wgsl::Fragment;

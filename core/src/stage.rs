@@ -97,6 +97,23 @@ impl<'a, R> Grads<'a, R> {
     }
 }
 
+/// What [`Kernel::backward`] gets.
+#[derive(Debug)]
+pub struct Backward<'a, R> {
+    /// The stage's parameters.
+    pub params: &'a [R],
+    /// Its input.
+    pub x: Tile<'a, R>,
+    /// What the forward pass kept. It may be used as scratch.
+    pub tape: TileMut<'a, R>,
+    /// `∂L/∂y`.
+    pub dy: Tile<'a, R>,
+    /// `∂L/∂params`, to which the pass adds.
+    pub grads: Grads<'a, R>,
+    /// `∂L/∂x`, which the pass overwrites, if it is wanted.
+    pub dx: Option<TileMut<'a, R>>,
+}
+
 /// The rows on which the result of a row may depend.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -171,18 +188,9 @@ pub trait Kernel<R: Real>: Send + Sync {
     /// Computes `y = f(x; params)`. Fills `tape` (`[info.tape][rows]`) for [`Kernel::backward`].
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>);
 
-    /// `tape` holds the values of the forward pass and may be used as scratch. Given `dy = ∂L/∂y`, *adds* `∂L/∂params`
-    /// to `grads` and, if `dx` is given, overwrites it with `∂L/∂x`. The summation order of a parameter's gradient must
-    /// not depend on `grads.range`.
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    );
+    /// Given `∂L/∂y`, *adds* `∂L/∂params` to the gradients and, if wanted, overwrites `∂L/∂x`. The summation order of a
+    /// parameter's gradient must not depend on the range of the gradients.
+    fn backward(&self, pass: Backward<'_, R>);
 
     /// Number of passes of [`Kernel::forward`], each over a table of its own: a host with many tiles runs one pass for
     /// all of them before the next, while its table is in the cache.

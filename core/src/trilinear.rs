@@ -5,7 +5,7 @@
 //! position is `p = clamp(x·scale + shift, 0, n − 1)`, the cell is `⌊p⌋` (the last cell if `p = n − 1`) and the
 //! fraction is the remainder.
 
-use crate::simd::{Real, Select, Simd, SimdBase, SimdFloat, V, load, store};
+use crate::simd::{Real, Simd, SimdBase, SimdFloat, V, load, store};
 use crate::stage::Tile;
 use std::ops::Range;
 
@@ -56,6 +56,14 @@ impl Grid {
         std::array::from_fn(|c| (0..3).map(|d| (c >> d & 1) * s[d]).sum())
     }
 
+    /// Derivative of the position along axis `d` with respect to the coordinate `x`: 0 where it is clamped.
+    pub fn stretch<R: Real>(&self, d: usize, x: R) -> R {
+        let scale = R::of(self.scale[d]);
+        let p = x * scale + R::of(self.shift);
+        let inside = p >= R::ZERO && p <= R::of(self.side[d] as f64 - 1.0);
+        if inside { scale } else { R::ZERO }
+    }
+
     /// [`slabs`] of whole planes of equal x.
     pub fn slabs(&self, most: usize) -> Vec<Range<usize>> {
         slabs(self.side[0], self.side[1] * self.side[2], most).collect()
@@ -75,14 +83,11 @@ pub struct Located<R> {
     cell: [[u32; BLOCK]; 3],
     base: [usize; BLOCK],
     fraction: [[R; BLOCK]; 3],
-    /// `∂p/∂x`: the grid's scale, or 0 where the position was clamped.
-    scale: [[R; BLOCK]; 3],
 }
 
 impl<R: Real> Default for Located<R> {
     fn default() -> Self {
-        let zero = [[R::ZERO; BLOCK]; 3];
-        Self { cell: [[0; BLOCK]; 3], base: [0; BLOCK], fraction: zero, scale: zero }
+        Self { cell: [[0; BLOCK]; 3], base: [0; BLOCK], fraction: [[R::ZERO; BLOCK]; 3] }
     }
 }
 
@@ -101,12 +106,10 @@ impl<R: Real> Located<R> {
             let mut i = 0;
             while i < n {
                 let p = load(s, x, i).mul_add(scale, shift);
-                let inside = p.simd_ge(zero) & p.simd_le(top);
                 // The precise forms return the other operand if one is NaN.
                 let p = p.max_precise(zero).min_precise(top);
                 let c = p.floor().min(last);
                 store::<S, R>(p - c, &mut self.fraction[d][..n], i);
-                store::<S, R>(inside.select(scale, zero), &mut self.scale[d][..n], i);
                 R::cells(s, c, &mut self.cell[d][i..n]);
                 i += V::<S, R>::LEN;
             }
@@ -131,20 +134,10 @@ impl<R: Real> Located<R> {
         std::array::from_fn(|c| f[0][c & 1] * f[1][c >> 1 & 1] * f[2][c >> 2])
     }
 
-    /// Gradient of the interpolated value with respect to row `i`'s point, given the values at the corners.
-    #[inline(always)]
-    pub fn slopes(&self, i: usize, corners: [R; 8]) -> [R; 3] {
-        let f = self.fraction.each_ref().map(|f| [R::ONE - f[i], f[i]]);
-        std::array::from_fn(|d| {
-            let (e, g) = ((d + 1) % 3, (d + 2) % 3);
-            let mut sum = R::ZERO;
-            for c in 0..8 {
-                if c >> d & 1 == 0 {
-                    sum += f[e][c >> e & 1] * f[g][c >> g & 1] * (corners[c | 1 << d] - corners[c]);
-                }
-            }
-            sum * self.scale[d][i]
-        })
+    /// Moves all rows to an end of their cells along axis `d`, 0 or 1. An interpolated value is linear in between: at end
+    /// 1, less that at end 0, it is the derivative with respect to the position.
+    pub fn move_to(&mut self, d: usize, end: R) {
+        self.fraction[d] = [end; BLOCK];
     }
 
     /// The interpolated features of row `i` from `table`, the grid's entries.
@@ -227,8 +220,15 @@ mod tests {
         }
         let l = run(At(grid, &x));
         let offsets = grid.offsets();
-        let corners = std::array::from_fn(|c| table[l.base(0) + offsets[c]][0]);
-        (l.gather(0, &offsets, &table)[0], l.slopes(0, corners))
+        let slope = |d: usize| {
+            let [near, far] = [0.0, 1.0].map(|end| {
+                let mut moved = l.clone();
+                moved.move_to(d, end);
+                moved.gather(0, &offsets, &table)[0]
+            });
+            (far - near) * grid.stretch(d, x[d])
+        };
+        (l.gather(0, &offsets, &table)[0], [0, 1, 2].map(slope))
     }
 
     #[test]

@@ -111,7 +111,7 @@ pub const RAY: &str = include_str!("wgsl/ray.wgsl");
 pub const RANDOM: &str = include_str!("wgsl/random.wgsl");
 /// `total`: the sum of a number over the 64 lanes of a group, in a fixed order.
 pub const TOTAL: &str = include_str!("wgsl/total.wgsl");
-/// `stage_trilinear_locate`, `…_index`, `…_weight` and `…_slopes`: equivalents of [`crate::trilinear`].
+/// `stage_trilinear_locate`, `…_index` and `…_weight`, and `stage_moved`: equivalents of [`crate::trilinear`].
 pub const TRILINEAR: &str = include_str!("wgsl/trilinear.wgsl");
 
 /// WGSL of one stage.

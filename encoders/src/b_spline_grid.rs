@@ -6,7 +6,7 @@
 //! Z)` at `t = p − ⌊p⌋`, and `B_0 … B_3` are `(1 − t)³/6`, `(3t³ − 6t² + 4)/6`, `(−3t³ + 3t² + 3t + 1)/6`, `t³/6`. It
 //! has two continuous derivatives; a trilinear grid has none.
 
-use crate::levels::{self, BLOCK, Cells, Levels, Rows, cube, fold, fours, grid, stretch};
+use crate::levels::{self, BLOCK, Cells, Levels, Rows, SUMS, cube, fold, fours, grid};
 use conefield_core::prelude::*;
 use conefield_core::simd::{Simd, SimdBase, SimdFloat};
 use std::ops::{Range, RangeInclusive};
@@ -71,7 +71,6 @@ fn splines<R: Real>(t: R) -> [R; TAPS] {
 }
 
 /// Their derivatives with respect to `t`.
-#[inline(always)]
 fn slopes<R: Real>(t: R) -> [R; TAPS] {
     let (half, rest) = (R::of(0.5), R::ONE - t);
     let (first, last) = (R::ZERO - rest * rest * half, t * t * half);
@@ -135,7 +134,7 @@ impl levels::Level for SplineLevel {
     type Located<R: Real> = Located<R>;
 
     const BASE: (RangeInclusive<u32>, &'static str) = (1..=1 << 20, "1 to 2^20 cells per side");
-    const WGSL: &'static [&'static str] = &[include_str!("b_spline_grid.wgsl")];
+    const WGSL: &'static [&'static str] = &[SUMS, include_str!("b_spline_grid.wgsl")];
 
     fn parts(s: &BSplineGrid, number: usize, resolution: f64, before: usize) -> Result<Vec<Self>> {
         let resolution = resolution.round();
@@ -227,24 +226,9 @@ impl levels::Level for SplineLevel {
         }
     }
 
-    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
-        let &Rows { located, table, .. } = rows;
-        let weight = located.weight.each_ref().map(|w| w[i]);
-        let by = located.cells.fraction.each_ref().map(|f| slopes(f[i]));
-        let table = table.as_flattened();
-        let mut sum = [R::ZERO; 3];
-        for a in 0..TAPS {
-            for b in 0..TAPS {
-                let run = &table[self.run(&located.cells, i, a, b, F)..][..TAPS * F];
-                for c in 0..TAPS {
-                    let value: R = (0..F).map(|f| run[c * F + f] * dy[f]).sum();
-                    sum[0] += by[0][a] * weight[1][b] * weight[2][c] * value;
-                    sum[1] += weight[0][a] * by[1][b] * weight[2][c] * value;
-                    sum[2] += weight[0][a] * weight[1][b] * by[2][c] * value;
-                }
-            }
-        }
-        std::array::from_fn(|d| sum[d] * stretch(x[d], self.cells))
+    /// The weights become their derivatives.
+    fn move_to<R: Real>(&self, to: &mut Located<R>, d: usize, end: R) {
+        to.weight[d] = to.cells.fraction[d].map(|t| slopes(t).map(|slope| slope * end));
     }
 
     fn code(&self) -> String {

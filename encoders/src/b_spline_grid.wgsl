@@ -1,4 +1,4 @@
-// Pyramid of cubic B-splines, as in b_spline_grid.rs, which adds `stage_FEATURES` and the calls level by level.
+// A level of cubic B-splines, as in b_spline_grid.rs.
 
 struct stage_Level {
     cells: u32,
@@ -13,7 +13,11 @@ struct stage_Located {
     first: u32,
     // Position within the cell.
     t: vec3<f32>,
+    // Weights of the four coefficients along each axis.
+    weights: array<vec4<f32>, 3>,
 }
+
+const stage_CORNERS = 64u;
 
 fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Located {
     let cells = vec3<f32>(f32(level.cells));
@@ -22,8 +26,9 @@ fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Located {
     let q = select(vec3<f32>(0.0), min(p, cells), p > vec3<f32>(0.0));
     let cell = min(floor(q), cells - 1.0);
     let c = vec3<u32>(cell);
-    let entry = (c.x * level.side + c.y) * level.side + c.z;
-    return stage_Located(level.start + entry * stage_FEATURES, q - cell);
+    let first = level.start + ((c.x * level.side + c.y) * level.side + c.z) * stage_FEATURES;
+    let t = q - cell;
+    return stage_Located(first, t, array<vec4<f32>, 3>(stage_splines(t.x), stage_splines(t.y), stage_splines(t.z)));
 }
 
 // The four B-splines that affect a cell.
@@ -35,59 +40,22 @@ fn stage_splines(t: f32) -> vec4<f32> {
     return vec4<f32>(first, second, 1.0 - first - second - last, last);
 }
 
-fn stage_spline_slopes(t: f32) -> vec4<f32> {
+// Their derivatives take the place of the weights.
+fn stage_moved(at: stage_Located, d: u32, end: f32) -> stage_Located {
+    let t = at.t[d];
     let rest = 1.0 - t;
     let first = -0.5 * rest * rest;
     let second = (1.5 * t - 2.0) * t;
     let last = 0.5 * t * t;
-    return vec4<f32>(first, second, -first - second - last, last);
+    var moved = at;
+    moved.weights[d] = end * vec4<f32>(first, second, -first - second - last, last);
+    return moved;
 }
 
-fn stage_level_forward(x: vec3<f32>, level: stage_Level) -> array<f32, stage_FEATURES> {
-    let at = stage_locate(x, level);
-    var a = stage_splines(at.t.x);
-    var b = stage_splines(at.t.y);
-    var c = stage_splines(at.t.z);
-    var sum: array<f32, stage_FEATURES>;
-    for (var n = 0u; n < 64u; n++) {
-        let i = n >> 4u;
-        let j = (n >> 2u) & 3u;
-        let k = n & 3u;
-        let entry = at.first + ((i * level.side + j) * level.side + k) * stage_FEATURES;
-        let w = a[i] * b[j] * c[k];
-        for (var f = 0u; f < stage_FEATURES; f++) {
-            sum[f] += w * stage_param(entry + f);
-        }
-    }
-    return sum;
-}
-
-// Adds to the gradients of the level's coefficients; returns the derivative with respect to the point.
-fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, array<f32, stage_FEATURES>>) -> vec3<f32> {
-    let at = stage_locate(x, level);
-    var a = stage_splines(at.t.x);
-    var b = stage_splines(at.t.y);
-    var c = stage_splines(at.t.z);
-    var da = stage_spline_slopes(at.t.x);
-    var db = stage_spline_slopes(at.t.y);
-    var dc = stage_spline_slopes(at.t.z);
-    var slope = vec3<f32>(0.0);
-    for (var n = 0u; n < 64u; n++) {
-        let i = n >> 4u;
-        let j = (n >> 2u) & 3u;
-        let k = n & 3u;
-        let entry = at.first + ((i * level.side + j) * level.side + k) * stage_FEATURES;
-        let w = a[i] * b[j] * c[k];
-        stage_features_grad(entry, w, dy);
-        if stage_wants_dx {
-            var along = 0.0;
-            for (var f = 0u; f < stage_FEATURES; f++) {
-                along += stage_param(entry + f) * (*dy)[f];
-            }
-            slope += along * vec3<f32>(da[i] * b[j] * c[k], a[i] * db[j] * c[k], a[i] * b[j] * dc[k]);
-        }
-    }
-    // Beyond the rim a position is clamped, whatever its value.
-    let inside = (x >= vec3<f32>(0.0)) & (x <= vec3<f32>(1.0));
-    return select(vec3<f32>(0.0), slope * f32(level.cells), inside);
+fn stage_corner(at: stage_Located, level: stage_Level, c: u32) -> stage_Corner {
+    let i = c >> 4u;
+    let j = (c >> 2u) & 3u;
+    let k = c & 3u;
+    let entry = at.first + ((i * level.side + j) * level.side + k) * stage_FEATURES;
+    return stage_Corner(entry, at.weights[0][i] * at.weights[1][j] * at.weights[2][k]);
 }

@@ -132,15 +132,7 @@ impl<R: Precision> Kernel<R> for ConcatStage {
         }
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        mut dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, tape, dy, grads, mut dx }: Backward<'_, R>) {
         let n = x.rows;
         // Parts overwrite their input gradient, so every part except the first needs its own buffer.
         let mut one = if dx.is_some() && self.parts.len() > 1 { vec![R::ZERO; 3 * n] } else { vec![] };
@@ -157,10 +149,14 @@ impl<R: Precision> Kernel<R> for ConcatStage {
                 &mut grads.values[own.start - range.start..own.end - range.start]
             };
             let own = own.start - part.params.start..own.end - part.params.start;
-            let part_dx = dx.as_mut().map(|dx| TileMut::new(if i == 0 { &mut *dx.data } else { &mut one }, n));
-            let (tape, grads) = (channels(tape.data, &part.tape, n), Grads { values, range: own });
-            let dy = Tile::new(dy.channels(part.outputs.clone()), n);
-            kernel.backward(&params[part.params.clone()], x, tape, dy, grads, part_dx);
+            kernel.backward(Backward {
+                params: &params[part.params.clone()],
+                x,
+                tape: channels(tape.data, &part.tape, n),
+                dy: Tile::new(dy.channels(part.outputs.clone()), n),
+                grads: Grads { values, range: own },
+                dx: dx.as_mut().map(|dx| TileMut::new(if i == 0 { &mut *dx.data } else { &mut one }, n)),
+            });
             if let (Some(dx), true) = (&mut dx, i > 0) {
                 dx.data.iter_mut().zip(&one).for_each(|(sum, &d)| *sum += d);
             }

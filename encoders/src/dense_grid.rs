@@ -5,7 +5,7 @@
 //! A level with `r` cells per side has `(r + 1)³` vertices at the corners of its cells, which fill the cube exactly:
 //! `p = clamp(x, 0, 1)·r`.
 
-use crate::levels::{self, BLOCK, Levels, Rows, cube, grid};
+use crate::levels::{self, BLOCK, Levels, Rows, SUMS, cube, grid};
 use conefield_core::prelude::*;
 use conefield_core::simd::Simd;
 use conefield_core::trilinear::{Grid, Located};
@@ -50,7 +50,7 @@ impl levels::Level for DenseLevel {
     type Located<R: Real> = Located<R>;
 
     const BASE: (RangeInclusive<u32>, &'static str) = (1..=1 << 20, "1 to 2^20 cells per side");
-    const WGSL: &'static [&'static str] = &[TRILINEAR, include_str!("dense_grid.wgsl")];
+    const WGSL: &'static [&'static str] = &[TRILINEAR, SUMS, include_str!("dense_grid.wgsl")];
 
     fn parts(s: &DenseGrid, number: usize, resolution: f64, before: usize) -> Result<Vec<Self>> {
         let resolution = resolution.round();
@@ -108,14 +108,8 @@ impl levels::Level for DenseLevel {
         }
     }
 
-    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], _: [R; 3], i: usize) -> [R; 3] {
-        let &Rows { located, table, .. } = rows;
-        let cell = &table[located.base(i)..];
-        let mut corners = [R::ZERO; 8];
-        for c in 0..8 {
-            corners[c] = (0..F).map(|f| cell[self.offsets[c]][f] * dy[f]).sum();
-        }
-        located.slopes(i, corners)
+    fn move_to<R: Real>(&self, to: &mut Located<R>, d: usize, end: R) {
+        to.move_to(d, end);
     }
 
     fn code(&self) -> String {

@@ -4,7 +4,7 @@
 //! point's cell, trilinearly interpolated. A level whose vertices fit into the table is indexed directly, a finer one
 //! by `h(c) = (c_x·π₁ ⊕ c_y·π₂ ⊕ c_z·π₃) mod T` with products modulo 2³² by definition.
 
-use crate::levels::{self, BLOCK, Levels, Rows, finest, grid, leaving, prefetch, primes, sizes, table_size};
+use crate::levels::{self, BLOCK, Levels, Rows, SUMS, finest, grid, leaving, prefetch, primes, sizes, table_size};
 use conefield_core::prelude::*;
 use conefield_core::simd::{Simd, SimdBase, SimdFloat, V, load, store};
 use std::ops::{Range, RangeInclusive};
@@ -110,6 +110,19 @@ impl<R: Real> Located<R> {
     fn ends(&self, dense: bool, e: usize, i: usize) -> [u32; 2] {
         let near = self.near[e][i];
         [near, if dense { near + 1 } else { self.far[e][i] }]
+    }
+
+    /// Computes the weights of edges. Loops as in `locate`.
+    #[inline(always)]
+    fn weigh(&mut self) {
+        let [_, fy, fz] = &self.fraction;
+        for e in 0..4 {
+            for i in 0..BLOCK {
+                let y = if e & 1 == 0 { R::ONE - fy[i] } else { fy[i] };
+                let z = if e & 2 == 0 { R::ONE - fz[i] } else { fz[i] };
+                self.weight[e][i] = y * z;
+            }
+        }
     }
 
     /// Weights of an edge's two ends for row `i`, in the layout of [`fours`].
@@ -263,7 +276,7 @@ impl levels::Level for HashLevel {
     type Located<R: Real> = Located<R>;
 
     const BASE: (RangeInclusive<u32>, &'static str) = (2..=1 << 20, "2 to 2^20");
-    const WGSL: &'static [&'static str] = &[include_str!("hash_grid.wgsl")];
+    const WGSL: &'static [&'static str] = &[SUMS, include_str!("hash_grid.wgsl")];
 
     fn parts(s: &HashGrid, number: usize, resolution: f64, _: usize) -> Result<Vec<Self>> {
         let table = table_size(s.log2_table_size)?;
@@ -280,6 +293,10 @@ impl levels::Level for HashLevel {
 
     fn resolution(&self) -> f64 {
         self.scale + 1.0
+    }
+
+    fn scale(&self) -> [f64; 2] {
+        [self.scale, 0.5]
     }
 
     fn blocks(&self, features: usize) -> Vec<(String, Vec<usize>)> {
@@ -332,14 +349,7 @@ impl levels::Level for HashLevel {
                 }
             }
         }
-        let [_, fy, fz] = &to.fraction;
-        for e in 0..4 {
-            for i in 0..BLOCK {
-                let y = if e & 1 == 0 { R::ONE - fy[i] } else { fy[i] };
-                let z = if e & 2 == 0 { R::ONE - fz[i] } else { fz[i] };
-                to.weight[e][i] = y * z;
-            }
-        }
+        to.weigh();
     }
 
     #[inline(always)]
@@ -374,29 +384,9 @@ impl levels::Level for HashLevel {
         }
     }
 
-    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
-        let &Rows { located, table, .. } = rows;
-        let mut v = [R::ZERO; 8];
-        for c in 0..8 {
-            let entry = &table[located.ends(self.dense, c >> 1, i)[c & 1] as usize];
-            v[c] = (0..F).map(|f| entry[f] * dy[f]).sum();
-        }
-        let mut slopes = [R::ZERO; 3];
-        for d in 0..3 {
-            // Beyond the rim a position is clamped, whatever its value.
-            if !(x[d] <= R::ONE && x[d] * R::of(self.scale) + R::of(0.5) >= R::ZERO) {
-                continue;
-            }
-            for c in 0..8 {
-                let mut w = if c >> d & 1 == 1 { R::of(self.scale) } else { R::of(-self.scale) };
-                for e in (0..3).filter(|&e| e != d) {
-                    let fraction = located.fraction[e][i];
-                    w *= if c >> e & 1 == 1 { fraction } else { R::ONE - fraction };
-                }
-                slopes[d] += w * v[c];
-            }
-        }
-        slopes
+    fn move_to<R: Real>(&self, to: &mut Located<R>, d: usize, end: R) {
+        to.fraction[d] = [end; BLOCK];
+        to.weigh();
     }
 
     fn code(&self) -> String {
@@ -487,10 +477,14 @@ mod tests {
         let (x, rows) = ([-0.3, 0.4, 0.45, 0.7, 1.4, 0.9], 2);
         let dy = vec![1.0; info.output * rows];
         let (mut grads, mut dx) = (vec![0.0; info.params], vec![0.0; 3 * rows]);
-        let into = Grads { values: &mut grads, range: 0..info.params };
-        let kernel: &dyn Kernel<f64> = &stage;
-        let (tape, into_x) = (TileMut::new(&mut [], rows), Some(TileMut::new(&mut dx, rows)));
-        kernel.backward(&params, Tile::new(&x, rows), tape, Tile::new(&dy, rows), into, into_x);
+        stage.backward(Backward {
+            params: &params,
+            x: Tile::new(&x, rows),
+            tape: TileMut::new(&mut [], rows),
+            dy: Tile::new(&dy, rows),
+            grads: Grads::all(&mut grads),
+            dx: Some(TileMut::new(&mut dx, rows)),
+        });
         assert_eq!([dx[0], dx[4]], [0.0, 0.0]);
         assert!([dx[1], dx[2], dx[3], dx[5]].iter().all(|g| *g != 0.0), "{dx:?}");
     }

@@ -30,15 +30,7 @@ impl<R: Real> Kernel<R> for IdentityStage {
         }
     }
 
-    fn backward(
-        &self,
-        _: &[R],
-        _: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        _: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { dy, dx, .. }: Backward<'_, R>) {
         let Some(mut dx) = dx else { return };
         dx.data.fill(R::ZERO);
         for (c, &axis) in self.axes.iter().enumerate() {

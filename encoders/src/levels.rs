@@ -2,8 +2,8 @@
 //!
 //! A [`Level`] says where a point lies on it, and which features enter there with which weights. [`Levels`] is the
 //! encoder of such levels: it checks the settings, passes blocks of rows to one level after another, selects the
-//! requested part of the gradients, names the parameters, removes channels, and calls `stage_level_forward` and
-//! `stage_level_backward` in WGSL, with the levels' settings as constants.
+//! requested part of the gradients, names the parameters, removes channels, and calls the functions of levels in WGSL, with
+//! the levels' settings as constants.
 
 use conefield_core::prelude::*;
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, V, load, run, store};
@@ -23,6 +23,9 @@ const SLAB: usize = 1 << 19;
 
 /// More parameters are refused: with gradients and moments they would take 32 GiB.
 const MOST: u64 = 1 << 31;
+
+/// For [`Level::WGSL`], of a level whose features are weighted sums of entries.
+pub const SUMS: &str = include_str!("sums.wgsl");
 
 /// The settings that all these encoders have.
 pub struct Pyramid {
@@ -89,7 +92,7 @@ pub trait Level: Clone + Send + Sync + 'static {
 
     /// Base resolutions that are allowed, and the same in words.
     const BASE: (RangeInclusive<u32>, &'static str);
-    /// WGSL of `stage_Level`, `stage_level_forward` and `stage_level_backward`.
+    /// What `levels.wgsl` expects of a level.
     const WGSL: &'static [&'static str];
 
     /// The parts of level `number`, with `resolution` cells along the cube's side. The levels before it have `before`
@@ -103,6 +106,11 @@ pub trait Level: Clone + Send + Sync + 'static {
 
     /// Cells along the cube's side.
     fn resolution(&self) -> f64;
+
+    /// `[a, b]` of the position `a·x + b` in cells.
+    fn scale(&self) -> [f64; 2] {
+        [self.resolution(), 0.0]
+    }
 
     /// Name and shape of each block of parameters, in order.
     fn blocks(&self, features: usize) -> Vec<(String, Vec<usize>)>;
@@ -136,8 +144,9 @@ pub trait Level: Clone + Send + Sync + 'static {
         own: &Range<usize>,
     );
 
-    /// Given the derivatives `dy` by the features of row `i`, those by its point `x`. Scalar.
-    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3];
+    /// Moves located rows to `end` 0 or 1 of their cells along axis `d`. Their features at end 1, less those at end 0, are
+    /// the derivatives by the position in cells: a level whose features are not linear in between moves weights instead.
+    fn move_to<R: Real>(&self, to: &mut Self::Located<R>, d: usize, end: R);
 
     /// The fields of its `stage_Level` in WGSL but the last one, the first parameter.
     fn code(&self) -> String;
@@ -272,30 +281,27 @@ fn locate<S: Simd, L: Level, R: Real>(s: S, level: &L, to: &mut L::Located<R>, x
     );
 }
 
-/// [`locate`] with the instructions of this machine.
-struct Locate<'a, L: Level, R: Real> {
-    level: &'a L,
-    to: &'a mut L::Located<R>,
-    x: Tile<'a, R>,
-    at: usize,
-    n: usize,
-}
-
-impl<L: Level, R: Real> Op for Locate<'_, L, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        locate(s, self.level, self.to, self.x, self.at, self.n);
-    }
+/// [`Level::move_to`], outside the loops of training.
+#[inline(never)]
+fn move_to<L: Level, R: Real>(level: &L, to: &mut L::Located<R>, (d, end): (usize, R)) {
+    level.move_to(to, d, end);
 }
 
 /// Where a point lies on a level.
 #[cfg(test)]
 pub fn located<L: Level, R: Real>(level: &L, x: [R; 3]) -> L::Located<R> {
-    let mut to = L::Located::default();
-    run(Locate { level, to: &mut to, x: Tile::new(&x, 1), at: 0, n: 1 });
-    to
+    struct At<'a, L, R>(&'a L, [R; 3]);
+    impl<L: Level, R: Real> Op for At<'_, L, R> {
+        type Number = R;
+        type Out = L::Located<R>;
+        #[inline(always)]
+        fn call<S: Simd>(self, s: S) -> Self::Out {
+            let mut to = L::Located::default();
+            locate(s, self.0, &mut to, Tile::new(&self.1, 1), 0, 1);
+            to
+        }
+    }
+    run(At(level, x))
 }
 
 struct LevelsForward<'a, L: Level, R> {
@@ -304,6 +310,8 @@ struct LevelsForward<'a, L: Level, R> {
     params: &'a [R],
     x: Tile<'a, R>,
     y: TileMut<'a, R>,
+    /// An axis and an end of the cells along it, to which rows are moved: see [`Level::move_to`].
+    end: Option<(usize, R)>,
 }
 
 impl<L: Level, R: Real> LevelsForward<'_, L, R> {
@@ -315,6 +323,9 @@ impl<L: Level, R: Real> LevelsForward<'_, L, R> {
             for at in (0..self.x.rows).step_by(BLOCK) {
                 let n = BLOCK.min(self.x.rows - at);
                 locate(s, &parts[0].level, &mut located, self.x, at, n);
+                if let Some(end) = self.end {
+                    move_to(&parts[0].level, &mut located, end);
+                }
                 for part in parts {
                     let (table, _) = self.params[part.range()].as_chunks::<F>();
                     part.level.gather(s, &Rows { located: &located, table, n }, &mut out);
@@ -358,38 +369,6 @@ impl<L: Level, R: Real> LevelsBackward<'_, L, R> {
     }
 }
 
-/// Overwrites `dx` with the derivatives by the input, which no training asks for: scalar, and with no copies for sets
-/// of instructions.
-fn slopes<L: Level, R: Real, const F: usize>(
-    parts: &[Part<L>],
-    params: &[R],
-    x: Tile<'_, R>,
-    dy: Tile<'_, R>,
-    dx: &mut TileMut<'_, R>,
-) {
-    let mut located = L::Located::default();
-    let (mut by, mut slopes) = ([[R::ZERO; F]; BLOCK], [[R::ZERO; 3]; BLOCK]);
-    dx.data.fill(R::ZERO);
-    for part in parts {
-        let (table, _) = params[part.range()].as_chunks::<F>();
-        for at in (0..x.rows).step_by(BLOCK) {
-            let n = BLOCK.min(x.rows - at);
-            part.take(dy, &mut by, at, n);
-            run(Locate { level: &part.level, to: &mut located, x, at, n });
-            let rows = Rows { located: &located, table, n };
-            let x = [0, 1, 2].map(|d| &x.channel(d)[at..at + n]);
-            for i in 0..n {
-                slopes[i] = part.level.slope(&rows, &by[i], x.map(|x| x[i]), i);
-            }
-            for d in 0..3 {
-                for (dx, slope) in dx.channel(d)[at..at + n].iter_mut().zip(&slopes) {
-                    *dx += slope[d];
-                }
-            }
-        }
-    }
-}
-
 /// Runs `features` of an operation with the number of features as a constant.
 macro_rules! by_features {
     ($op:ident) => {
@@ -412,9 +391,49 @@ macro_rules! by_features {
 by_features!(LevelsForward);
 by_features!(LevelsBackward);
 
+impl<L: Level> Levels<L> {
+    /// The features of `parts`; see [`LevelsForward`].
+    #[inline(never)]
+    fn encode<R: Real>(
+        &self,
+        parts: &[Part<L>],
+        params: &[R],
+        x: Tile<'_, R>,
+        y: TileMut<'_, R>,
+        end: Option<(usize, R)>,
+    ) {
+        run(LevelsForward { stage: self, parts, params, x, y, end });
+    }
+
+    /// Overwrites `dx` with the derivatives by the input, which no training asks for.
+    fn slopes<R: Real>(&self, params: &[R], x: Tile<'_, R>, dy: Tile<'_, R>, mut dx: TileMut<'_, R>) {
+        let n = x.rows;
+        dx.data.fill(R::ZERO);
+        for d in 0..3 {
+            let [near, far] = [R::ZERO, R::ONE].map(|end| {
+                let mut y = vec![R::ZERO; self.outputs * n];
+                self.encode(&self.parts, params, x, TileMut::new(&mut y, n), Some((d, end)));
+                y
+            });
+            let (x, dx) = (x.channel(d), dx.channel(d));
+            for part in self.parts.iter().filter(|p| !p.level.adds()) {
+                let [scale, shift] = part.level.scale().map(R::of);
+                for &c in part.outputs.iter().flatten() {
+                    for i in 0..n {
+                        // Beyond the rim a position is clamped, whatever its value.
+                        if x[i] <= R::ONE && x[i] * scale + shift >= R::ZERO {
+                            dx[i] += scale * dy.channel(c)[i] * (far[c * n + i] - near[c * n + i]);
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
 impl<L: Level, R: Real> Kernel<R> for Levels<L> {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
-        run(LevelsForward { stage: self, parts: &self.parts, params, x, y });
+        self.encode(&self.parts, params, x, y, None);
     }
 
     fn passes(&self) -> usize {
@@ -423,26 +442,12 @@ impl<L: Level, R: Real> Kernel<R> for Levels<L> {
 
     fn forward_pass(&self, pass: usize, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, _: TileMut<'_, R>) {
         let parts = by_level(&self.parts).nth(pass).unwrap_or_default();
-        run(LevelsForward { stage: self, parts, params, x, y });
+        self.encode(parts, params, x, y, None);
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        if let Some(dx) = &mut { dx } {
-            let slopes = match self.features {
-                1 => slopes::<L, R, 1>,
-                2 => slopes::<L, R, 2>,
-                4 => slopes::<L, R, 4>,
-                _ => slopes::<L, R, 8>,
-            };
-            slopes(&self.parts, params, x, dy, dx);
+    fn backward(&self, Backward { params, x, dy, grads, dx, .. }: Backward<'_, R>) {
+        if let Some(dx) = dx {
+            self.slopes(params, x, dy, dx);
         }
         run(LevelsBackward { stage: self, params, x, dy, grads });
     }
@@ -502,13 +507,13 @@ impl<L: Level> Stage for Levels<L> {
         // A part that adds belongs to the level in front of it there.
         for part in self.parts.iter().filter(|p| !p.level.adds()) {
             let first = u32::try_from(part.start).ok()?;
-            levels.push((format!("stage_Level({}, {first}u)", part.level.code()), &part.outputs[..]));
+            let value = format!("stage_Level({}, {first}u)", part.level.code());
+            levels.push((value, part.level.scale(), &part.outputs[..]));
         }
         let constants = format!("const stage_FEATURES = {}u;\n{}", self.features, L::constants(&self.settings));
         let functions = functions(self.features, &levels, self.outputs);
-        let sources = L::WGSL.iter().copied();
-        let all: Vec<_> = [&constants[..]].into_iter().chain(sources).chain([&functions[..]]).collect();
-        Some(Fragment::new(&all))
+        let shared = [include_str!("levels.wgsl"), &functions];
+        Some(Fragment::new(&[&[constants.as_str()], L::WGSL, &shared].concat()))
     }
 
     fn describe(&self) -> String {
@@ -608,8 +613,8 @@ impl<R: Real> Asked<R> {
 
 /// `stage_forward` and `stage_backward` of an encoder with `width` output channels, and `stage_features_grad` for its
 /// levels, which adds `w` times `dy` to the gradients of the entry that begins at parameter `entry`. A level is a value
-/// of type `stage_Level` and the output channels of its features.
-fn functions(features: usize, levels: &[(String, &[Option<usize>])], width: usize) -> String {
+/// of type `stage_Level`, its [`Level::scale`], and the output channels of its features.
+fn functions(features: usize, levels: &[(String, [f64; 2], &[Option<usize>])], width: usize) -> String {
     let mut grad =
         String::from("fn stage_features_grad(entry: u32, w: f32, dy: ptr<function, array<f32, stage_FEATURES>>) {\n");
     if features.is_multiple_of(2) {
@@ -623,14 +628,21 @@ fn functions(features: usize, levels: &[(String, &[Option<usize>])], width: usiz
     }
     grad += "}\n";
     let (mut forward, mut backward) = (String::new(), String::new());
-    for (l, (value, outputs)) in levels.iter().enumerate() {
-        let _ = writeln!(forward, "    let v{l} = stage_level_forward(p, {value});");
-        let _ = writeln!(backward, "    var d{l}: array<f32, stage_FEATURES>;");
+    for (l, (value, scale, outputs)) in levels.iter().enumerate() {
+        let level = format!("    let level{l} = {value};\n");
+        let _ = writeln!(forward, "{level}    let v{l} = stage_level_value(stage_locate(p, level{l}), level{l});");
+        let _ = writeln!(backward, "{level}    var d{l}: array<f32, stage_FEATURES>;");
         for (f, c) in outputs.iter().enumerate().filter_map(|(f, c)| Some((f, (*c)?))) {
             let _ = writeln!(forward, "    (*y)[{c}] = v{l}[{f}];");
             let _ = writeln!(backward, "    d{l}[{f}] = (*dy)[{c}];");
         }
-        let _ = writeln!(backward, "    slope += stage_level_backward(p, {value}, &d{l});");
+        let [scale, shift] = scale.map(|x| x as f32);
+        let _ = write!(
+            backward,
+            "    stage_level_backward(stage_locate(p, level{l}), level{l}, &d{l});
+    if stage_wants_dx {{ slope += stage_level_slope(p, level{l}, &d{l}, {scale:?}, {shift:?}); }}
+"
+        );
     }
     let p = "    let p = vec3<f32>((*x)[0], (*x)[1], (*x)[2]);\n";
     let slope = "    (*dx)[0] = slope.x;\n    (*dx)[1] = slope.y;\n    (*dx)[2] = slope.z;\n";
@@ -710,12 +722,6 @@ impl<R: Real> Cells<R> {
             }
         }
     }
-}
-
-/// Derivative of a position among `cells` with respect to a coordinate. Beyond the rim the position is clamped.
-#[inline(always)]
-pub fn stretch<R: Real>(x: R, cells: u32) -> R {
-    if x >= R::ZERO && x <= R::ONE { R::of(f64::from(cells)) } else { R::ZERO }
 }
 
 /// For each of the first `n` rows, whether it is the last one before a row elsewhere, which `differ` tells for a row and

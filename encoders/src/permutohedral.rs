@@ -15,7 +15,7 @@
 //! 4, of `k`.
 
 use crate::levels::{
-    self, BLOCK, Levels, Rows, entry, entry_mut, finest, fold, fours, grid, leaving, prefetch, primes, sizes,
+    self, BLOCK, Levels, Rows, SUMS, entry, entry_mut, finest, fold, fours, grid, leaving, prefetch, primes, sizes,
     table_size,
 };
 use conefield_core::prelude::*;
@@ -165,7 +165,7 @@ impl levels::Level for SimplexLevel {
     type Located<R: Real> = Located<R>;
 
     const BASE: (RangeInclusive<u32>, &'static str) = (2..=1 << 20, "2 to 2^20");
-    const WGSL: &'static [&'static str] = &[include_str!("permutohedral.wgsl")];
+    const WGSL: &'static [&'static str] = &[SUMS, include_str!("permutohedral.wgsl")];
 
     fn parts(s: &Permutohedral, number: usize, resolution: f64, _: usize) -> Result<Vec<Self>> {
         let table = table_size(s.log2_table_size)?;
@@ -184,6 +184,10 @@ impl levels::Level for SimplexLevel {
 
     fn resolution(&self) -> f64 {
         self.resolution
+    }
+
+    fn scale(&self) -> [f64; 2] {
+        [self.scale, 0.0]
     }
 
     fn blocks(&self, features: usize) -> Vec<(String, Vec<usize>)> {
@@ -292,19 +296,16 @@ impl levels::Level for SimplexLevel {
         scatter(s, grads, located, dy, n);
     }
 
-    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
-        let &Rows { located, table, .. } = rows;
-        let v: [R; 4] = located.corners(i).map(|c| (0..F).map(|f| table[c as usize][f] * dy[f]).sum());
-        // With respect to a fraction: the corner that it adds to, minus the one before.
-        let by = located.rank.each_ref().map(|rank| {
-            let rank = rank[i] as usize;
-            v[rank + 1] - v[rank]
-        });
-        std::array::from_fn(|d| {
-            // Beyond the rim a position is clamped, whatever its value.
-            let inside = x[d] >= R::ZERO && x[d] <= R::ONE;
-            if inside { R::of(self.scale) * (by[(d + 1) % 3] + by[(d + 2) % 3]) } else { R::ZERO }
-        })
+    /// Along an axis two fractions grow. The weight of the corner that a fraction adds to grows with it, that of the one
+    /// before falls.
+    fn move_to<R: Real>(&self, to: &mut Located<R>, d: usize, end: R) {
+        to.weight = [[R::ZERO; BLOCK]; 4];
+        for rank in [(d + 1) % 3, (d + 2) % 3].map(|fraction| to.rank[fraction]) {
+            for (i, rank) in rank.into_iter().enumerate() {
+                to.weight[rank as usize + 1][i] += end;
+                to.weight[rank as usize][i] -= end;
+            }
+        }
     }
 
     fn code(&self) -> String {

@@ -1,5 +1,4 @@
-// Multi-resolution hash of a permutohedral lattice, as in permutohedral.rs, which adds `stage_FEATURES`, `stage_PRIMES`
-// and the calls level by level.
+// A level of a hashed permutohedral lattice, as in permutohedral.rs, which adds `stage_PRIMES`.
 
 struct stage_Level {
     scale: f32,
@@ -11,7 +10,7 @@ struct stage_Level {
     start: u32,
 }
 
-struct stage_Simplex {
+struct stage_Located {
     cell: vec3<u32>,
     // Number of the other two fractions that precede each one.
     rank: vec3<u32>,
@@ -19,7 +18,9 @@ struct stage_Simplex {
     weight: vec4<f32>,
 }
 
-fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Simplex {
+const stage_CORNERS = 4u;
+
+fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Located {
     // A NaN coordinate counts as 0.
     let p = select(vec3<f32>(0.0), min(x, vec3<f32>(1.0)), x > vec3<f32>(0.0));
     let u = (p.yxx + p.zzy) * level.scale;
@@ -32,11 +33,23 @@ fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Simplex {
     let top = max(max(f.x, f.y), f.z);
     let bottom = min(min(f.x, f.y), f.z);
     let middle = max(min(f.x, f.y), min(max(f.x, f.y), f.z));
-    return stage_Simplex(vec3<u32>(cell), rank, vec4<f32>(1.0 - top, top - middle, middle - bottom, bottom));
+    return stage_Located(vec3<u32>(cell), rank, vec4<f32>(1.0 - top, top - middle, middle - bottom, bottom));
 }
 
-// First parameter of corner `c`.
-fn stage_entry(level: stage_Level, at: stage_Simplex, c: u32) -> u32 {
+// Along an axis two fractions grow. The weight of the corner that a fraction adds to grows with it, that of the one before
+// falls.
+fn stage_moved(at: stage_Located, d: u32, end: f32) -> stage_Located {
+    var moved = at;
+    moved.weight = vec4<f32>(0.0);
+    for (var k = 1u; k < 3u; k++) {
+        let rank = at.rank[(d + k) % 3u];
+        moved.weight[rank + 1u] += end;
+        moved.weight[rank] -= end;
+    }
+    return moved;
+}
+
+fn stage_corner(at: stage_Located, level: stage_Level, c: u32) -> stage_Corner {
     let k = at.cell + select(vec3<u32>(0u), vec3<u32>(1u), at.rank < vec3<u32>(c));
     let h = k * stage_PRIMES;
     let hashed = (h.x ^ h.y ^ h.z) & level.last;
@@ -44,40 +57,6 @@ fn stage_entry(level: stage_Level, at: stage_Simplex, c: u32) -> u32 {
     let half = v >> vec3<u32>(1u);
     let pair = (half.x * level.side + half.y) * level.side + half.z;
     let direct = min(2u * pair + (v.x & 1u), level.last);
-    return level.start + select(hashed, direct, level.side != 0u) * stage_FEATURES;
-}
-
-fn stage_level_forward(x: vec3<f32>, level: stage_Level) -> array<f32, stage_FEATURES> {
-    let at = stage_locate(x, level);
-    var sum: array<f32, stage_FEATURES>;
-    for (var c = 0u; c < 4u; c++) {
-        let entry = stage_entry(level, at, c);
-        for (var f = 0u; f < stage_FEATURES; f++) {
-            sum[f] += at.weight[c] * stage_param(entry + f);
-        }
-    }
-    return sum;
-}
-
-// Adds to the gradients of the level's entries; returns the derivative with respect to the point.
-fn stage_level_backward(x: vec3<f32>, level: stage_Level, dy: ptr<function, array<f32, stage_FEATURES>>) -> vec3<f32> {
-    let at = stage_locate(x, level);
-    var along: array<f32, 4>;
-    for (var c = 0u; c < 4u; c++) {
-        let entry = stage_entry(level, at, c);
-        stage_features_grad(entry, at.weight[c], dy);
-        if stage_wants_dx {
-            for (var f = 0u; f < stage_FEATURES; f++) {
-                along[c] += stage_param(entry + f) * (*dy)[f];
-            }
-        }
-    }
-    // With respect to a fraction: the corner that it adds to, minus the one before.
-    var by: vec3<f32>;
-    for (var d = 0u; d < 3u; d++) {
-        by[d] = along[at.rank[d] + 1u] - along[at.rank[d]];
-    }
-    // Beyond the rim a position is clamped, whatever its value.
-    let inside = (x >= vec3<f32>(0.0)) & (x <= vec3<f32>(1.0));
-    return select(vec3<f32>(0.0), (by.yxx + by.zzy) * level.scale, inside);
+    let entry = level.start + select(hashed, direct, level.side != 0u) * stage_FEATURES;
+    return stage_Corner(entry, at.weight[c]);
 }

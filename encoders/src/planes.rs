@@ -10,7 +10,7 @@
 //! A level with `r` cells per side has `r + 1` nodes along each axis, at the corners of its cells, which fill the cube
 //! exactly.
 
-use crate::levels::{self, BLOCK, Cells, Levels, Rows, finest, grid, stretch};
+use crate::levels::{self, BLOCK, Cells, Levels, Rows, finest, grid};
 use conefield_core::prelude::*;
 use conefield_core::simd::Simd;
 use std::ops::{Range, RangeInclusive};
@@ -81,19 +81,6 @@ impl Factor {
     fn has_line(&self) -> bool {
         self.form == Form::VectorMatrix
     }
-
-    /// The gradient with respect to the plane's value.
-    #[inline(always)]
-    fn worth<R: Real, const F: usize>(&self, line: &[[R; F]], at: &Place<R>, dy: &[R; F]) -> [R; F] {
-        let mut worth = *dy;
-        if self.has_line() {
-            let along = on_line(line, at, at.line);
-            for f in 0..F {
-                worth[f] *= along[f];
-            }
-        }
-        worth
-    }
 }
 
 /// A position on a plane and its line: entries and weights of the plane's four surrounding corners, entry of the line's
@@ -103,8 +90,6 @@ struct Place<R> {
     weights: [R; 4],
     node: usize,
     line: [R; 2],
-    /// For both coordinates on the plane: the weights of the node and of the next one.
-    plane: [[R; 2]; 2],
 }
 
 impl<R: Real> Place<R> {
@@ -114,43 +99,36 @@ impl<R: Real> Place<R> {
         let [a, b, c] = AXES[orientation];
         let (f, g, h) = (at.fraction[a][i], at.fraction[b][i], at.fraction[c][i]);
         let first = at.cell[a][i] as usize * nodes + at.cell[b][i] as usize;
-        let plane = [[R::ONE - f, f], [R::ONE - g, g]];
+        let (a, b) = ([R::ONE - f, f], [R::ONE - g, g]);
         Self {
             corners: [first, first + 1, first + nodes, first + nodes + 1],
-            weights: products(plane[0], plane[1]),
+            weights: [a[0] * b[0], a[0] * b[1], a[1] * b[0], a[1] * b[1]],
             node: at.cell[c][i] as usize,
             line: [R::ONE - h, h],
-            plane,
         }
     }
 }
 
-/// The weights of the corners of a plane's cell.
+/// The plane's value.
 #[inline(always)]
-fn products<R: Real>(a: [R; 2], b: [R; 2]) -> [R; 4] {
-    [a[0] * b[0], a[0] * b[1], a[1] * b[0], a[1] * b[1]]
-}
-
-/// `Σ weights·plane` at the corners.
-#[inline(always)]
-fn on_plane<R: Real, const F: usize>(plane: &[[R; F]], at: &Place<R>, weights: [R; 4]) -> [R; F] {
+fn on_plane<R: Real, const F: usize>(plane: &[[R; F]], at: &Place<R>) -> [R; F] {
     let mut sum = [R::ZERO; F];
     for c in 0..4 {
         let entry = &plane[at.corners[c]];
         for f in 0..F {
-            sum[f] += weights[c] * entry[f];
+            sum[f] += at.weights[c] * entry[f];
         }
     }
     sum
 }
 
-/// `Σ weights·line` at both nodes.
+/// The line's value.
 #[inline(always)]
-fn on_line<R: Real, const F: usize>(line: &[[R; F]], at: &Place<R>, weights: [R; 2]) -> [R; F] {
+fn on_line<R: Real, const F: usize>(line: &[[R; F]], at: &Place<R>) -> [R; F] {
     let mut sum = [R::ZERO; F];
     let [near, far] = [&line[at.node], &line[at.node + 1]];
     for f in 0..F {
-        sum[f] = weights[0] * near[f] + weights[1] * far[f];
+        sum[f] = at.line[0] * near[f] + at.line[1] * far[f];
     }
     sum
 }
@@ -205,9 +183,9 @@ impl levels::Level for Factor {
         let (plane, line) = table.split_at(self.plane(1));
         for i in 0..n {
             let place = Place::of(located, self.orientation, self.nodes(), i);
-            let mut value = on_plane(plane, &place, place.weights);
+            let mut value = on_plane(plane, &place);
             if self.has_line() {
-                let along = on_line(line, &place, place.line);
+                let along = on_line(line, &place);
                 for f in 0..F {
                     value[f] *= along[f];
                 }
@@ -234,7 +212,14 @@ impl levels::Level for Factor {
         let (plane_grads, line_grads) = grads.as_chunks_mut::<F>().0.split_at_mut(self.plane(1));
         for i in 0..n {
             let place = Place::of(located, self.orientation, self.nodes(), i);
-            let worth = self.worth(line, &place, &dy[i]);
+            // The gradient with respect to the plane's value.
+            let mut worth = dy[i];
+            if self.has_line() {
+                let along = on_line(line, &place);
+                for f in 0..F {
+                    worth[f] *= along[f];
+                }
+            }
             for c in 0..4 {
                 let to = &mut plane_grads[place.corners[c]];
                 for f in 0..F {
@@ -242,7 +227,7 @@ impl levels::Level for Factor {
                 }
             }
             if self.has_line() {
-                let value = on_plane(plane, &place, place.weights);
+                let value = on_plane(plane, &place);
                 for k in 0..2 {
                     let to = &mut line_grads[place.node + k];
                     for f in 0..F {
@@ -253,25 +238,8 @@ impl levels::Level for Factor {
         }
     }
 
-    fn slope<R: Real, const F: usize>(&self, rows: &Rows<'_, Self, R, F>, dy: &[R; F], x: [R; 3], i: usize) -> [R; 3] {
-        let &Rows { located, table, .. } = rows;
-        let (plane, line) = table.split_at(self.plane(1));
-        let [a, b, c] = AXES[self.orientation];
-        let place = Place::of(located, self.orientation, self.nodes(), i);
-        let worth = self.worth(line, &place, dy);
-        let ends = [R::ZERO - R::ONE, R::ONE];
-        let along_a = on_plane(plane, &place, products(ends, place.plane[1]));
-        let along_b = on_plane(plane, &place, products(place.plane[0], ends));
-        let dot = |v: [R; F], w: [R; F]| (0..F).map(|f| v[f] * w[f]).sum::<R>();
-        let mut slopes = [R::ZERO; 3];
-        slopes[a] = dot(along_a, worth);
-        slopes[b] = dot(along_b, worth);
-        if self.has_line() {
-            let value = on_plane(plane, &place, place.weights);
-            let along = on_line(line, &place, ends);
-            slopes[c] = (0..F).map(|f| dy[f] * value[f] * along[f]).sum();
-        }
-        std::array::from_fn(|d| slopes[d] * stretch(x[d], self.cells))
+    fn move_to<R: Real>(&self, to: &mut Cells<R>, d: usize, end: R) {
+        to.fraction[d] = [end; BLOCK];
     }
 
     fn code(&self) -> String {

@@ -10,7 +10,6 @@ use crate::normalizers::line_attention::{LineAttention, LineAttentionStage};
 use conefield_core::activation::{Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
 use conefield_core::prelude::*;
-use conefield_core::simd::{Op, Simd, run};
 use std::ops::Range;
 
 /// Settings of `line-transformer`.
@@ -118,163 +117,74 @@ impl<'a, R: Real> Tape<'a, R> {
     }
 }
 
-/// Computes `output = f(W·x + b)`; the derivative of `f` goes to `slope`.
-struct First<'a, R> {
-    stage: &'a LineTransformerStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    output: &'a mut [R],
-    slope: &'a mut [R],
-}
-
-impl<R: Real> Op for First<'_, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let Self { stage, params, x, output, slope } = self;
-        let layer = &stage.first;
-        affine(s, layer.matrix(params, 0), Some(&params[layer.bias()]), x.data, slope, x.rows);
-        activate(s, stage.settings.activation, slope, output);
-    }
-}
-
-/// All layers after the blocks.
-struct Tail<'a, 'b, R> {
-    stage: &'a LineTransformerStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    y: TileMut<'a, R>,
-    tape: &'a mut Tape<'b, R>,
-}
-
-impl<R: Real> Op for Tail<'_, '_, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let Self { stage: LineTransformerStage { settings, skip, last, .. }, params, x, y, tape } = self;
-        let n = x.rows;
-        let [mixed, slope] = &mut tape.mixed;
-        if let Some([output, _]) = tape.blocks.last() {
-            slope.copy_from_slice(output);
-        }
-        activate(s, settings.activation, slope, mixed);
-        let [hidden, slope] = &mut tape.skip;
-        affine(s, skip.matrix(params, skip.skip), Some(&params[skip.bias()]), mixed, slope, n);
-        affine(s, skip.matrix(params, 0), None, x.data, slope, n);
-        activate(s, settings.activation, slope, hidden);
-        affine(s, last.matrix(params, 0), Some(&params[last.bias()]), hidden, tape.last, n);
-        activate(s, settings.output, tape.last, y.data);
-    }
-}
-
-/// Backward pass of all layers after the blocks: the slope of `tape.mixed` becomes `∂L` of the last block's output.
-struct TailBackward<'a, 'b, R> {
-    stage: &'a LineTransformerStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    dy: Tile<'a, R>,
-    grads: &'a mut [R],
-    dx: Option<&'a mut [R]>,
-    tape: &'a mut Tape<'b, R>,
-}
-
-impl<R: Real> Op for TailBackward<'_, '_, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let Self { stage: LineTransformerStage { skip, last, .. }, params, x, dy, grads, dx, tape } = self;
-        let n = x.rows;
-        multiply(tape.last, dy.data);
-        let [hidden, d_skip] = &mut tape.skip;
-        let (dw, db) = last.gradients(grads);
-        affine_weights(s, tape.last, hidden, dw, last.ld(), 0, Some(db), n);
-        affine_input(s, last.matrix(params, 0), tape.last, d_skip, Into::Multiply, n);
-        let [mixed, d_mixed] = &mut tape.mixed;
-        let (dw, db) = skip.gradients(grads);
-        affine_weights(s, d_skip, mixed, dw, skip.ld(), skip.skip, Some(db), n);
-        affine_weights(s, d_skip, x.data, dw, skip.ld(), 0, None, n);
-        affine_input(s, skip.matrix(params, skip.skip), d_skip, d_mixed, Into::Multiply, n);
-        if let Some(dx) = dx {
-            affine_input(s, skip.matrix(params, 0), d_skip, dx, Into::Set, n);
-        }
-    }
-}
-
-/// Backward pass of the first layer, from `d`, `∂L` of its output.
-struct FirstBack<'a, R> {
-    stage: &'a LineTransformerStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    d: &'a [R],
-    slope: &'a mut [R],
-    grads: &'a mut [R],
-    dx: Option<&'a mut [R]>,
-}
-
-impl<R: Real> Op for FirstBack<'_, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let Self { stage, params, x, d, slope, grads, dx } = self;
-        let layer = &stage.first;
-        multiply(slope, d);
-        let (dw, db) = layer.gradients(grads);
-        affine_weights(s, slope, x.data, dw, layer.ld(), 0, Some(db), x.rows);
-        if let Some(dx) = dx {
-            affine_input(s, layer.matrix(params, 0), slope, dx, Into::Add, x.rows);
-        }
-    }
-}
-
 fn multiply<R: Real>(product: &mut [R], other: &[R]) {
     product.iter_mut().zip(other).for_each(|(a, &b)| *a *= b);
 }
 
 impl<R: Real> Kernel<R> for LineTransformerStage {
     fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        let n = x.rows;
+        let (Self { settings, skip, last, .. }, n) = (self, x.rows);
         let mut tape = Tape::of(self, tape);
         let [first, slope] = &mut tape.first;
-        run(First { stage: self, params, x, output: first, slope });
+        affine(self.first.matrix(params, 0), Some(&params[self.first.bias()]), x.data, slope, n);
+        activate(settings.activation, slope, first);
         let mut before: &[R] = first;
         for (&start, [output, own]) in self.blocks.iter().zip(&mut tape.blocks) {
             let (out, own) = (TileMut::new(output, n), TileMut::new(own, n));
             self.block.forward(&params[self.of_block(start)], Tile::new(before, n), out, own);
             before = output;
         }
-        run(Tail { stage: self, params, x, y, tape: &mut tape });
+        let [mixed, slope] = &mut tape.mixed;
+        slope.copy_from_slice(before);
+        activate(settings.activation, slope, mixed);
+        let [hidden, slope] = &mut tape.skip;
+        affine(skip.matrix(params, skip.skip), Some(&params[skip.bias()]), mixed, slope, n);
+        affine(skip.matrix(params, 0), None, x.data, slope, n);
+        activate(settings.activation, slope, hidden);
+        affine(last.matrix(params, 0), Some(&params[last.bias()]), hidden, tape.last, n);
+        activate(settings.output, tape.last, y.data);
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, tape, dy, grads, mut dx }: Backward<'_, R>) {
         debug_assert_eq!(grads.range, 0..params.len());
-        let (n, grads, mut dx) = (x.rows, grads.values, dx.map(|t| t.data));
+        let (Self { first, skip, last, .. }, n, grads) = (self, x.rows, grads.values);
         let mut tape = Tape::of(self, tape);
-        run(TailBackward { stage: self, params, x, dy, grads, dx: dx.as_deref_mut(), tape: &mut tape });
-        let [first, slope] = tape.first;
-        let [_, d] = tape.mixed;
+        // The derivatives of activations become `∂L` of their arguments.
+        multiply(tape.last, dy.data);
+        let [hidden, d_skip] = tape.skip;
+        let (dw, db) = last.gradients(grads);
+        affine_weights(tape.last, hidden, dw, last.ld(), 0, Some(db), n);
+        affine_input(last.matrix(params, 0), tape.last, d_skip, Into::Multiply, n);
+        let [mixed, d] = tape.mixed;
+        let (dw, db) = skip.gradients(grads);
+        affine_weights(d_skip, mixed, dw, skip.ld(), skip.skip, Some(db), n);
+        affine_weights(d_skip, x.data, dw, skip.ld(), 0, None, n);
+        affine_input(skip.matrix(params, skip.skip), d_skip, d, Into::Multiply, n);
+        if let Some(dx) = &mut dx {
+            affine_input(skip.matrix(params, 0), d_skip, dx.data, Into::Set, n);
+        }
+        let [features, d_first] = tape.first;
         for (k, &start) in self.blocks.iter().enumerate().rev() {
             let (before, from) = tape.blocks.split_at_mut(k);
             let [output, own] = &mut from[0];
-            let input: &[R] = if let Some([output, _]) = before.last() { output } else { first };
-            let of = Grads::all(&mut grads[self.of_block(start)]);
-            // The block's output is no longer needed: `∂L` of its input replaces it.
-            let (own, to) = (TileMut::new(own, n), Some(TileMut::new(output, n)));
-            self.block.backward(&params[self.of_block(start)], Tile::new(input, n), own, Tile::new(d, n), of, to);
+            let input: &[R] = if let Some([output, _]) = before.last() { output } else { features };
+            self.block.backward(Backward {
+                params: &params[self.of_block(start)],
+                x: Tile::new(input, n),
+                tape: TileMut::new(own, n),
+                dy: Tile::new(d, n),
+                grads: Grads::all(&mut grads[self.of_block(start)]),
+                // The block's output is no longer needed: `∂L` of its input replaces it.
+                dx: Some(TileMut::new(output, n)),
+            });
             d.copy_from_slice(output);
         }
-        run(FirstBack { stage: self, params, x, d, slope, grads, dx });
+        multiply(d_first, d);
+        let (dw, db) = first.gradients(grads);
+        affine_weights(d_first, x.data, dw, first.ld(), 0, Some(db), n);
+        if let Some(dx) = dx {
+            affine_input(first.matrix(params, 0), d_first, dx.data, Into::Add, n);
+        }
     }
 
     fn points(&self) -> Option<&(dyn Kernel<R> + '_)> {

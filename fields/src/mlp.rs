@@ -6,11 +6,9 @@
 mod wgsl;
 
 use crate::linear::Linear;
-use crate::passes::{Backward, Forward};
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::dense::{Output as Into, affine, affine_input, affine_weights};
 use conefield_core::prelude::*;
-use conefield_core::simd::{Op, Simd, run};
 use std::ops::Range;
 
 /// Initialization of weights and biases.
@@ -109,99 +107,58 @@ impl MlpStage {
     }
 }
 
-/// Splits `data` into `[..at]` and the channels `range` after it.
-fn split<R>(data: &mut [R], range: Range<usize>, rows: usize) -> (&[R], &mut [R]) {
-    let (before, rest) = data.split_at_mut(range.start * rows);
-    (before, &mut rest[..range.len() * rows])
-}
-
-impl<R: Real> Op for Forward<'_, MlpStage, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let Self { stage, params, x, y, tape } = self;
+impl<R: Real> Kernel<R> for MlpStage {
+    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
         let n = x.rows;
-        for (i, layer) in stage.layers.iter().enumerate() {
-            let last = i + 1 == stage.layers.len();
-            let act = if last { stage.settings.output } else { stage.settings.activation };
+        for (i, layer) in self.layers.iter().enumerate() {
+            let last = i + 1 == self.layers.len();
+            let act = if last { self.settings.output } else { self.settings.activation };
             // The linear map is written where its derivative will be stored; the activation then reads it in place.
-            let from = if last { stage.slope(i).start } else { stage.hidden(i).start };
-            let until = stage.slope(i).end;
-            let (before, both) = split(tape.data, from..until, n);
+            let from = if last { self.slope(i).start } else { self.hidden(i).start };
+            let until = self.slope(i).end;
+            let (before, rest) = tape.data.split_at_mut(from * n);
+            let both = &mut rest[..(until - from) * n];
             let (h, z) = if last { (&mut y.data[..], both) } else { both.split_at_mut(layer.output * n) };
-            let input =
-                if i == 0 { x.data } else { &before[stage.hidden(i - 1).start * n..stage.hidden(i - 1).end * n] };
-            affine(s, layer.matrix(params, layer.skip), Some(&params[layer.bias()]), input, z, n);
+            let input = if i == 0 { x.data } else { &before[self.hidden(i - 1).start * n..self.hidden(i - 1).end * n] };
+            affine(layer.matrix(params, layer.skip), Some(&params[layer.bias()]), input, z, n);
             if layer.skip > 0 {
-                affine(s, layer.matrix(params, 0), None, x.data, z, n);
+                affine(layer.matrix(params, 0), None, x.data, z, n);
             }
-            activate(s, act, z, h);
+            activate(act, z, h);
         }
     }
-}
 
-impl<R: Real> Op for Backward<'_, MlpStage, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let Self { stage, params, x, tape, dy, grads, mut dx } = self;
+    fn backward(&self, Backward { params, x, tape, dy, grads, mut dx }: Backward<'_, R>) {
         let n = x.rows;
-        let last = stage.layers.len() - 1;
+        let last = self.layers.len() - 1;
         debug_assert_eq!(grads.range, 0..params.len());
         // The tape's derivatives become ∂L/∂z, layer by layer.
-        for (d, &g) in tape.data[stage.slope(last).start * n..].iter_mut().zip(dy.data) {
+        for (d, &g) in tape.data[self.slope(last).start * n..].iter_mut().zip(dy.data) {
             *d *= g;
         }
         let mut fresh = true;
-        for (i, layer) in stage.layers.iter().enumerate().rev() {
-            let (before, dz) = tape.data.split_at_mut(stage.slope(i).start * n);
+        for (i, layer) in self.layers.iter().enumerate().rev() {
+            let (before, dz) = tape.data.split_at_mut(self.slope(i).start * n);
             let dz = &dz[..layer.output * n];
-            let input =
-                if i == 0 { x.data } else { &before[stage.hidden(i - 1).start * n..stage.hidden(i - 1).end * n] };
+            let input = if i == 0 { x.data } else { &before[self.hidden(i - 1).start * n..self.hidden(i - 1).end * n] };
             let (dw, db) = layer.gradients(grads.values);
-            affine_weights(s, dz, input, dw, layer.ld(), layer.skip, Some(db), n);
+            affine_weights(dz, input, dw, layer.ld(), layer.skip, Some(db), n);
             if layer.skip > 0 {
-                affine_weights(s, dz, x.data, dw, layer.ld(), 0, None, n);
+                affine_weights(dz, x.data, dw, layer.ld(), 0, None, n);
             }
             if let Some(dx) = &mut dx
                 && (layer.skip > 0 || i == 0)
             {
                 let out = if fresh { Into::Set } else { Into::Add };
-                affine_input(s, layer.matrix(params, 0), dz, dx.data, out, n);
+                affine_input(layer.matrix(params, 0), dz, dx.data, out, n);
                 fresh = false;
             }
             if i > 0 {
-                let slope = stage.slope(i - 1);
-                affine_input(
-                    s,
-                    layer.matrix(params, layer.skip),
-                    dz,
-                    &mut before[slope.start * n..slope.end * n],
-                    Into::Multiply,
-                    n,
-                );
+                let slope = self.slope(i - 1);
+                let dz_before = &mut before[slope.start * n..slope.end * n];
+                affine_input(layer.matrix(params, layer.skip), dz, dz_before, Into::Multiply, n);
             }
         }
-    }
-}
-
-impl<R: Real> Kernel<R> for MlpStage {
-    fn forward(&self, params: &[R], x: Tile<'_, R>, y: TileMut<'_, R>, tape: TileMut<'_, R>) {
-        run(Forward { stage: self, params, x, y, tape });
-    }
-
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        run(Backward { stage: self, params, x, tape, dy, grads, dx });
     }
 }
 

@@ -1,6 +1,6 @@
 //! The arguments of a kernel's passes, for what is compiled for several sets of instructions.
 
-use conefield_core::stage::{Grads, Tile, TileMut};
+use conefield_core::stage::{Backward, Tile, TileMut};
 
 /// Those of [`Kernel::forward`](conefield_core::stage::Kernel::forward).
 pub(crate) struct Forward<'a, T, R> {
@@ -11,13 +11,8 @@ pub(crate) struct Forward<'a, T, R> {
     pub tape: TileMut<'a, R>,
 }
 
-/// Those of [`Kernel::backward`](conefield_core::stage::Kernel::backward).
-pub(crate) struct Backward<'a, T, R> {
+/// A stage with those of [`Kernel::backward`](conefield_core::stage::Kernel::backward).
+pub(crate) struct Back<'a, T, R> {
     pub stage: &'a T,
-    pub params: &'a [R],
-    pub x: Tile<'a, R>,
-    pub tape: TileMut<'a, R>,
-    pub dy: Tile<'a, R>,
-    pub grads: Grads<'a, R>,
-    pub dx: Option<TileMut<'a, R>>,
+    pub pass: Backward<'a, R>,
 }

@@ -3,7 +3,7 @@
 //! Values are given at the voxel centres and interpolated trilinearly; they are constant within half a voxel of the
 //! surface. The activation follows the interpolation, so that edges can lie between voxels.
 
-use crate::passes::{Backward, Forward};
+use crate::passes::{Back, Forward};
 use conefield_core::activation::{self, Activation, activate};
 use conefield_core::prelude::*;
 use conefield_core::simd::{Op, Simd, run};
@@ -105,50 +105,55 @@ impl<R: Real> Op for Forward<'_, VoxelGridStage, R> {
             for i in 0..n {
                 [z[i]] = located.gather(i, &offsets, table);
             }
-            activate(s, self.stage.output, &mut z[..n], &mut self.y.data[at..at + n]);
+            activate(self.stage.output, &mut z[..n], &mut self.y.data[at..at + n]);
         }
     }
 }
 
-impl<R: Real> Op for Backward<'_, VoxelGridStage, R> {
+impl<R: Real> Op for Back<'_, VoxelGridStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
-    fn call<S: Simd>(mut self, s: S) {
-        let (table, _) = self.params.as_chunks::<1>();
-        let offsets = self.stage.grid.offsets();
-        let own = self.grads.range.clone();
+    fn call<S: Simd>(self, s: S) {
+        let (stage, Backward { params, x, dy, grads, mut dx, .. }) = (self.stage, self.pass);
+        let (table, _) = params.as_chunks::<1>();
+        let offsets = stage.grid.offsets();
+        let own = grads.range.clone();
         let mut located = Located::default();
         let (mut slope, mut value) = ([R::ZERO; BLOCK], [R::ZERO; BLOCK]);
-        for at in (0..self.x.rows).step_by(BLOCK) {
-            let n = BLOCK.min(self.x.rows - at);
-            located.locate(s, &self.stage.grid, self.x, at, n);
+        for at in (0..x.rows).step_by(BLOCK) {
+            let n = BLOCK.min(x.rows - at);
+            located.locate(s, &stage.grid, x, at, n);
             let touched = (0..n).any(|i| {
                 let first = located.base(i);
                 first < own.end && own.start <= first + offsets[7]
             });
-            if !touched && self.dx.is_none() {
+            if !touched && dx.is_none() {
                 continue;
             }
             // A scattered stage keeps no tape, so the activation's derivative is recomputed.
             slope[..n].fill(R::ONE);
-            if self.stage.output != Activation::None {
+            if stage.output != Activation::None {
                 for i in 0..n {
                     [slope[i]] = located.gather(i, &offsets, table);
                 }
-                activate(s, self.stage.output, &mut slope[..n], &mut value[..n]);
+                activate(stage.output, &mut slope[..n], &mut value[..n]);
             }
             for i in 0..n {
-                slope[i] *= self.dy.data[at + i];
+                slope[i] *= dy.data[at + i];
             }
             for i in 0..n {
-                located.scatter(i, &offsets, &[slope[i]], self.grads.values, &own);
+                located.scatter(i, &offsets, &[slope[i]], grads.values, &own);
             }
-            if let Some(dx) = &mut self.dx {
-                for i in 0..n {
-                    let corners = offsets.map(|o| table[located.base(i) + o][0]);
-                    for (d, v) in located.slopes(i, corners).into_iter().enumerate() {
-                        dx.channel(d)[at + i] = v * slope[i];
+            if let Some(dx) = &mut dx {
+                for d in 0..3 {
+                    let (mut near, mut far) = (located.clone(), located.clone());
+                    near.move_to(d, R::ZERO);
+                    far.move_to(d, R::ONE);
+                    for i in 0..n {
+                        let [[near], [far]] = [&near, &far].map(|moved| moved.gather(i, &offsets, table));
+                        let stretch = stage.grid.stretch(d, x.channel(d)[at + i]);
+                        dx.channel(d)[at + i] = (far - near) * stretch * slope[i];
                     }
                 }
             }
@@ -161,16 +166,8 @@ impl<R: Real> Kernel<R> for VoxelGridStage {
         run(Forward { stage: self, params, x, y, tape });
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        run(Backward { stage: self, params, x, tape, dy, grads, dx });
+    fn backward(&self, pass: Backward<'_, R>) {
+        run(Back { stage: self, pass });
     }
 }
 

@@ -21,15 +21,10 @@ fn stage_forward(x: ptr<function, array<f32, 3>>, y: ptr<function, array<f32, 1>
 fn stage_backward(x: ptr<function, array<f32, 3>>, dy: ptr<function, array<f32, 1>>, dx: ptr<function, array<f32, 3>>) {
     let at = stage_at(x);
     let d = (*dy)[0] * stage_output(stage_value(at)).y;
-    var slope = vec3<f32>(0.0);
     for (var c = 0u; c < 8u; c++) {
-        let voxel = stage_trilinear_index(at, stage_STRIDES, c);
-        stage_grad(voxel, stage_trilinear_weight(at, c) * d);
-        if stage_wants_dx {
-            slope += stage_param(voxel) * stage_trilinear_slopes(at, c);
-        }
+        stage_grad(stage_trilinear_index(at, stage_STRIDES, c), stage_trilinear_weight(at, c) * d);
     }
-    (*dx)[0] = slope.x * d;
-    (*dx)[1] = slope.y * d;
-    (*dx)[2] = slope.z * d;
+    for (var k = 0u; k < 3u && stage_wants_dx; k++) {
+        (*dx)[k] = (stage_value(stage_moved(at, k, 1.0)) - stage_value(stage_moved(at, k, 0.0))) * at.slope[k] * d;
+    }
 }

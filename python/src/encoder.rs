@@ -7,7 +7,9 @@ use crate::errors::{broken, raised};
 use crate::stages::{StageObject, array, optional};
 use conefield_core::error::ensure;
 use conefield_core::simd::Real;
-use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut};
+use conefield_core::stage::{
+    Backward, Encoder, GradKind, Info, Kernel, Parameter, Reduced, Scope, Stage, Tile, TileMut,
+};
 use conefield_core::{Error, Result};
 use ndarray::{Array1, Array2, ArrayD};
 use numpy::{Element, IntoPyArray};
@@ -169,15 +171,7 @@ impl<R: Real + Element> Kernel<R> for PythonEncoder {
         }
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, dy, grads, dx, .. }: Backward<'_, R>) {
         let mut whole = Array2::from_elem((x.rows, self.shared.width), R::ZERO);
         for (c, &place) in self.outputs.iter().enumerate() {
             whole.column_mut(place).iter_mut().zip(dy.channel(c)).for_each(|(to, d)| *to = *d);

@@ -149,15 +149,7 @@ impl<R: Real> Kernel<R> for Toy {
         }
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, dy, grads, dx, .. }: Backward<'_, R>) {
         assert!(self.fault != Fault::Panics, "as ordered");
         for c in grads.range.clone() {
             let w = params[c];

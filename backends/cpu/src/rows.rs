@@ -2,7 +2,7 @@
 
 use conefield_core::pipeline::Pipeline;
 use conefield_core::simd::Real;
-use conefield_core::stage::{GradKind, Grads, Info, Kernel, Scope, Stage, TILE_ROWS, Tile, TileMut};
+use conefield_core::stage::{Backward, GradKind, Grads, Info, Kernel, Scope, Stage, TILE_ROWS, Tile, TileMut};
 use std::ops::Range;
 
 /// A stage ready to run: its kernel, widths and place in the arena.
@@ -199,16 +199,8 @@ impl<R: Real> Single<R> {
         }
     }
 
-    fn backward(
-        &mut self,
-        kernel: &dyn Kernel<R>,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        mut dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&mut self, kernel: &dyn Kernel<R>, pass: Backward<'_, R>) {
+        let Backward { params, x, tape, dy, grads, mut dx } = pass;
         let left = Tile::new(&*tape.data, tape.rows);
         self.dx.resize(x.width(), R::ZERO);
         for i in 0..x.rows {
@@ -216,14 +208,14 @@ impl<R: Real> Single<R> {
                 to.clear();
                 to.extend(row(from, i));
             }
-            kernel.backward(
+            kernel.backward(Backward {
                 params,
-                Tile::new(&self.x, 1),
-                TileMut::new(&mut self.tape, 1),
-                Tile::new(&self.y, 1),
-                Grads { values: &mut *grads.values, range: grads.range.clone() },
-                dx.is_some().then(|| TileMut::new(&mut self.dx, 1)),
-            );
+                x: Tile::new(&self.x, 1),
+                tape: TileMut::new(&mut self.tape, 1),
+                dy: Tile::new(&self.y, 1),
+                grads: Grads { values: &mut *grads.values, range: grads.range.clone() },
+                dx: dx.is_some().then(|| TileMut::new(&mut self.dx, 1)),
+            });
             if let Some(dx) = &mut dx {
                 set_row(dx, i, &self.dx);
             }
@@ -284,14 +276,14 @@ impl<R: Real> Encoded<R> {
         let n = self.rows();
         if s.info.grads == GradKind::Dense && s.info.params > 0 && n > 0 {
             let (x, dy) = self.log.data.split_at(3 * n);
-            s.kernel.backward(
-                &params[s.params.clone()],
-                Tile::new(x, n),
-                TileMut::new(&mut self.tape, n),
-                Tile::new(dy, n),
-                Grads::all(dense.of(0)),
-                None,
-            );
+            s.kernel.backward(Backward {
+                params: &params[s.params.clone()],
+                x: Tile::new(x, n),
+                tape: TileMut::new(&mut self.tape, n),
+                dy: Tile::new(dy, n),
+                grads: Grads::all(dense.of(0)),
+                dx: None,
+            });
         }
     }
 
@@ -446,12 +438,17 @@ impl<R: Real> Scratch<R> {
                 } else {
                     Grads::all(dense.of(k))
                 };
-                let (params, x, g) = (&params[s.params.clone()], Tile::new(x, n), Tile::new(g, n));
-                let tape = TileMut::new(&mut after[s.info.output * n..(s.info.output + s.info.tape) * n], n);
-                let dx_here = s.hands_on.then(|| TileMut::new(&mut dx[..s.info.input * n], n));
+                let pass = Backward {
+                    params: &params[s.params.clone()],
+                    x: Tile::new(x, n),
+                    tape: TileMut::new(&mut after[s.info.output * n..(s.info.output + s.info.tape) * n], n),
+                    dy: Tile::new(g, n),
+                    grads,
+                    dx: s.hands_on.then(|| TileMut::new(&mut dx[..s.info.input * n], n)),
+                };
                 match s.whole(self.belong) {
-                    Some(kernel) => kernel.backward(params, x, tape, g, grads, dx_here),
-                    None => self.single.backward(s.kernel, params, x, tape, g, grads, dx_here),
+                    Some(kernel) => kernel.backward(pass),
+                    None => self.single.backward(s.kernel, pass),
                 }
                 if !s.hands_on {
                     continue 'tiles;

@@ -4,7 +4,7 @@ use crate::rows::{Belong, DenseGrads, Encoded, Kernels, Log, Scratch, even_tiles
 use conefield_core::backend::{BlockWork, StepStats, Work};
 use conefield_core::random::mix;
 use conefield_core::simd::Real;
-use conefield_core::stage::{Grads, Projector, Samples, Tile, TileMut};
+use conefield_core::stage::{Backward, Grads, Projector, Samples, Tile, TileMut};
 use rayon::prelude::*;
 use std::ops::Range;
 use std::time::Instant;
@@ -148,15 +148,14 @@ impl<R: Real> Slots<R> {
                     let (x, after) = data.split_at(s.info.input * n);
                     let (dy, after) = after.split_at(s.info.output * n);
                     data = after;
-                    let grads = Grads { values: &mut values[..], range: range.clone() };
-                    s.kernel.backward(
-                        &params[s.params.clone()],
-                        Tile::new(x, n),
-                        TileMut::new(&mut [], n),
-                        Tile::new(dy, n),
-                        grads,
-                        None,
-                    );
+                    s.kernel.backward(Backward {
+                        params: &params[s.params.clone()],
+                        x: Tile::new(x, n),
+                        tape: TileMut::new(&mut [], n),
+                        dy: Tile::new(dy, n),
+                        grads: Grads { values: &mut values[..], range: range.clone() },
+                        dx: None,
+                    });
                 }
             }
         });

@@ -89,13 +89,13 @@ pub struct Chain {
     /// Parameters that every row reads.
     dense: usize,
     /// Channels that rows keep.
-    tape: usize,
+    pub tape: usize,
     /// Sums over rows.
     sums: Vec<RowSum>,
     /// The blocks of `sums`.
     blocks: Vec<String>,
     /// Parameters of the arena.
-    params: usize,
+    pub params: usize,
     pub target: Target,
 }
 
@@ -156,11 +156,6 @@ impl Chain {
         Ok(())
     }
 
-    /// Channels that rows keep.
-    pub fn tape(&self) -> usize {
-        self.tape
-    }
-
     /// Number of partial sums of a share of the rows.
     pub fn summed(&self) -> usize {
         self.sums.last().map_or(0, |s| s.partial + s.sum.params())
@@ -192,19 +187,9 @@ impl Chain {
         first.map_or(0, |l| l.info.output)
     }
 
-    /// Parameters of the arena.
-    pub fn params(&self) -> usize {
-        self.params
-    }
-
     /// Number of the encoder's output channels.
     pub fn features(&self) -> usize {
         self.links.first().filter(|_| self.encoder).map_or(3, |l| l.info.output)
-    }
-
-    /// Whether `backward` has anything to do.
-    pub fn learns(&self) -> bool {
-        self.params > 0
     }
 
     /// Binds the arena and, if one of `links` needs it, the copy of the parameters that every row reads.

@@ -281,14 +281,16 @@ impl Gpu {
 
     /// Waits until the device has finished a submission and all before it.
     pub(crate) fn wait_for(&self, index: wgpu::SubmissionIndex) -> Result<()> {
-        let polled = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None });
-        self.fault()?;
-        polled.map(drop).map_err(|e| self.error(e.to_string()))
+        self.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None })
     }
 
     /// Waits until the device has finished all submitted work.
     pub fn wait(&self) -> Result<()> {
-        let polled = self.device.poll(wgpu::PollType::wait_indefinitely());
+        self.poll(wgpu::PollType::wait_indefinitely())
+    }
+
+    fn poll(&self, until: wgpu::PollType) -> Result<()> {
+        let polled = self.device.poll(until);
         self.fault()?;
         polled.map(drop).map_err(|e| self.error(e.to_string()))
     }

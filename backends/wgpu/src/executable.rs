@@ -102,7 +102,7 @@ impl Wgpu {
             ("lines", compose::lines()),
             ("adam", compose::adam()),
         ];
-        if chain.learns() {
+        if chain.params > 0 {
             all.push(("backward", chain.backward()));
         }
         if chain.scatters() {
@@ -115,7 +115,7 @@ impl Wgpu {
         let sources = all.into_iter().map(|(label, source)| (label.to_owned(), source)).collect();
         let adapter = &shared.gpu.adapter;
         let tape = TAPE_BYTES[usize::from(!adapter.software)].min(adapter.bound_bytes());
-        let rows = tape / (4 * chain.tape().max(1) as u64);
+        let rows = tape / (4 * chain.tape.max(1) as u64);
         let most = rows.clamp(u64::from(LEAST_ROWS), u64::from(MOST_ROWS)) as u32;
         Ok(Self {
             programs: Programs::new(shared),
@@ -135,7 +135,7 @@ impl Wgpu {
     /// Peak memory on the device in bytes.
     pub fn device_bytes(&self) -> u64 {
         let rows = u64::from(self.most) * self.row_bytes();
-        16 * self.chain.params() as u64 + rows + self.partial_bytes()
+        16 * self.chain.params as u64 + rows + self.partial_bytes()
     }
 
     /// Peak host memory for copies in bytes.
@@ -145,7 +145,7 @@ impl Wgpu {
 
     /// Bytes per row: position and weight, μ and its derivative, target, features, kept channels.
     fn row_bytes(&self) -> u64 {
-        let channels = self.chain.kept().max(self.chain.features()) + self.chain.tape();
+        let channels = self.chain.kept().max(self.chain.features()) + self.chain.tape;
         16 + 4 + 4 + 4 + 4 * channels as u64
     }
 
@@ -199,7 +199,7 @@ impl Wgpu {
         self.programs.reserve_as("dmu", 4 * n, U::STORAGE)?;
         self.programs.reserve_as("targets", 4 * n, U::STORAGE | U::COPY_DST)?;
         self.programs.reserve_as("features", 4 * n * self.chain.kept().max(1) as u64, U::STORAGE | U::COPY_SRC)?;
-        self.programs.reserve_as("tape", 4 * n * self.chain.tape().max(1) as u64, U::STORAGE)?;
+        self.programs.reserve_as("tape", 4 * n * self.chain.tape.max(1) as u64, U::STORAGE)?;
         self.room = rows;
         Ok(())
     }
@@ -238,7 +238,7 @@ impl Wgpu {
             let (kernel, bound) = self.ready(label, label, str::to_owned)?;
             let timestamp_writes = self.profile.as_mut().and_then(|p| p.around(label));
             let mut pass = encoder
-                .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(kernel.label()), timestamp_writes });
+                .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(&kernel.label), timestamp_writes });
             kernel.launch(&mut pass, &bound, groups.min(MOST_GROUPS) as u32);
         }
         Ok(())
@@ -375,7 +375,7 @@ impl Wgpu {
         }
         self.write("step", bytemuck::bytes_of(&step))?;
         let groups = |rows: usize| rows.div_ceil(GROUP as usize);
-        let backward = if self.chain.learns() { groups(wave.rows as usize) } else { 0 };
+        let backward = if self.chain.params > 0 { groups(wave.rows as usize) } else { 0 };
         let scatter = if self.chain.scatters() { backward } else { 0 };
         self.launch(
             encoder,

@@ -11,7 +11,8 @@ use std::time::Instant;
 
 /// A compiled kernel.
 pub struct Kernel {
-    label: String,
+    /// Its name.
+    pub label: String,
     pipeline: wgpu::ComputePipeline,
     layout: wgpu::BindGroupLayout,
     /// Names of its buffers, in order.
@@ -168,11 +169,6 @@ impl Kernel {
                 entries: &entries,
             })
         })
-    }
-
-    /// Its name.
-    pub fn label(&self) -> &str {
-        &self.label
     }
 
     /// Adds a launch of `groups` groups to a pass.

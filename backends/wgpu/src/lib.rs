@@ -140,8 +140,8 @@ impl Backend for Wgpu {
                 .into(),
             n => format!("split: forward and backward{after}; {n} features per sample are kept in between"),
         });
-        if chain.tape() > 0 {
-            notes.push(format!("stages keep {} numbers per sample between forward, backward and sums", chain.tape()));
+        if chain.tape > 0 {
+            notes.push(format!("stages keep {} numbers per sample between forward, backward and sums", chain.tape));
         }
         if chain.segments() > 1 {
             notes.push(format!(

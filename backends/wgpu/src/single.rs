@@ -37,7 +37,7 @@ impl Runner for Wgpu {
         }
         let (inputs, outputs) = (info.input * rows, info.output * rows);
         for (name, count) in
-            [("y", outputs), ("dx", inputs), ("tape", rows * chain.tape()), ("partial", SHARES * chain.summed())]
+            [("y", outputs), ("dx", inputs), ("tape", rows * chain.tape), ("partial", SHARES * chain.summed())]
         {
             device.reserve(name, 4 * count as u64)?;
         }

@@ -37,6 +37,19 @@ pub fn validate(source: &Source) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::device::Access;
+
+    /// Native sums of gradients are no part of plain WGSL. Uniform values take no storage buffer.
+    #[test]
+    fn sums_of_numbers_are_valid_and_their_buffers_are_counted() {
+        let mut source = Source::default();
+        source.bind("rule", Access::Uniform, "vec4<f32>");
+        source.bind("values", Access::Read, "array<f32>");
+        source.bind("sums", Access::Write, "array<atomic<f32>>");
+        source.add("sum", "@compute @workgroup_size(1) fn main() { atomicAdd(&sums[0], rule.x * values[0]); }");
+        validate(&source).unwrap();
+        assert_eq!(source.storage_buffers(), 2);
+    }
 
     #[test]
     fn an_error_names_the_piece_and_its_line() {

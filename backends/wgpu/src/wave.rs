@@ -1,7 +1,7 @@
 //! A step's work cut into waves of bounded size, so that no launch holds a device for long.
 
 use crate::compose::GROUP;
-use conefield_core::backend::{BlockWork, TrainRay, Work};
+use conefield_core::backend::{TrainRay, Work};
 use conefield_core::random::mix;
 use conefield_core::stage::{Projector, UnitRay};
 use std::ops::Range;
@@ -83,48 +83,39 @@ pub fn of_step(projector: &dyn Projector, work: &Work<'_>, most: u32) -> Vec<Wav
     let rays = work.rays.iter().enumerate();
     let mut waves =
         cast(projector, rays.map(|(i, TrainRay { ray, target })| (ray, *target, mix(seed, i as u64))), most);
-    let mut at = 0;
-    while at < work.points.len() {
-        let room = waves.last().map_or(0, |w| most.saturating_sub(w.rows) as usize);
-        if room == 0 {
-            waves.push(Wave::default());
-            continue;
-        }
-        let end = (at + room).min(work.points.len());
-        if let Some(wave) = waves.last_mut() {
-            wave.points = at..end;
-            wave.rows += (end - at) as u32;
-        }
-        at = end;
-    }
+    place(&mut waves, work.points.len(), [1, most], usize::MAX, |wave, points| wave.points = points);
     for (prior, blocks) in work.priors.iter().enumerate() {
-        place_blocks(&mut waves, prior, blocks, most);
+        // All blocks of a wave belong to one prior.
+        if waves.last().is_some_and(|w| !w.blocks.is_empty()) && !blocks.corners.is_empty() {
+            waves.push(Wave::default());
+        }
+        let each = blocks.prior.blocks().points() as u32;
+        let put = |wave: &mut Wave, blocks| (wave.prior, wave.blocks) = (prior, blocks);
+        place(&mut waves, blocks.corners.len(), [each, most], MOST_GROUPS, put);
     }
     waves
 }
 
-/// Adds blocks to the last wave and to new ones. All blocks of a wave belong to one prior.
-fn place_blocks(waves: &mut Vec<Wave>, prior: usize, blocks: &BlockWork<'_>, most: u32) {
-    let each = blocks.prior.blocks().points() as u32;
-    let count = blocks.corners.len();
+/// Puts `count` things of `each` rows into the last wave and new ones of at most `most` rows and `limit` things: `put` gets a
+/// wave and its range of them.
+fn place(
+    waves: &mut Vec<Wave>,
+    count: usize,
+    [each, most]: [u32; 2],
+    limit: usize,
+    put: impl Fn(&mut Wave, Range<usize>),
+) {
     let mut at = 0;
-    if waves.last().is_some_and(|w| !w.blocks.is_empty()) {
-        waves.push(Wave::default());
-    }
     while at < count {
-        let empty = waves.last().is_none_or(|w| w.rows == 0);
-        let room = waves.last().map_or(0, |w| most.saturating_sub(w.rows) / each) as usize;
-        let room = if empty { room.max(1) } else { room }.min(MOST_GROUPS);
-        if room == 0 {
-            waves.push(Wave::default());
-            continue;
-        }
-        let end = (at + room).min(count);
-        if let Some(wave) = waves.last_mut() {
-            (wave.prior, wave.blocks) = (prior, at..end);
+        let Some(wave) = waves.last_mut() else { return };
+        let room = (most.saturating_sub(wave.rows) / each) as usize;
+        let room = if wave.rows == 0 { room.max(1) } else { room };
+        let end = (at + room.min(limit)).min(count);
+        if at < end {
+            put(wave, at..end);
             wave.rows += (end - at) as u32 * each;
+            at = end;
         }
-        at = end;
         if at < count {
             waves.push(Wave::default());
         }
@@ -139,6 +130,7 @@ pub fn of_rays(projector: &dyn Projector, rays: &[UnitRay], most: u32) -> Vec<Wa
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::backend::BlockWork;
     use conefield_core::loss::Loss;
     use conefield_core::prior::{Blocks, Prior};
     use conefield_core::stage::Samples;

@@ -30,10 +30,10 @@ fn stage_trilinear_weight(l: stage_Located, c: u32) -> f32 {
     return f.x * f.y * f.z;
 }
 
-// Derivative of corner `c`'s weight with respect to the point.
-fn stage_trilinear_slopes(l: stage_Located, c: u32) -> vec3<f32> {
-    let further = vec3<bool>((c & 1u) != 0u, (c & 2u) != 0u, (c & 4u) != 0u);
-    let f = select(1.0 - l.fraction, l.fraction, further);
-    let sign = select(-l.slope, l.slope, further);
-    return vec3<f32>(sign.x * f.y * f.z, f.x * sign.y * f.z, f.x * f.y * sign.z);
+// The same place moved to `end` 0 or 1 of the cell along axis `d`. A value is linear in between: at end 1, less that at end
+// 0, it is the derivative with respect to the position in cells.
+fn stage_moved(l: stage_Located, d: u32, end: f32) -> stage_Located {
+    var moved = l;
+    moved.fraction[d] = end;
+    return moved;
 }

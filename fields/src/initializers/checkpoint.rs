@@ -77,19 +77,57 @@ impl Initializer for FromWeights {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::initializers::mci::Mci;
     use conefield_core::arena::Block;
 
+    fn layout() -> Layout {
+        let names = ["encoder.0.table", "normalizers.0.weight", "field.0.weight"].into_iter().zip([0..3, 3..5, 5..6]);
+        let block = |(name, range): (&str, std::ops::Range<usize>)| Block {
+            name: name.to_owned(),
+            shape: vec![range.len()],
+            range,
+        };
+        Layout { blocks: names.map(block).collect() }
+    }
+
+    fn weights() -> Weights {
+        Weights::from_arena(&layout(), &[9.0; 6], |_| true)
+    }
+
+    fn mci(weights: Weights) -> Box<dyn Initializer> {
+        Mci { weights: "w.safetensors".into() }.build(&|_| Ok(weights.clone())).unwrap()
+    }
+
     #[test]
-    fn everything_is_loaded_and_a_missing_file_is_reported() {
-        let block = Block { name: "encoder.0.table".into(), shape: vec![2], range: 0..2 };
-        let layout = Layout { blocks: vec![block] };
-        let weights = Weights::from_arena(&layout, &[1.0, 2.0], |_| true);
+    fn everything_or_everything_but_the_encoder_is_loaded() {
+        let mut arena = Arena::new(6);
+        let report = mci(weights()).apply(&layout(), &mut arena).unwrap();
+        assert_eq!(*arena.params, [0.0, 0.0, 0.0, 9.0, 9.0, 9.0]);
+        assert_eq!(report.loaded, ["normalizers.0.weight", "field.0.weight"]);
+        assert_eq!(report.fresh[0].0, "encoder.0.table");
+        assert_eq!(report.unused[0].0, "encoder.0.table");
+        let all = CheckpointSettings { weights: "w".into() }.build(&|_| Ok(weights())).unwrap();
+        assert_eq!(all.apply(&layout(), &mut arena).unwrap().loaded.len(), 3);
+        assert_eq!(*arena.params, [9.0; 6]);
+    }
+
+    #[test]
+    fn missing_files_and_weights_are_refused() {
         let settings = CheckpointSettings { weights: "w".into() };
-        let mut arena = Arena::new(2);
-        let built = settings.build(&|_| Ok(weights.clone())).unwrap();
-        assert_eq!(built.apply(&layout, &mut arena).unwrap().loaded, ["encoder.0.table"]);
-        assert_eq!(*arena.params, [1.0, 2.0]);
         assert!(settings.build(&|p| Err(Error::invalid(p, "file", "nothing", "weights"))).is_err());
         assert!(CheckpointSettings { weights: InputFile::default() }.build(&|_| Ok(Weights::default())).is_err());
+        let (mut weights, mut arena) = (weights(), Arena::new(6));
+        let mut refused = |weights: &Weights, words: &[&str]| {
+            let e = mci(weights.clone()).apply(&layout(), &mut arena).unwrap_err().to_string();
+            assert!(words.iter().all(|word| e.contains(word)), "{e}");
+        };
+        weights.tensors.remove("field.0.weight");
+        refused(&weights, &["w.safetensors", "field.0.weight"]);
+        weights.tensors.insert("field.0.weight".into(), (vec![1, 1], vec![1.0]));
+        refused(&weights, &["[1, 1]", "[1]"]);
+        assert_eq!(*arena.params, [0.0; 6]);
+        let bare = Layout { blocks: layout().blocks[..1].to_vec() };
+        let e = mci(Weights::default()).apply(&bare, &mut Arena::new(3)).unwrap_err().to_string();
+        assert!(e.contains("mci"), "{e}");
     }
 }

@@ -6,7 +6,7 @@
 //! rounding. A row whose largest magnitude would overflow when squared is first scaled down by a power of two. This
 //! changes only the influence of `eps`, which is then far below rounding.
 
-use crate::passes::Forward;
+use crate::passes::{Back, Forward};
 use conefield_core::dense::total;
 use conefield_core::prelude::*;
 use conefield_core::simd::{Op, Select, Simd, SimdBase, SimdFloat, V, load, run, store};
@@ -119,16 +119,6 @@ impl<R: Real> Op for Forward<'_, LayerNormStage, R> {
     }
 }
 
-struct LayerNormBackward<'a, R> {
-    stage: &'a LayerNormStage,
-    params: &'a [R],
-    x: Tile<'a, R>,
-    tape: Tile<'a, R>,
-    dy: Tile<'a, R>,
-    grads: Grads<'a, R>,
-    dx: Option<TileMut<'a, R>>,
-}
-
 /// Results of forward for one vector of rows.
 #[derive(Clone, Copy)]
 struct RowMoments<T> {
@@ -138,47 +128,47 @@ struct RowMoments<T> {
     scale: T,
 }
 
-impl<R: Real> LayerNormBackward<'_, R> {
+impl<R: Real> Back<'_, LayerNormStage, R> {
     #[inline(always)]
     fn found<S: Simd>(&self, s: S, i: usize) -> RowMoments<V<S, R>> {
-        let mean = load(s, self.tape.channel(0), i);
-        let root = load(s, self.tape.channel(1), i);
-        let scale = load(s, self.tape.channel(2), i);
-        RowMoments { first: load(s, self.x.channel(0), i) * scale, mean, root, scale }
+        let n = self.pass.x.rows;
+        let [mean, root, scale] = [0, 1, 2].map(|c| &self.pass.tape.data[c * n..(c + 1) * n]);
+        let [mean, root, scale] = [load(s, mean, i), load(s, root, i), load(s, scale, i)];
+        RowMoments { first: load(s, self.pass.x.channel(0), i) * scale, mean, root, scale }
     }
 
     /// `(x − mean)/deviation` of input `c`, for the rows from `i`.
     #[inline(always)]
     fn normal<S: Simd>(&self, s: S, f: RowMoments<V<S, R>>, c: usize, i: usize) -> V<S, R> {
-        ((load(s, self.x.channel(c), i) * f.scale - f.first) - f.mean) * f.root
+        ((load(s, self.pass.x.channel(c), i) * f.scale - f.first) - f.mean) * f.root
     }
 }
 
-impl<R: Real> Op for LayerNormBackward<'_, R> {
+impl<R: Real> Op for Back<'_, LayerNormStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
     fn call<S: Simd>(mut self, s: S) {
-        let (n, stage) = (self.x.rows, self.stage);
+        let (n, stage) = (self.pass.x.rows, self.stage);
         let zero = V::<S, R>::splat(s, R::ZERO);
         if stage.settings.affine {
-            let range = self.grads.range.clone();
+            let range = self.pass.grads.range.clone();
             for c in 0..stage.width {
                 if range.contains(&c) {
                     let mut sum = zero;
                     let mut i = 0;
                     while i < n {
-                        sum = self.normal(s, self.found(s, i), c, i).mul_add(load(s, self.dy.channel(c), i), sum);
+                        sum = self.normal(s, self.found(s, i), c, i).mul_add(load(s, self.pass.dy.channel(c), i), sum);
                         i += V::<S, R>::LEN;
                     }
-                    self.grads.values[c - range.start] += sum.as_slice().iter().copied().sum::<R>();
+                    self.pass.grads.values[c - range.start] += sum.as_slice().iter().copied().sum::<R>();
                 }
                 if range.contains(&(stage.width + c)) {
-                    self.grads.values[stage.width + c - range.start] += total(s, self.dy.channel(c));
+                    self.pass.grads.values[stage.width + c - range.start] += total(s, self.pass.dy.channel(c));
                 }
             }
         }
-        let Some(mut dx) = self.dx.take() else { return };
+        let Some(mut dx) = self.pass.dx.take() else { return };
         let share = V::<S, R>::splat(s, R::of(1.0 / stage.width as f64));
         let mut i = 0;
         while i < n {
@@ -186,14 +176,14 @@ impl<R: Real> Op for LayerNormBackward<'_, R> {
             let found = self.found(s, i);
             let (mut mean, mut along) = (zero, zero);
             for c in 0..stage.width {
-                let g = load(s, self.dy.channel(c), i) * stage.gamma(self.params, c);
+                let g = load(s, self.pass.dy.channel(c), i) * stage.gamma(self.pass.params, c);
                 mean += g;
                 along = g.mul_add(self.normal(s, found, c, i), along);
             }
             let (mean, along) = (mean * share, along * share);
             let back = found.root * found.scale;
             for c in 0..stage.width {
-                let g = load(s, self.dy.channel(c), i) * stage.gamma(self.params, c);
+                let g = load(s, self.pass.dy.channel(c), i) * stage.gamma(self.pass.params, c);
                 let d = (g - mean - self.normal(s, found, c, i) * along) * back;
                 store::<S, R>(d, dx.channel(c), i);
             }
@@ -207,17 +197,8 @@ impl<R: Real> Kernel<R> for LayerNormStage {
         run(Forward { stage: self, params, x, y, tape });
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        let tape = Tile::new(tape.data, tape.rows);
-        run(LayerNormBackward { stage: self, params, x, tape, dy, grads, dx });
+    fn backward(&self, pass: Backward<'_, R>) {
+        run(Back { stage: self, pass });
     }
 }
 

@@ -9,7 +9,7 @@
 //! levels are combined. Here the input is a linear map of the features, and levels stay separate. The publication's
 //! additional training target of the attention (from gradients of the attenuation, and uncertainty) is not included.
 
-use crate::passes::{Backward, Forward};
+use crate::passes::{Back, Forward};
 use conefield_core::dense::{Output as Into, WeightMatrix, affine, affine_input, affine_weights};
 use conefield_core::prelude::*;
 use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, V, load, run, store};
@@ -88,7 +88,7 @@ impl<R: Real> Op for Forward<'_, LevelAttentionStage, R> {
     fn call<S: Simd>(mut self, s: S) {
         let (stage, n) = (self.stage, self.x.rows);
         let bias = &self.params[stage.weights()..];
-        affine(s, stage.matrix(self.params), Some(bias), self.x.data, self.tape.data, n);
+        affine(stage.matrix(self.params), Some(bias), self.x.data, self.tape.data, n);
         let number = |v: f64| V::<S, R>::splat(s, R::of(v));
         let mut i = 0;
         while i < n {
@@ -116,12 +116,13 @@ impl<R: Real> Op for Forward<'_, LevelAttentionStage, R> {
     }
 }
 
-impl<R: Real> Op for Backward<'_, LevelAttentionStage, R> {
+impl<R: Real> Op for Back<'_, LevelAttentionStage, R> {
     type Number = R;
     type Out = ();
     #[inline(always)]
-    fn call<S: Simd>(mut self, s: S) {
-        let (stage, n) = (self.stage, self.x.rows);
+    fn call<S: Simd>(self, s: S) {
+        let (stage, Backward { params, x, mut tape, dy, grads, mut dx }) = (self.stage, self.pass);
+        let n = x.rows;
         let zero = V::<S, R>::splat(s, R::ZERO);
         let levels = V::<S, R>::splat(s, R::of(stage.levels as f64));
         let mut i = 0;
@@ -129,10 +130,10 @@ impl<R: Real> Op for Backward<'_, LevelAttentionStage, R> {
             // With g_l = L·Σ dy·x over the channels of level l: ∂L/∂z_l = a_l·(g_l − Σ a·g).
             let mut mean = zero;
             for (c, &l) in stage.level.iter().enumerate() {
-                let a = load(s, self.tape.channel(l), i) * levels;
-                let dy = load(s, self.dy.channel(c), i);
-                mean = (a * dy).mul_add(load(s, self.x.channel(c), i), mean);
-                if let Some(dx) = &mut self.dx {
+                let a = load(s, tape.channel(l), i) * levels;
+                let dy = load(s, dy.channel(c), i);
+                mean = (a * dy).mul_add(load(s, x.channel(c), i), mean);
+                if let Some(dx) = &mut dx {
                     store::<S, R>(a * dy, dx.channel(c), i);
                 }
             }
@@ -140,20 +141,20 @@ impl<R: Real> Op for Backward<'_, LevelAttentionStage, R> {
             for l in 0..stage.levels {
                 let mut g = zero;
                 while c < stage.width() && stage.level[c] == l {
-                    g = load(s, self.dy.channel(c), i).mul_add(load(s, self.x.channel(c), i), g);
+                    g = load(s, dy.channel(c), i).mul_add(load(s, x.channel(c), i), g);
                     c += 1;
                 }
-                let dz = load(s, self.tape.channel(l), i) * (g * levels - mean);
-                store::<S, R>(dz, self.tape.channel(l), i);
+                let dz = load(s, tape.channel(l), i) * (g * levels - mean);
+                store::<S, R>(dz, tape.channel(l), i);
             }
             i += V::<S, R>::LEN;
         }
-        debug_assert_eq!(self.grads.range, 0..self.params.len());
-        let (dw, db) = self.grads.values.split_at_mut(stage.weights());
-        let dz = &*self.tape.data;
-        affine_weights(s, dz, self.x.data, dw, stage.width(), 0, Some(db), n);
-        if let Some(dx) = self.dx {
-            affine_input(s, stage.matrix(self.params), dz, dx.data, Into::Add, n);
+        debug_assert_eq!(grads.range, 0..params.len());
+        let (dw, db) = grads.values.split_at_mut(stage.weights());
+        let dz = &*tape.data;
+        affine_weights(dz, x.data, dw, stage.width(), 0, Some(db), n);
+        if let Some(dx) = dx {
+            affine_input(stage.matrix(params), dz, dx.data, Into::Add, n);
         }
     }
 }
@@ -163,16 +164,8 @@ impl<R: Real> Kernel<R> for LevelAttentionStage {
         run(Forward { stage: self, params, x, y, tape });
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
-        run(Backward { stage: self, params, x, tape, dy, grads, dx });
+    fn backward(&self, pass: Backward<'_, R>) {
+        run(Back { stage: self, pass });
     }
 }
 

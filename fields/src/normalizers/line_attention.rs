@@ -228,7 +228,7 @@ impl<R: Real> Op for Attend<'_, '_, R> {
         let LineAttention { segment, heads, head_width: d, .. } = stage.settings;
         let reach = stage.reach;
         tape.qkv.fill(R::ZERO);
-        affine(s, matrix(&params[at.qkv], stage.width), None, tape.normed[0], tape.qkv, n);
+        affine(matrix(&params[at.qkv], stage.width), None, tape.normed[0], tape.qkv, n);
         let (queries, rest) = tape.qkv.split_at(inner * n);
         let (keys, values) = rest.split_at(inner * n);
         let position = &params[at.position];
@@ -265,7 +265,7 @@ impl<R: Real> Op for Attend<'_, '_, R> {
         }
         tape.sum.copy_from_slice(x.data);
         let (weights, bias) = (matrix(&params[at.project], inner), &params[at.project_bias]);
-        affine(s, weights, None, tape.attended, tape.sum, n);
+        affine(weights, None, tape.attended, tape.sum, n);
         for (sum, &b) in tape.sum.chunks_exact_mut(n).zip(bias) {
             sum.iter_mut().for_each(|v| *v += b);
         }
@@ -307,83 +307,42 @@ fn softmax<S: Simd, R: Real>(s: S, scores: &mut [R], segment: usize, n: usize) {
     }
 }
 
-/// Computes `y = sum + feed(normed[1])`.
-struct Feed<'a, 'b, R> {
-    stage: &'a LineAttentionStage,
-    params: &'a [R],
-    y: TileMut<'a, R>,
-    tape: &'a mut Tape<'b, R>,
-}
-
-impl<R: Real> Op for Feed<'_, '_, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let Self { stage, params, y, tape } = self;
-        let (n, [first, second, third]) = (y.rows, stage.at.feed.clone());
+impl LineAttentionStage {
+    /// Computes `y = sum + feed(normed[1])`.
+    fn feed<R: Real>(&self, params: &[R], y: TileMut<'_, R>, tape: &mut Tape<'_, R>) {
+        let (n, [first, second, third]) = (y.rows, self.at.feed.clone());
         let ([h0, h1], [s0, s1]) = (&mut tape.hidden, &mut tape.slope);
         s0.fill(R::ZERO);
-        affine(s, matrix(&params[first], stage.width), None, tape.normed[1], s0, n);
-        activate(s, Activation::Gelu, s0, h0);
+        affine(matrix(&params[first], self.width), None, tape.normed[1], s0, n);
+        activate(Activation::Gelu, s0, h0);
         s1.fill(R::ZERO);
-        affine(s, matrix(&params[second], stage.hidden), None, h0, s1, n);
-        activate(s, Activation::Gelu, s1, h1);
+        affine(matrix(&params[second], self.hidden), None, h0, s1, n);
+        activate(Activation::Gelu, s1, h1);
         y.data.copy_from_slice(tape.sum);
-        affine(s, matrix(&params[third], stage.hidden), None, h1, y.data, n);
+        affine(matrix(&params[third], self.hidden), None, h1, y.data, n);
     }
-}
 
-/// Backward pass of the feed-forward part: `∂L` of `normed[1]` from `dy`.
-struct FeedBack<'a, 'b, R> {
-    stage: &'a LineAttentionStage,
-    params: &'a [R],
-    dy: Tile<'a, R>,
-    grads: &'a mut [R],
-    tape: &'a mut Tape<'b, R>,
-}
-
-impl<R: Real> Op for FeedBack<'_, '_, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let Self { stage, params, dy, grads, tape } = self;
-        let (n, [first, second, third]) = (dy.rows, stage.at.feed.clone());
-        let (f, h) = (stage.width, stage.hidden);
+    /// Backward pass of the feed-forward part: `∂L` of `normed[1]` from `dy`.
+    fn feed_back<R: Real>(&self, params: &[R], dy: Tile<'_, R>, grads: &mut [R], tape: &mut Tape<'_, R>) {
+        let (n, [first, second, third]) = (dy.rows, self.at.feed.clone());
+        let (f, h) = (self.width, self.hidden);
         let ([h0, h1], [s0, s1]) = (&tape.hidden, &mut tape.slope);
-        affine_weights(s, dy.data, h1, &mut grads[third.clone()], h, 0, None, n);
-        affine_input(s, matrix(&params[third], h), dy.data, s1, Into::Multiply, n);
-        affine_weights(s, s1, h0, &mut grads[second.clone()], h, 0, None, n);
-        affine_input(s, matrix(&params[second], h), s1, s0, Into::Multiply, n);
-        affine_weights(s, s0, tape.normed[1], &mut grads[first.clone()], f, 0, None, n);
-        affine_input(s, matrix(&params[first], f), s0, tape.normed[1], Into::Set, n);
+        affine_weights(dy.data, h1, &mut grads[third.clone()], h, 0, None, n);
+        affine_input(matrix(&params[third], h), dy.data, s1, Into::Multiply, n);
+        affine_weights(s1, h0, &mut grads[second.clone()], h, 0, None, n);
+        affine_input(matrix(&params[second], h), s1, s0, Into::Multiply, n);
+        affine_weights(s0, tape.normed[1], &mut grads[first.clone()], f, 0, None, n);
+        affine_input(matrix(&params[first], f), s0, tape.normed[1], Into::Set, n);
     }
-}
 
-/// Backward pass of attention: `∂L` of `normed[0]` from `d_sum`.
-struct AttendBack<'a, 'b, R> {
-    stage: &'a LineAttentionStage,
-    params: &'a [R],
-    rows: usize,
-    grads: &'a mut [R],
-    tape: &'a mut Tape<'b, R>,
-}
-
-impl<R: Real> Op for AttendBack<'_, '_, R> {
-    type Number = R;
-    type Out = ();
-    #[inline(always)]
-    fn call<S: Simd>(self, s: S) {
-        let Self { stage, params, rows: n, grads, tape } = self;
-        let (at, inner) = (stage.at.clone(), stage.inner());
-        let LineAttention { segment, heads, head_width: d, .. } = stage.settings;
-        let reach = stage.reach;
-        affine_weights(s, tape.d_sum, tape.attended, &mut grads[at.project.clone()], inner, 0, None, n);
-        for (sum, d) in grads[at.project_bias].iter_mut().zip(tape.d_sum.chunks_exact(n)) {
-            *sum += conefield_core::dense::total(s, d);
-        }
-        affine_input(s, matrix(&params[at.project], inner), tape.d_sum, tape.attended, Into::Set, n);
+    /// Backward pass of attention: `∂L` of `normed[0]` from `d_sum`.
+    fn attend_back<R: Real>(&self, params: &[R], n: usize, grads: &mut [R], tape: &mut Tape<'_, R>) {
+        let (at, inner) = (self.at.clone(), self.inner());
+        let LineAttention { segment, heads, head_width: d, .. } = self.settings;
+        let reach = self.reach;
+        let (dw, db) = grads[at.project.start..at.project_bias.end].split_at_mut(at.project.len());
+        affine_weights(tape.d_sum, tape.attended, dw, inner, 0, Some(db), n);
+        affine_input(matrix(&params[at.project], inner), tape.d_sum, tape.attended, Into::Set, n);
         let (d_attended, position) = (&*tape.attended, &mut grads[at.position]);
         let (queries, rest) = tape.qkv.split_at(inner * n);
         let (keys, values) = rest.split_at(inner * n);
@@ -420,8 +379,8 @@ impl<R: Real> Op for AttendBack<'_, '_, R> {
                 }
             }
         }
-        affine_weights(s, tape.d_qkv, tape.normed[0], &mut grads[at.qkv.clone()], stage.width, 0, None, n);
-        affine_input(s, matrix(&params[at.qkv], stage.width), tape.d_qkv, tape.normed[0], Into::Set, n);
+        affine_weights(tape.d_qkv, tape.normed[0], &mut grads[at.qkv.clone()], self.width, 0, None, n);
+        affine_input(matrix(&params[at.qkv], self.width), tape.d_qkv, tape.normed[0], Into::Set, n);
     }
 }
 
@@ -436,38 +395,36 @@ impl<R: Real> Kernel<R> for LineAttentionStage {
         let Tape { norm, normed, sum, .. } = &mut tape;
         let tiles = (TileMut::new(normed[1], n), TileMut::new(norm[1], n));
         self.norm.forward(&params[second], Tile::new(sum, n), tiles.0, tiles.1);
-        run(Feed { stage: self, params, y, tape: &mut tape });
+        self.feed(params, y, &mut tape);
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, tape, dy, grads, mut dx }: Backward<'_, R>) {
         debug_assert_eq!(grads.range, 0..params.len());
         let (n, [first, second], grads) = (x.rows, self.at.norms.clone(), grads.values);
         let mut tape = Tape::of(self, tape);
-        run(FeedBack { stage: self, params, dy, grads, tape: &mut tape });
+        self.feed_back(params, dy, grads, &mut tape);
         let Tape { norm, normed, sum, d_sum, .. } = &mut tape;
-        let of = Grads::all(&mut grads[second.clone()]);
-        let (z, kept) = (Tile::new(sum, n), TileMut::new(norm[1], n));
-        let d = Some(TileMut::new(d_sum, n));
-        self.norm.backward(&params[second], z, kept, Tile::new(normed[1], n), of, d);
+        self.norm.backward(Backward {
+            params: &params[second.clone()],
+            x: Tile::new(sum, n),
+            tape: TileMut::new(norm[1], n),
+            dy: Tile::new(normed[1], n),
+            grads: Grads::all(&mut grads[second]),
+            dx: Some(TileMut::new(d_sum, n)),
+        });
         add(d_sum, dy.data);
-        run(AttendBack { stage: self, params, rows: n, grads, tape: &mut tape });
+        self.attend_back(params, n, grads, &mut tape);
         let Tape { norm, normed, d_sum, .. } = &mut tape;
-        let of = Grads::all(&mut grads[first.clone()]);
-        let (kept, d) = (TileMut::new(norm[0], n), Tile::new(normed[0], n));
-        match dx {
-            Some(dx) => {
-                self.norm.backward(&params[first], x, kept, d, of, Some(TileMut::new(dx.data, n)));
-                add(dx.data, d_sum);
-            }
-            None => self.norm.backward(&params[first], x, kept, d, of, None),
+        self.norm.backward(Backward {
+            params: &params[first.clone()],
+            x,
+            tape: TileMut::new(norm[0], n),
+            dy: Tile::new(normed[0], n),
+            grads: Grads::all(&mut grads[first]),
+            dx: dx.as_mut().map(|dx| TileMut::new(dx.data, n)),
+        });
+        if let Some(dx) = dx {
+            add(dx.data, d_sum);
         }
     }
 
@@ -675,5 +632,7 @@ mod tests {
             let error = LineAttentionStage::new(&settings, 4).unwrap_err().to_string();
             assert!(error.contains(name), "{error}");
         }
+        let error = LineAttentionStage::new(&LineAttention::default(), 4).unwrap().keep_inputs(&[]).err().unwrap();
+        assert!(error.to_string().contains("none kept"), "{error}");
     }
 }

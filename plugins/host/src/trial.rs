@@ -164,9 +164,14 @@ fn tile(ty: &Type, stage: &dyn Stage, params: &mut Guarded<f32>, rows: usize) ->
     }
     let dy = vec![1.0; info.output * rows];
     let mut grads = Guarded::zeroed(range.len());
-    let (into, to) = (Grads { values: grads.inner(), range }, TileMut::new(dx.inner(), rows));
-    let (from, left) = (Tile::new(x.inner(), rows), TileMut::new(tape.inner(), rows));
-    kernel.backward(params.inner(), from, left, Tile::new(&dy, rows), into, Some(to));
+    kernel.backward(Backward {
+        params: params.inner(),
+        x: Tile::new(x.inner(), rows),
+        tape: TileMut::new(tape.inner(), rows),
+        dy: Tile::new(&dy, rows),
+        grads: Grads { values: grads.inner(), range },
+        dx: Some(TileMut::new(dx.inner(), rows)),
+    });
     stage.fault()?;
     settled(ty, grads.broken("gradients").or_else(|| dx.broken("input gradient")))?;
     settled(ty, tape.broken("tape").or_else(|| x.broken("input")).or_else(|| params.broken("parameters")))?;

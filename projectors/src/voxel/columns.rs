@@ -5,7 +5,7 @@
 //! of rows at a time. The adjoint goes the same way back: every voxel of a line gathers from the rows that are less
 //! than a voxel away, with the same hat-shaped weights.
 
-use super::layout::{ColumnMajor, ViewColumns, batch, column_major_bytes, main_axis, to_voxels};
+use super::layout::{ColumnMajor, batch, column_major_bytes, main_axis, to_voxels};
 use super::readers::{Among, Ends, PAD, Path, Stands, mix, places, read, read_on};
 use conefield_core::geometry::{Geometry, Vec3, dot, sub};
 use conefield_core::parallel;
@@ -420,9 +420,10 @@ pub fn adjoint<R: Real>(
         let images = projections.slice_axis(Axis(0), part.into());
         let mut pixels = ColumnMajor::new(geometry, &numbers, images);
         // The nonzero rows of each column: zeros, as the residual of air in an empty volume, are not gathered.
-        let of_view = |_, (mut view, (_, columns)): (ViewColumns<'_, R>, &(usize, &[Column]))| -> Vec<Range<usize>> {
+        let of_view = |_, (view, (_, columns)): (&mut [R], &(usize, &[Column]))| -> Vec<Range<usize>> {
             let rows = |c: &Column| {
-                let pixels = view.rows(c.number, c.rows.clone());
+                let start = c.number * (geometry.detector[0] + 2 * PAD) + PAD;
+                let pixels = &mut view[start + c.rows.start..start + c.rows.end];
                 run(Lengthen(c, pixels));
                 let found = occupied(pixels);
                 c.rows.start + found.start..c.rows.start + found.end

@@ -6,7 +6,6 @@ use conefield_core::parallel;
 use conefield_core::simd::Real;
 use conefield_core::voxel::VoxelView;
 use ndarray::{ArrayView3, Axis};
-use std::ops::Range;
 
 /// A world position in voxel coordinates: integers are voxel centres.
 pub fn to_voxels(grid: &VoxelGrid, p: Vec3) -> Vec3 {
@@ -66,10 +65,9 @@ impl<R: Real> ColumnMajor<R> {
         &self.data[at..at + stride]
     }
 
-    /// Mutable access to every view.
-    pub fn views_mut(&mut self) -> impl Iterator<Item = ViewColumns<'_, R>> {
-        let (rows, stride) = (self.rows, self.rows + 2 * PAD);
-        self.data.chunks_mut((self.columns * stride).max(1)).map(move |data| ViewColumns { data, rows })
+    /// The numbers of every view, column by column, each with its padding.
+    pub fn views_mut(&mut self) -> impl Iterator<Item = &mut [R]> {
+        self.data.chunks_mut((self.columns * (self.rows + 2 * PAD)).max(1))
     }
 
     /// Whether the first row of a view's projections is its highest.
@@ -85,20 +83,6 @@ impl<R: Real> ColumnMajor<R> {
         }
         let from_below = if self.downwards[view] { self.rows - 1 - row } else { row };
         self.column(view, column)[PAD + from_below]
-    }
-}
-
-/// Mutable access to the columns of a view.
-pub struct ViewColumns<'a, R> {
-    data: &'a mut [R],
-    rows: usize,
-}
-
-impl<R> ViewColumns<'_, R> {
-    /// Some rows of a column, from below.
-    pub fn rows(&mut self, column: usize, rows: Range<usize>) -> &mut [R] {
-        let start = column * (self.rows + 2 * PAD) + PAD;
-        &mut self.data[start + rows.start..start + rows.end]
     }
 }
 

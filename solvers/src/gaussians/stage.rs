@@ -13,7 +13,7 @@ use conefield_core::geometry::{Vec3, cross, dot, norm, sub};
 use conefield_core::parallel;
 use conefield_core::simd::Real;
 use conefield_core::stage::{
-    Field, GradKind, Grads, Info, Kernel, Lines, OnDevice, OnGrid, Parameter, Scope, Stage, Tile, TileMut, UnitGrid,
+    Backward, Field, GradKind, Info, Kernel, Lines, OnDevice, OnGrid, Parameter, Scope, Stage, Tile, TileMut, UnitGrid,
     UnitRay,
 };
 use std::f64::consts::TAU;
@@ -96,15 +96,7 @@ impl<R: Real> Kernel<R> for Mixture {
     }
 
     /// Never called: the method differentiates whole views and grids, and backends refuse its steps.
-    fn backward(
-        &self,
-        _: &[R],
-        _: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        _: Tile<'_, R>,
-        _: Grads<'_, R>,
-        _: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, _: Backward<'_, R>) {
         unreachable!("a mixture of Gaussians is trained by its method")
     }
 }

@@ -3,7 +3,7 @@
 use crate::call::{Before, Guarded, Loaded, Subject, differing, error, rows_of, settle, within};
 use crate::{Options, Outcome};
 use conefield_core::arena::{Block, Layout, Weights};
-use conefield_core::stage::{GradKind, Grads, Tile, TileMut};
+use conefield_core::stage::{Backward, GradKind, Grads, Tile, TileMut};
 use std::collections::BTreeSet;
 
 /// Rows of the tile that is split into others; more than a host uses, and not a multiple of anything.
@@ -218,14 +218,14 @@ pub fn guards(of: &Subject<'_>) -> Outcome {
             let [mut grads, mut dx] = [range.len(), s.info.input * n].map(|len| Guarded::new(len, 0.0));
             let (to, left) = (TileMut::new(y.inner(), n), TileMut::new(tape.inner(), n));
             s.kernel.forward(&s.params, Tile::new(&x, n), to, left);
-            s.kernel.backward(
-                &s.params,
-                Tile::new(&x, n),
-                TileMut::new(tape.inner(), n),
-                Tile::new(&dy, n),
-                Grads { values: grads.inner(), range },
-                Some(TileMut::new(dx.inner(), n)),
-            );
+            s.kernel.backward(Backward {
+                params: &s.params,
+                x: Tile::new(&x, n),
+                tape: TileMut::new(tape.inner(), n),
+                dy: Tile::new(&dy, n),
+                grads: Grads { values: grads.inner(), range },
+                dx: Some(TileMut::new(dx.inner(), n)),
+            });
             let complaint = y
                 .broken("output")
                 .or_else(|| tape.broken("tape"))

@@ -4,7 +4,7 @@ use crate::{Options, Outcome};
 use conefield_core::error::Result;
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
-use conefield_core::stage::{Grads, Info, Kernel, Stage, Tile, TileMut};
+use conefield_core::stage::{Backward, Grads, Info, Kernel, Stage, Tile, TileMut};
 use rayon::ThreadPoolBuilder;
 use std::ops::Range;
 use std::sync::OnceLock;
@@ -175,14 +175,14 @@ impl<'a, R: Real> Loaded<'a, R> {
         tape.inner().copy_from_slice(&left);
         let mut grads = Guarded::new(range.len(), before.grads);
         let mut dx = before.dx.map(|v| Guarded::new(self.info.input * rows, v));
-        self.kernel.backward(
-            &self.params,
-            Tile::new(x, rows),
-            TileMut::new(tape.inner(), rows),
-            Tile::new(dy, rows),
-            Grads { values: grads.inner(), range },
-            dx.as_mut().map(|dx| TileMut::new(dx.inner(), rows)),
-        );
+        self.kernel.backward(Backward {
+            params: &self.params,
+            x: Tile::new(x, rows),
+            tape: TileMut::new(tape.inner(), rows),
+            dy: Tile::new(dy, rows),
+            grads: Grads { values: grads.inner(), range },
+            dx: dx.as_mut().map(|dx| TileMut::new(dx.inner(), rows)),
+        });
         [y, grads.into_inner(), dx.map(Guarded::into_inner).unwrap_or_default()]
     }
 

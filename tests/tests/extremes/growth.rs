@@ -11,7 +11,7 @@ use conefield_core::random::{mix, unit};
 use conefield_core::scene::{Scene, SceneSettings};
 use conefield_core::settings::{EncoderSpec, FieldSpec, NormalizerSpec};
 use conefield_core::simd::Real;
-use conefield_core::stage::{Grads, Kernel, Stage, Tile, TileMut};
+use conefield_core::stage::{Backward, Grads, Kernel, Stage, Tile, TileMut};
 use conefield_evaluation::report::{CurveOptions, curves_png};
 use conefield_solvers::losses::L2;
 use serde_json::{Value, json};
@@ -73,8 +73,8 @@ impl<'a> Pair<'a> {
         let (mut g, mut dx) = (zeros(info.params), zeros(info.input * n));
         kernel.forward(&p, Tile::new(&x, n), TileMut::new(&mut y, n), TileMut::new(&mut tape, n));
         let grads = Grads { values: &mut g, range: 0..info.params };
-        let (tape, into) = (TileMut::new(&mut tape, n), Some(TileMut::new(&mut dx, n)));
-        kernel.backward(&p, Tile::new(&x, n), tape, Tile::new(&dy, n), grads, into);
+        let (tape, to) = (TileMut::new(&mut tape, n), Some(TileMut::new(&mut dx, n)));
+        kernel.backward(Backward { params: &p, x: Tile::new(&x, n), tape, dy: Tile::new(&dy, n), grads, dx: to });
         [y, g, dx]
     }
 }

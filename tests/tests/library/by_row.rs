@@ -90,14 +90,14 @@ fn many_parameters_are_scattered() {
     assert_eq!(products(3, 5).info().grads, GradKind::Dense);
     let (small, mut grads) = (products(3, 5), [7.0f32; 2]);
     let (params, x, dy) = ([1.0f32; 6], [1.0f32, 2.0, 3.0], [1.0f32; 5]);
-    small.backward(
-        &params,
-        Tile::new(&x, 1),
-        TileMut::new(&mut [], 1),
-        Tile::new(&dy, 1),
-        Grads { values: &mut grads, range: 1..3 },
-        None,
-    );
+    small.backward(Backward {
+        params: &params,
+        x: Tile::new(&x, 1),
+        tape: TileMut::new(&mut [], 1),
+        dy: Tile::new(&dy, 1),
+        grads: Grads { values: &mut grads, range: 1..3 },
+        dx: None,
+    });
     let want = [7.0 + 2.0f32.sin() * 3.0, 7.0 + 3.0f32.sin() * 1.0];
     assert_eq!(grads, want);
 }

@@ -3,10 +3,9 @@
 //! Rows are convolved in space. Their number of multiply-adds is far below that of the back-projection, and no size of
 //! row is special.
 
-use super::launch::{Room, Task, each};
+use super::launch::{Room, Task};
 use super::{Array, parts, plane};
-use crate::Shared;
-use conefield_core::device::{Access, Source};
+use conefield_core::device::Access;
 use conefield_core::error::Result;
 use conefield_core::parallel;
 use conefield_core::place::FilteredViews;
@@ -54,38 +53,30 @@ impl SeenView {
 }
 
 /// The kernels: weights of pixels; rows convolved, with rows and columns exchanged; voxels.
-fn kernels() -> [Source; 3] {
-    let begun = || {
-        let mut source = Source::default();
-        source.add("structures", include_str!("../kernels/back.wgsl"));
-        source.bind("back", Access::Uniform, "Back");
-        source
-    };
-    let [mut weights, mut convolve, mut voxels] = [begun(), begun(), begun()];
-    weights.bind("rows", Access::Read, "array<RowWeights>");
-    weights.bind("counts", Access::Read, "array<f32>");
-    weights.bind("images", Access::Write, "array<f32>");
-    weights.add("weights", &each("back", include_str!("../kernels/row_weights.wgsl")));
-    convolve.bind("taps", Access::Read, "array<f32>");
-    convolve.bind("images", Access::Read, "array<f32>");
-    convolve.bind("padded", Access::Write, "array<f32>");
-    convolve.add("ramp", include_str!("../kernels/ramp.wgsl"));
-    voxels.bind("seen_views", Access::Uniform, &format!("array<SeenView, {VIEWS}>"));
-    voxels.bind("padded", Access::Read, "array<f32>");
-    voxels.bind("volume", Access::Write, "array<f32>");
-    voxels.add("back-projection", include_str!("../kernels/backproject.wgsl"));
-    [weights, convolve, voxels]
+fn tasks() -> [Task<'static>; 3] {
+    let task = |label| Task::new(label, include_str!("../kernels/back.wgsl"), "back", "Back");
+    let weights = task("weights of rows").bind("rows", Access::Read, "RowWeights").bind("counts", Access::Read, "f32");
+    let convolve = task("ramp filter").bind("taps", Access::Read, "f32").bind("images", Access::Read, "f32");
+    let voxels = task("back-projection").uniform("seen_views", &format!("array<SeenView, {VIEWS}>"));
+    [
+        weights.bind("images", Access::Write, "f32").each(include_str!("../kernels/row_weights.wgsl")),
+        convolve.bind("padded", Access::Write, "f32").add("ramp", include_str!("../kernels/ramp.wgsl")),
+        voxels
+            .bind("padded", Access::Read, "f32")
+            .bind("volume", Access::Write, "f32")
+            .add("back-projection", include_str!("../kernels/backproject.wgsl")),
+    ]
 }
 
 /// [`conefield_core::place::Place::filtered`].
 pub(super) fn backproject(
-    shared: &Shared,
     room: &mut Room,
     work: &dyn FilteredViews,
     (views, images): (&[usize], &Array),
     (slab, first): (&mut Array, usize),
 ) -> Result<()> {
-    let [weights, convolve, voxels] = kernels();
+    let [weights, convolve, voxels] = tasks();
+    let shared = room.shared.clone();
     let gpu = &shared.gpu;
     let [_, rows, columns] = images.shape();
     let shape = slab.shape();
@@ -95,7 +86,7 @@ pub(super) fn backproject(
         return Err(gpu.error(format!("a view takes {bytes} bytes, a buffer holds {most}")));
     }
     let chunk = ((PADDED_BYTES.min(most) / bytes) as usize).clamp(1, VIEWS);
-    room.write(gpu, "taps", &work.taps())?;
+    room.write("taps", &work.taps())?;
     // A uniform buffer is bound as a whole.
     room.buffers.reserve(gpu, "seen_views", (VIEWS * size_of::<SeenView>()) as u64, U::UNIFORM | U::COPY_DST)?;
     for part in parts(images) {
@@ -104,11 +95,11 @@ pub(super) fn backproject(
             let all = parallel::map(some, |_, &v| work.weights(v));
             let wide = |x: [f64; 3]| [x[0] as f32, x[1] as f32, x[2] as f32, 0.0];
             let data: Vec<[[f32; 4]; 4]> = all.iter().map(|w| [w.corner, w.u, w.v, w.normal].map(wide)).collect();
-            room.write(gpu, "rows", &data)?;
-            room.write(gpu, "counts", &all.iter().flat_map(|w| w.columns.iter().copied()).collect::<Vec<f32>>())?;
+            room.write("rows", &data)?;
+            room.write("counts", &all.iter().flat_map(|w| w.columns.iter().copied()).collect::<Vec<f32>>())?;
             room.buffers.reserve(gpu, "padded", some.len() as u64 * bytes, super::ARRAY)?;
             let seen: Vec<SeenView> = some.iter().map(|&v| SeenView::of(&work.seen(v))).collect();
-            room.write(gpu, "seen_views", &seen)?;
+            room.write("seen_views", &seen)?;
             let whole = Back {
                 shape: shape.map(|n| n as u32),
                 views: some.len() as u32,
@@ -119,17 +110,14 @@ pub(super) fn backproject(
             };
             let uniform = |begin, end| Back { begin, end, ..whole };
             let of_images = [("images", &part.buffer)];
-            let task = Task { label: "weights of rows", source: &weights, bind: &of_images };
-            room.run(shared, task, ("back", uniform), (some.len() * rows * columns) as u32)?;
-            let task = Task { label: "ramp filter", source: &convolve, bind: &of_images };
+            room.run(&weights, &of_images, uniform, (some.len() * rows * columns) as u32)?;
             // Four rows and 64 columns per group, and a column of zeros on each side.
             let tiles = some.len() * (rows + 2).div_ceil(4) * (columns + 2).div_ceil(64);
-            room.run(shared, task, ("back", uniform), (64 * tiles) as u32)?;
+            room.run(&convolve, &of_images, uniform, (64 * tiles) as u32)?;
             for held in parts(slab) {
                 let uniform = |begin, end| Back { begin, end, held: (first + held.planes.start) as u32, ..whole };
                 let bind = [("volume", &held.buffer)];
-                let task = Task { label: "back-projection", source: &voxels, bind: &bind };
-                room.run(shared, task, ("back", uniform), (held.planes.len() * plane(shape)) as u32)?;
+                room.run(&voxels, &bind, uniform, (held.planes.len() * plane(shape)) as u32)?;
             }
         }
     }

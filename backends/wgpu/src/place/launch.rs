@@ -1,14 +1,15 @@
 //! Launches of kernels on the arrays of a place.
 
+use super::{Array, Chunk, Mask, parts};
 use crate::Shared;
 use crate::compose::GROUP;
-use crate::device::Gpu;
 use crate::kernel::Buffers;
 use crate::pace::Pace;
 use crate::wave::MOST_GROUPS;
 use conefield_core::device::{Access, Source};
 use conefield_core::error::Result;
 use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
 use std::time::Instant;
 use wgpu::BufferUsages as U;
 
@@ -24,30 +25,77 @@ const AHEAD: usize = 2;
 const SUMMED: u32 = 4096;
 const SUMS: u32 = 4096;
 
-/// A kernel that runs `body` for each i of a launch, from `begin` to `end` of the uniform buffer `launch`.
-pub(super) fn each(launch: &str, body: &str) -> String {
-    include_str!("../kernels/each.wgsl").replace("LAUNCH", launch).replace("BODY", body)
-}
-
-/// A kernel that adds up the pairs `v` that `body` computes for each i of a launch, or finds the largest, and writes a
-/// pair per group into `sums`.
-pub(super) fn summing(source: &mut Source, launch: &str, body: &str, largest: bool) {
-    source.bind("sums", Access::Write, "array<vec2<f32>>");
-    let [add, merge] = if largest {
-        ["    total = max(total, v);", "partial[lane] = max(partial[lane], partial[lane + half]);"]
-    } else {
-        [include_str!("../kernels/add.wgsl"), "partial[lane] += partial[lane + half];"]
-    };
-    let text = include_str!("../kernels/summing.wgsl").replace("LAUNCH", launch).replace("BODY", body);
-    source.add("sums", &text.replace("ADD", add).replace("MERGE", merge));
-}
-
-/// A kernel with its name for messages.
+/// A kernel, and arrays among its buffers.
 pub(super) struct Task<'a> {
-    pub(super) label: &'a str,
-    pub(super) source: &'a Source,
-    /// Its storage buffers by name.
-    pub(super) bind: &'a [(&'a str, &'a wgpu::Buffer)],
+    /// Its name for messages.
+    label: &'a str,
+    pub(super) source: Source,
+    /// The uniform buffer that says where a launch begins and ends.
+    uniform: &'a str,
+    /// Arrays by the names of their parts in the kernel.
+    arrays: Vec<(&'a str, &'a [Chunk])>,
+}
+
+impl<'a> Task<'a> {
+    /// Begins with the structures `text` and the uniform buffer `uniform`, of type `ty`.
+    pub(super) fn new(label: &'a str, text: &str, uniform: &'a str, ty: &str) -> Self {
+        let task = Self { label, source: Source::default(), uniform, arrays: vec![] };
+        task.add(uniform, text).uniform(uniform, ty)
+    }
+
+    /// Declares a uniform buffer of WGSL type `ty`.
+    pub(super) fn uniform(mut self, name: &str, ty: &str) -> Self {
+        self.source.bind(name, Access::Uniform, ty);
+        self
+    }
+
+    /// Declares a storage buffer with elements of WGSL type `ty`.
+    pub(super) fn bind(mut self, name: &str, access: Access, ty: &str) -> Self {
+        self.source.bind(name, access, &format!("array<{ty}>"));
+        self
+    }
+
+    /// Declares a storage buffer of `f32`, and that it is a part of `x`.
+    pub(super) fn with(mut self, name: &'a str, access: Access, x: &'a Array) -> Self {
+        self.arrays.push((name, parts(x)));
+        self.bind(name, access, "f32")
+    }
+
+    /// The same for the flags of a mask.
+    pub(super) fn masked(mut self, name: &'a str, mask: &'a Mask) -> Self {
+        self.arrays.push((name, parts(mask)));
+        self.bind(name, Access::Read, "u32")
+    }
+
+    /// Appends a piece of text.
+    pub(super) fn add(mut self, name: &str, text: &str) -> Self {
+        self.source.add(name, text);
+        self
+    }
+
+    /// Runs `body` for each i of a launch, from `begin` to `end` of the uniform buffer.
+    pub(super) fn each(self, body: &str) -> Self {
+        let text = include_str!("../kernels/each.wgsl").replace("LAUNCH", self.uniform).replace("BODY", body);
+        let label = self.label;
+        self.add(label, &text)
+    }
+
+    /// Adds up the pairs `v` that `body` computes for each i of a launch, or finds the largest, and writes a pair per group
+    /// into `sums`.
+    pub(super) fn summing(self, body: &str, largest: bool) -> Self {
+        let [add, merge] = if largest {
+            ["    total = max(total, v);", "partial[lane] = max(partial[lane], partial[lane + half]);"]
+        } else {
+            [include_str!("../kernels/add.wgsl"), "partial[lane] += partial[lane + half];"]
+        };
+        let text = include_str!("../kernels/summing.wgsl").replace("LAUNCH", self.uniform).replace("BODY", body);
+        self.bind("sums", Access::Write, "vec2<f32>").add("sums", &text.replace("ADD", add).replace("MERGE", merge))
+    }
+
+    /// The buffers of the arrays' k-th parts.
+    pub(super) fn parts(&self, k: usize) -> Vec<(&'a str, &'a wgpu::Buffer)> {
+        self.arrays.iter().filter_map(|(name, parts)| Some((*name, &parts.get(k)?.buffer))).collect()
+    }
 }
 
 /// A batch of launches on the device.
@@ -61,6 +109,7 @@ struct Batch {
 
 /// Buffers that launches share, and the size of launches.
 pub(super) struct Room {
+    pub(super) shared: Arc<Shared>,
     pub(super) buffers: Buffers,
     paces: HashMap<String, Pace>,
     batches: VecDeque<Batch>,
@@ -68,41 +117,41 @@ pub(super) struct Room {
 }
 
 impl Room {
-    pub(super) fn new() -> Self {
-        Self { buffers: Buffers::default(), paces: HashMap::new(), batches: VecDeque::new(), finished: None }
+    pub(super) fn new(shared: Arc<Shared>) -> Self {
+        let (buffers, paces, batches) = Default::default();
+        Self { shared, buffers, paces, batches, finished: None }
     }
 
     /// Runs `task` over `0..count` in launches; `uniform` returns the buffer that says where a launch begins and ends.
-    /// Does not wait for the device.
+    /// `bind` are its arrays; the other buffers are the room's. Does not wait for the device.
     pub(super) fn run<T: bytemuck::Pod>(
         &mut self,
-        shared: &Shared,
-        task: Task<'_>,
-        (name, uniform): (&str, impl Fn(u32, u32) -> T),
+        task: &Task<'_>,
+        bind: &[(&str, &wgpu::Buffer)],
+        uniform: impl Fn(u32, u32) -> T,
         count: u32,
     ) -> Result<()> {
-        let first = FIRST[usize::from(!shared.gpu.adapter.software)];
+        let first = FIRST[usize::from(!self.shared.gpu.adapter.software)];
         let size = self.paces.entry(task.label.into()).or_insert_with(|| Pace::new(first, LEAST, MOST)).size();
         let parts = (0..count).step_by(size as usize).map(|at| (at, count.min(at.saturating_add(size))));
         let parts: Vec<_> = parts.map(|(at, end)| (uniform(at, end), (end - at).div_ceil(GROUP))).collect();
-        self.launch(shared, task, name, &parts, count.min(size))
+        self.launch(task, bind, &parts, count.min(size))
     }
 
-    /// Runs `task`, made by [`summing`], over `0..count`. Returns the two sums, or the largest pair.
+    /// Runs `task`, made by [`Task::summing`], over `0..count`. Returns the two sums, or the largest pair.
     pub(super) fn sum<T: bytemuck::Pod>(
         &mut self,
-        shared: &Shared,
-        task: Task<'_>,
-        (name, uniform): (&str, impl Fn(u32, u32) -> T),
+        task: &Task<'_>,
+        bind: &[(&str, &wgpu::Buffer)],
+        uniform: impl Fn(u32, u32) -> T,
         count: u32,
         largest: bool,
     ) -> Result<[f64; 2]> {
         let groups = count.div_ceil(SUMMED).clamp(1, SUMS);
-        let sums = self.buffers.of(&shared.gpu, "sums", 8 * u64::from(groups), ARRAY)?;
-        let bind: Vec<_> = task.bind.iter().copied().chain([("sums", &sums)]).collect();
-        self.launch(shared, Task { bind: &bind, ..task }, name, &[(uniform(0, count), groups)], 0)?;
+        let sums = self.buffers.of(&self.shared.gpu, "sums", 8 * u64::from(groups), ARRAY)?;
+        self.launch(task, bind, &[(uniform(0, count), groups)], 0)?;
         let mut total = [0.0f64; 2];
-        self.read(&shared.gpu, &sums, 0, 2 * groups as usize, |found| {
+        self.read(&sums, 0, 2 * groups as usize, |found| {
             for pair in found.chunks_exact(2) {
                 let merge = |k: usize| {
                     let (a, b) = (total[k], f64::from(pair[k]));
@@ -116,18 +165,17 @@ impl Room {
 
     fn launch<T: bytemuck::Pod>(
         &mut self,
-        shared: &Shared,
-        Task { label, source, bind }: Task<'_>,
-        uniform: &str,
+        Task { label, source, uniform, .. }: &Task<'_>,
+        bind: &[(&str, &wgpu::Buffer)],
         parts: &[(T, u32)],
         largest: u32,
     ) -> Result<()> {
-        let gpu = &shared.gpu;
         while self.batches.len() >= AHEAD {
-            self.finish_one(gpu)?;
+            self.finish_one()?;
         }
+        let Shared { gpu, kernels, .. } = &*self.shared;
         let values = self.buffers.of(gpu, uniform, size_of::<T>() as u64, U::UNIFORM | U::COPY_DST)?;
-        let kernel = shared.kernels.get(gpu, label, source)?;
+        let kernel = kernels.get(gpu, label, source)?;
         let find = |name: &str| {
             let given = bind.iter().find(|(n, _)| *n == name).map(|(_, buffer)| *buffer);
             given.or_else(|| self.buffers.get(name))
@@ -143,15 +191,15 @@ impl Room {
             last = Some(gpu.submit(encoder));
         }
         if let Some(index) = last {
-            self.batches.push_back(Batch { label: label.into(), index, submitted, launches: parts.len(), largest });
+            self.batches.push_back(Batch { label: (*label).into(), index, submitted, launches: parts.len(), largest });
         }
         Ok(())
     }
 
     /// Waits for the oldest batch, and adapts the size of such launches.
-    fn finish_one(&mut self, gpu: &Gpu) -> Result<()> {
+    fn finish_one(&mut self) -> Result<()> {
         let Some(batch) = self.batches.pop_front() else { return Ok(()) };
-        gpu.wait_for(batch.index)?;
+        self.shared.gpu.wait_for(batch.index)?;
         let now = Instant::now();
         let begun = self.finished.map_or(batch.submitted, |finished| finished.max(batch.submitted));
         self.finished = Some(now);
@@ -162,29 +210,29 @@ impl Room {
     }
 
     /// Overwrites the first numbers of the room's buffer `name`.
-    pub(super) fn write<T: bytemuck::Pod>(&mut self, gpu: &Gpu, name: &str, data: &[T]) -> Result<()> {
-        let buffer = self.buffers.of(gpu, name, size_of_val(data) as u64, ARRAY)?;
-        gpu.write(&buffer, 0, bytemuck::cast_slice(data));
+    pub(super) fn write<T: bytemuck::Pod>(&mut self, name: &str, data: &[T]) -> Result<()> {
+        let buffer = self.buffers.of(&self.shared.gpu, name, size_of_val(data) as u64, ARRAY)?;
+        self.shared.gpu.write(&buffer, 0, bytemuck::cast_slice(data));
         Ok(())
     }
 
     /// Calls `take` with `count` numbers of `from`, from number `first` on.
     pub(super) fn read(
         &mut self,
-        gpu: &Gpu,
         from: &wgpu::Buffer,
         first: usize,
         count: usize,
         take: impl FnOnce(&[f32]),
     ) -> Result<()> {
         let bytes = 4 * count as u64;
+        let gpu = &self.shared.gpu;
         let staging = self.buffers.staging(gpu, bytes)?;
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         encoder.copy_buffer_to_buffer(from, 4 * first as u64, &staging, 0, bytes);
         gpu.submit(encoder);
         while !self.batches.is_empty() {
-            self.finish_one(gpu)?;
+            self.finish_one()?;
         }
-        gpu.read(&staging, bytes, |found| take(bytemuck::cast_slice(found)))
+        self.shared.gpu.read(&staging, bytes, |found| take(bytemuck::cast_slice(found)))
     }
 }

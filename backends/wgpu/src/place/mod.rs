@@ -59,7 +59,7 @@ fn parts<T>(x: &conefield_core::place::Held<T>) -> &[Chunk] {
 
 impl DevicePlace {
     pub(crate) fn new(shared: Arc<Shared>) -> Self {
-        Self { shared, room: Mutex::new(Room::new()) }
+        Self { room: Mutex::new(Room::new(shared.clone())), shared }
     }
 
     fn room(&self) -> MutexGuard<'_, Room> {
@@ -98,7 +98,7 @@ impl Place for DevicePlace {
     }
 
     fn admits(&self, projector: &dyn VoxelProjector) -> Result<()> {
-        rays::Walks::new(&self.shared, projector)?.validate()
+        rays::admits(&self.shared, projector)
     }
 
     fn holds(&self, bytes: u64) -> bool {
@@ -145,7 +145,7 @@ impl Place for DevicePlace {
                 let mut to = to.slice_mut(s![start - first..end - first, .., ..]);
                 let at = (start - part.planes.start) * plane;
                 let shape = to.raw_dim();
-                room.read(&self.shared.gpu, &part.buffer, at, (end - start) * plane, |found| {
+                room.read(&part.buffer, at, (end - start) * plane, |found| {
                     let found = ArrayView3::from_shape(shape, found);
                     let found = found.unwrap_or_else(|e| unreachable!("as many numbers as asked for: {e}"));
                     parallel::over(to.outer_iter_mut().zip(found.outer_iter()), |_, (mut to, found)| to.assign(&found));
@@ -185,7 +185,7 @@ impl Place for DevicePlace {
     }
 
     fn fill(&self, x: &mut Array, value: f32) -> Result<()> {
-        elements::fill(&self.shared, &mut self.room(), x, value)
+        elements::fill(&mut self.room(), x, value)
     }
 
     fn scatter(&self, from: &Array, first: usize, out: &mut Array, at: &[usize]) -> Result<()> {
@@ -194,23 +194,23 @@ impl Place for DevicePlace {
     }
 
     fn keep(&self, x: &mut Array, inside: &Mask, value: f32) -> Result<()> {
-        elements::keep(&self.shared, &mut self.room(), x, inside, value)
+        elements::keep(&mut self.room(), x, inside, value)
     }
 
     fn map(&self, map: &Map, factors: [f64; 2], out: &mut Array, inputs: &[&Array]) -> Result<()> {
-        elements::map(&self.shared, &mut self.room(), map, factors, out, inputs)
+        elements::map(&mut self.room(), map, factors, out, inputs)
     }
 
     fn reduce(&self, kind: Reduction, x: &Array, y: &Array) -> Result<f64> {
-        elements::reduce(&self.shared, &mut self.room(), kind, x, y)
+        elements::reduce(&mut self.room(), kind, x, y)
     }
 
     fn forward(&self, rays: ViewRays<'_>, volume: &Array, images: &mut Array) -> Result<()> {
-        rays::Walks::new(&self.shared, rays.projector)?.run(&mut self.room(), true, rays, volume, images)
+        rays::project(&mut self.room(), true, rays, volume, images)
     }
 
     fn adjoint(&self, rays: ViewRays<'_>, images: &Array, volume: &mut Array) -> Result<()> {
-        rays::Walks::new(&self.shared, rays.projector)?.run(&mut self.room(), false, rays, volume, images)
+        rays::project(&mut self.room(), false, rays, volume, images)
     }
 
     fn compare(&self, by: &Weighing<'_>, views: &[usize], images: &mut Array) -> Result<[f64; 2]> {
@@ -246,12 +246,12 @@ impl Place for DevicePlace {
         slab: &mut Array,
         first: usize,
     ) -> Result<()> {
-        filtered::backproject(&self.shared, &mut self.room(), work, (views, images), (slab, first))
+        filtered::backproject(&mut self.room(), work, (views, images), (slab, first))
     }
 
     fn update(&self, step: ProximalStep<'_>, tau: f32, penalty: &mut dyn Penalty) -> Result<()> {
         match penalty.kernels() {
-            Some(kernels) => stencils::update(&self.shared, &mut self.room(), step, tau, kernels),
+            Some(kernels) => stencils::update(&mut self.room(), step, tau, kernels),
             None => self.update_around(step, tau, penalty),
         }
     }
@@ -261,25 +261,25 @@ impl Place for DevicePlace {
             return prox_on_host(self, v, tau, penalty);
         };
         let iterate = self.zeros(v.shape())?;
-        stencils::prox(&self.shared, &mut self.room(), (v, &iterate), tau, kernels)
+        stencils::prox(&mut self.room(), (v, &iterate), tau, kernels)
     }
 
     fn penalty(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<f64> {
         match penalty.kernels() {
             Some(Kernels::Clip(_)) => Ok(0.0),
-            Some(Kernels::Dual(dual)) => stencils::value(&self.shared, &mut self.room(), &dual, x),
+            Some(Kernels::Dual(dual)) => stencils::value(&mut self.room(), &dual, x),
             None => Ok(penalty.value(self.read(x)?.view())),
         }
     }
 
     fn adapt(&self, penalty: &mut dyn Penalty, x: &Array) -> Result<Option<f64>> {
         match penalty.kernels() {
-            Some(Kernels::Dual(dual)) => stencils::adapt(&self.shared, &mut self.room(), dual, x).map(Some),
+            Some(Kernels::Dual(dual)) => stencils::adapt(&mut self.room(), dual, x).map(Some),
             _ => Ok(penalty.adapt(self.read(x)?.view())),
         }
     }
 
     fn slope(&self, slope: &VariationSlope<'_>, x: &Array, out: &mut Array) -> Result<f64> {
-        stencils::slope(&self.shared, &mut self.room(), slope, x, out)
+        stencils::slope(&mut self.room(), slope, x, out)
     }
 }

@@ -1,8 +1,8 @@
 //! Data terms: computed line integrals against measured ones.
 
-use super::launch::{Room, Task, each, summing};
+use super::launch::{Room, Task};
 use super::{Array, Chunk, DevicePlace, flag, parts, plane};
-use conefield_core::device::{Access, Source, fragment_of};
+use conefield_core::device::{Access, fragment_of};
 use conefield_core::error::Result;
 use conefield_core::place::{Place, Weighing};
 use conefield_core::wgsl::Fragment;
@@ -29,84 +29,73 @@ fn indices(part: &Chunk, wanted: &[usize]) -> Option<Vec<u32>> {
     all.iter().any(|i| *i != NONE).then_some(all)
 }
 
-/// Images with the measured ones, and what has a value for every pixel of the scan: shadow and weights.
-struct Sources<'a> {
-    place: &'a DevicePlace,
-    by: &'a Weighing<'a>,
-    source: Source,
-    label: &'a str,
-}
-
-impl Sources<'_> {
-    /// Calls `launch` for each part of the images with its task and number of pixels.
-    fn run(
-        &self,
-        views: &[usize],
-        images: &Array,
-        launch: &mut dyn FnMut(&mut Room, Task<'_>, u32) -> Result<()>,
-    ) -> Result<()> {
-        let (place, by) = (self.place, self.by);
-        let pixels = plane(images.shape());
-        for part in parts(images) {
-            let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
-            let mut loaded;
-            let (measured, wanted): (_, Vec<usize>) = match &by.views.here {
-                Some(here) => (parts(here), some.to_vec()),
-                // Measured views that are not on the device come for each use.
-                None => {
-                    loaded = place.zeros([some.len(), images.shape()[1], images.shape()[2]])?;
-                    for (i, &view) in some.iter().enumerate() {
-                        place.load(by.views.measured.slice(s![view..view + 1, .., ..]), &mut loaded, i)?;
-                    }
-                    (parts(&loaded), (0..some.len()).collect())
+/// Calls `launch` for each part of the images with its number of pixels and its buffers: images, measured ones, and what has a
+/// value for every pixel of the scan, shadow and weights.
+fn over(
+    place: &DevicePlace,
+    by: &Weighing<'_>,
+    views: &[usize],
+    images: &Array,
+    launch: &mut dyn FnMut(&mut Room, &[(&str, &wgpu::Buffer)], u32) -> Result<()>,
+) -> Result<()> {
+    let pixels = plane(images.shape());
+    for part in parts(images) {
+        let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
+        let mut loaded;
+        let (measured, wanted): (_, Vec<usize>) = match &by.views.here {
+            Some(here) => (parts(here), some.to_vec()),
+            // Measured views that are not on the device come for each use.
+            None => {
+                loaded = place.zeros([some.len(), images.shape()[1], images.shape()[2]])?;
+                for (i, &view) in some.iter().enumerate() {
+                    place.load(by.views.measured.slice(s![view..view + 1, .., ..]), &mut loaded, i)?;
                 }
-            };
-            let of_all = by.shadow.map(parts).or_else(|| by.weights.map(parts));
-            for held in measured {
-                let Some(at) = indices(held, &wanted) else { continue };
-                for k in 0..of_all.map_or(1, <[Chunk]>::len) {
-                    let at_all = match of_all {
-                        Some(all) => indices(&all[k], some),
-                        None => Some(at.clone()),
-                    };
-                    let Some(at_all) = at_all else { continue };
-                    let index: Vec<[u32; 2]> = at.iter().zip(at_all).map(|(&a, b)| [a, b]).collect();
-                    let mut bind = vec![("images", &part.buffer), ("measured", &held.buffer)];
-                    bind.extend(by.shadow.map(|shadow| ("shadow", &parts(shadow)[k].buffer)));
-                    bind.extend(by.weights.map(|weights| ("weights", &parts(weights)[k].buffer)));
-                    let mut room = place.room();
-                    room.write(&place.shared.gpu, "index", &index)?;
-                    let task = Task { label: self.label, source: &self.source, bind: &bind };
-                    launch(&mut room, task, (some.len() * pixels) as u32)?;
-                }
+                (parts(&loaded), (0..some.len()).collect())
+            }
+        };
+        let of_all = by.shadow.map(parts).or_else(|| by.weights.map(parts));
+        for held in measured {
+            let Some(at) = indices(held, &wanted) else { continue };
+            for k in 0..of_all.map_or(1, <[Chunk]>::len) {
+                let at_all = match of_all {
+                    Some(all) => indices(&all[k], some),
+                    None => Some(at.clone()),
+                };
+                let Some(at_all) = at_all else { continue };
+                let index: Vec<[u32; 2]> = at.iter().zip(at_all).map(|(&a, b)| [a, b]).collect();
+                let mut bind = vec![("images", &part.buffer), ("measured", &held.buffer)];
+                bind.extend(by.shadow.map(|shadow| ("shadow", &parts(shadow)[k].buffer)));
+                bind.extend(by.weights.map(|weights| ("weights", &parts(weights)[k].buffer)));
+                let mut room = place.room();
+                room.write("index", &index)?;
+                launch(&mut room, &bind, (some.len() * pixels) as u32)?;
             }
         }
-        Ok(())
     }
+    Ok(())
 }
 
-/// A source with the bindings of pixels.
-fn begun(by: &Weighing<'_>, term: Option<&Fragment>) -> Result<Source> {
-    let mut source = Source::default();
-    source.add("pixels", include_str!("../kernels/pixels.wgsl"));
-    source.bind("pixels", Access::Uniform, "Pixels");
-    source.bind("index", Access::Read, "array<vec2<u32>>");
-    source.bind("images", Access::Write, "array<f32>");
-    source.bind("measured", Access::Read, "array<f32>");
+/// A kernel with the bindings of pixels.
+fn task<'a>(label: &'a str, by: &Weighing<'_>, term: Option<&Fragment>) -> Result<Task<'a>> {
+    let mut task = Task::new(label, include_str!("../kernels/pixels.wgsl"), "pixels", "Pixels")
+        .bind("index", Access::Read, "vec2<u32>")
+        .bind("images", Access::Write, "f32")
+        .bind("measured", Access::Read, "f32");
     if by.shadow.is_some() {
-        source.bind("shadow", Access::Read, "array<u32>");
+        task = task.bind("shadow", Access::Read, "u32");
     }
     if by.weights.is_some() {
-        source.bind("weights", Access::Read, "array<f32>");
+        task = task.bind("weights", Access::Read, "f32");
     }
     if let Some(term) = term {
-        source.add("data term", &fragment_of("the data term", Some(term.clone()))?.named("term_"));
+        task = task.add("data term", &fragment_of("the data term", Some(term.clone()))?.named("term_"));
     }
-    Ok(source)
+    Ok(task)
 }
 
-fn uniform(pixels: usize) -> (&'static str, impl Fn(u32, u32) -> Pixels) {
-    ("pixels", move |begin, end| Pixels { begin, end, pixels: pixels as u32, pad: 0 })
+fn uniform(images: &Array) -> impl Fn(u32, u32) -> Pixels {
+    let pixels = plane(images.shape()) as u32;
+    move |begin, end| Pixels { begin, end, pixels, pad: 0 }
 }
 
 /// [`Place::compare`] with the data term `term`, or least squares.
@@ -117,17 +106,14 @@ pub(super) fn compare(
     views: &[usize],
     images: &mut Array,
 ) -> Result<[f64; 2]> {
-    let mut source = begun(by, term)?;
     let inside = if by.shadow.is_some() { flag("shadow", "all") } else { "true".into() };
     let weight = if by.weights.is_some() { "weights[all]" } else { "1.0" };
     let derivative = if term.is_some() { "term_differentiate(p, r)" } else { "vec2<f32>(0.5 * r * r, r)" };
     let body = include_str!("../kernels/compare.wgsl").replace("INSIDE", &inside).replace("WEIGHT", weight);
-    summing(&mut source, "pixels", &body.replace("DERIVATIVE", derivative), false);
-    let pixels = plane(images.shape());
+    let task = task("data term", by, term)?.summing(&body.replace("DERIVATIVE", derivative), false);
     let mut sums = [0.0; 2];
-    let sources = Sources { place, by, source, label: "data term" };
-    sources.run(views, images, &mut |room, task, count| {
-        let found = room.sum(&place.shared, task, uniform(pixels), count, false)?;
+    over(place, by, views, images, &mut |room, bind, count| {
+        let found = room.sum(&task, bind, uniform(images), count, false)?;
         sums = std::array::from_fn(|k| sums[k] + found[k]);
         Ok(())
     })?;
@@ -144,11 +130,8 @@ pub(super) fn weigh(
     images: &mut Array,
 ) -> Result<()> {
     let by = &Weighing { shadow: None, weights: None, ..*by };
-    let mut source = begun(by, Some(term))?;
-    let value = if spread { "term_spread" } else { "term_curve" };
-    source.add("weights", &each("pixels", &include_str!("../kernels/weigh.wgsl").replace("VALUE", value)));
-    let pixels = plane(images.shape());
-    let label = if spread { "noise" } else { "curvature" };
-    let sources = Sources { place, by, source, label };
-    sources.run(views, images, &mut |room, task, count| room.run(&place.shared, task, uniform(pixels), count))
+    let (label, value) = if spread { ("noise", "term_spread") } else { ("curvature", "term_curve") };
+    let body = include_str!("../kernels/weigh.wgsl").replace("VALUE", value);
+    let task = task(label, by, Some(term))?.each(&body);
+    over(place, by, views, images, &mut |room, bind, count| room.run(&task, bind, uniform(images), count))
 }

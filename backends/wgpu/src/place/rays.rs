@@ -1,16 +1,15 @@
 //! Line integrals of voxel volumes and their adjoint.
 
 use super::elements::fill;
-use super::launch::{Room, Task, each};
+use super::launch::{Room, Task};
 use super::{Array, parts, plane};
 use crate::Shared;
 use crate::source::validate;
-use conefield_core::device::{Access, Source, fragment_of};
+use conefield_core::device::{Access, fragment_of};
 use conefield_core::error::Result;
 use conefield_core::geometry::{Geometry, cross, dot, norm, sub};
 use conefield_core::place::ViewRays;
 use conefield_core::voxel::VoxelProjector;
-use conefield_core::wgsl::Fragment;
 
 /// `Projection` in `kernels/project.wgsl`.
 #[repr(C)]
@@ -52,87 +51,67 @@ fn projected(geometry: &Geometry, view: usize) -> [[f32; 4]; 4] {
     [[x, y, z, near], voxels(corner), voxels(w.u), voxels(w.v)]
 }
 
-/// A projector's kernels: they take line integrals of the buffer `volume` and add up `lines`, or the reverse.
-pub(super) struct Walks<'a> {
-    shared: &'a Shared,
-    name: String,
-    fragment: Fragment,
+/// A projector's kernel: it takes line integrals of the buffer `volume` and adds up `lines`, or the reverse. Refuses a projector
+/// without WGSL.
+fn task(shared: &Shared, projector: &dyn VoxelProjector, forward: bool) -> Result<Task<'static>> {
+    let name = format!("projector ({})", projector.describe());
+    let walk = fragment_of(&name, projector.wgsl())?.named("walk_");
+    let atomics = shared.gpu.adapter.atomics;
+    let label = if forward { "forward projection" } else { "adjoint of projection" };
+    let task = Task::new(label, include_str!("../kernels/project.wgsl"), "projection", "Projection");
+    let task = task.bind("views", Access::Read, "ProjectedView");
+    let (task, what, begin, end) = if forward {
+        let task = task.bind("volume", Access::Read, "f32").bind("lines", Access::Write, "f32");
+        (task, "value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[line] += value;")
+    } else {
+        let task = task.bind("volume", Access::Write, &format!("atomic<{}>", atomics.number()));
+        let begin = "value = lines[line];\n        if value == 0.0 { continue; }";
+        let what = format!("let v = weight * value;\n{}", atomics.sum("volume[i]"));
+        (task.bind("lines", Access::Read, "f32"), what, begin, "")
+    };
+    let body = format!("let line = line_of(i);\n        {begin}\n        walk_walk(projected(line));\n        {end}");
+    let visit = include_str!("../kernels/visit.wgsl").replace("WHAT", &what);
+    Ok(task.add("visit", &visit).add(&name, &walk).each(&body))
 }
 
-impl<'a> Walks<'a> {
-    /// Refuses a projector without WGSL.
-    pub(super) fn new(shared: &'a Shared, projector: &dyn VoxelProjector) -> Result<Self> {
-        let name = format!("projector ({})", projector.describe());
-        let fragment = fragment_of(&name, projector.wgsl())?;
-        Ok(Self { shared, name, fragment })
-    }
+/// Refuses a projector without WGSL or with invalid WGSL.
+pub(super) fn admits(shared: &Shared, projector: &dyn VoxelProjector) -> Result<()> {
+    [true, false].into_iter().try_for_each(|forward| validate(&task(shared, projector, forward)?.source))
+}
 
-    fn kernel(&self, forward: bool) -> Source {
-        let atomics = self.shared.gpu.adapter.atomics;
-        let mut source = Source::default();
-        source.add("projection", include_str!("../kernels/project.wgsl"));
-        source.bind("projection", Access::Uniform, "Projection");
-        source.bind("views", Access::Read, "array<ProjectedView>");
-        let (what, begin, end) = if forward {
-            source.bind("volume", Access::Read, "array<f32>");
-            source.bind("lines", Access::Write, "array<f32>");
-            ("value += weight * volume[i];".to_owned(), "value = 0.0;", "lines[line] += value;")
-        } else {
-            source.bind("volume", Access::Write, &format!("array<atomic<{}>>", atomics.number()));
-            source.bind("lines", Access::Read, "array<f32>");
-            let begin = "value = lines[line];\n        if value == 0.0 { continue; }";
-            (format!("let v = weight * value;\n{}", atomics.sum("volume[i]")), begin, "")
-        };
-        source.add("visit", &include_str!("../kernels/visit.wgsl").replace("WHAT", &what));
-        source.add(&self.name, &self.fragment.named("walk_"));
-        let body =
-            format!("let line = line_of(i);\n        {begin}\n        walk_walk(projected(line));\n        {end}");
-        source.add("rays", &each("projection", &body));
-        source
+/// Line integrals overwrite `images` if `forward`, else their adjoint adds to `volume`.
+pub(super) fn project(
+    room: &mut Room,
+    forward: bool,
+    ViewRays { projector, geometry, views }: ViewRays<'_>,
+    volume: &Array,
+    images: &Array,
+) -> Result<()> {
+    let task = task(&room.shared, projector, forward)?;
+    if forward {
+        // Line integrals are added up part by part of the volume.
+        fill(room, images, 0.0)?;
     }
-
-    /// Refuses invalid WGSL.
-    pub(super) fn validate(&self) -> Result<()> {
-        [true, false].into_iter().try_for_each(|forward| validate(&self.kernel(forward)))
-    }
-
-    /// Overwrites `images` if `forward`, else adds to `volume`.
-    pub(super) fn run(
-        &self,
-        room: &mut Room,
-        forward: bool,
-        ViewRays { geometry, views, .. }: ViewRays<'_>,
-        volume: &Array,
-        images: &Array,
-    ) -> Result<()> {
-        if forward {
-            // Line integrals are added up part by part of the volume.
-            fill(self.shared, room, images, 0.0)?;
+    let pixels = plane(images.shape());
+    for part in parts(images) {
+        let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
+        let data: Vec<f32> = some.iter().flat_map(|&v| projected(geometry, v)).flatten().collect();
+        room.write("views", &data)?;
+        let count = (some.len() * pixels) as u32;
+        for held in parts(volume) {
+            let whole = Projection {
+                shape: geometry.volume.shape.map(|n| n as u32),
+                count,
+                spacing: geometry.volume.spacing.map(|h| h as f32),
+                columns: geometry.detector[1] as u32,
+                pixels: pixels as u32,
+                held: held.planes.start as u32,
+                held_end: held.planes.end as u32,
+                ..Projection::default()
+            };
+            let bind = [("volume", &held.buffer), ("lines", &part.buffer)];
+            room.run(&task, &bind, |begin, end| Projection { begin, end, ..whole }, count)?;
         }
-        let pixels = plane(images.shape());
-        let label = if forward { "forward projection" } else { "adjoint of projection" };
-        let source = &self.kernel(forward);
-        for part in parts(images) {
-            let Some(some) = views.get(part.planes.start..part.planes.end.min(views.len())) else { break };
-            let data: Vec<f32> = some.iter().flat_map(|&v| projected(geometry, v)).flatten().collect();
-            room.write(&self.shared.gpu, "views", &data)?;
-            let count = (some.len() * pixels) as u32;
-            for held in parts(volume) {
-                let whole = Projection {
-                    shape: geometry.volume.shape.map(|n| n as u32),
-                    count,
-                    spacing: geometry.volume.spacing.map(|h| h as f32),
-                    columns: geometry.detector[1] as u32,
-                    pixels: pixels as u32,
-                    held: held.planes.start as u32,
-                    held_end: held.planes.end as u32,
-                    ..Projection::default()
-                };
-                let bind = [("volume", &held.buffer), ("lines", &part.buffer)];
-                let uniform = ("projection", |begin, end| Projection { begin, end, ..whole });
-                room.run(self.shared, Task { label, source, bind: &bind }, uniform, count)?;
-            }
-        }
-        Ok(())
     }
+    Ok(())
 }

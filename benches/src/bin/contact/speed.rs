@@ -12,7 +12,6 @@ use conefield_projectors::voxel::Joseph;
 use conefield_solvers::fdk::Fdk;
 use ndarray::Array3;
 use serde_json::{Value, json};
-use std::path::PathBuf;
 use std::process::Command;
 use std::time::Instant;
 
@@ -187,14 +186,30 @@ pub fn voxels(asked: &Asked) -> Result<()> {
     Ok(())
 }
 
-/// Where a run of the program writes, until it is removed.
-fn run_folder() -> PathBuf {
-    std::env::temp_dir().join(format!("conefield-contact-{}", std::process::id()))
+/// Runs the program with a spec on the kit's scan, as a user does: what it printed, its metrics, and the seconds it took.
+fn program(spec: &str, backend: &str, arguments: &[&str]) -> Result<(Vec<u8>, std::io::Result<String>, f64)> {
+    let run = std::env::temp_dir().join(format!("conefield-contact-{}", std::process::id()));
+    let mut command = Command::new(file("conefield")?);
+    command
+        .arg("reconstruct")
+        .arg(file("scan")?)
+        .args(["--spec", spec, "--backend", backend, "--force", "-q", "-o"])
+        .arg(&run);
+    command.args(["--reference", "truth"]).args(arguments);
+    let started = Instant::now();
+    let done = command.output()?;
+    let seconds = started.elapsed().as_secs_f64();
+    let metrics = std::fs::read_to_string(run.join("metrics.jsonl"));
+    let _ = std::fs::remove_dir_all(&run);
+    if !done.status.success() {
+        return Err(String::from_utf8_lossy(&done.stderr).into());
+    }
+    Ok((done.stdout, metrics, seconds))
 }
 
 /// `smooth-tv` on the device and on the CPU. A software device makes one pass per level.
 pub fn classical(asked: &Asked) -> Result<()> {
-    let few: Vec<String> = (0..3).map(|level| format!("methods.{level}.stop.passes=1")).collect();
+    let few = ["methods.0.stop.passes=1", "methods.1.stop.passes=1", "methods.2.stop.passes=1"];
     let few = if asked.software { &few[..] } else { &[] };
     reconstruct("smooth-tv", &format!("wgpu:{}", asked.adapter), few)?;
     reconstruct("smooth-tv", "cpu", few)
@@ -202,46 +217,27 @@ pub fn classical(asked: &Asked) -> Result<()> {
 
 /// `gaussians` on the device. A software device trains few of them for a few steps.
 pub fn gaussians(asked: &Asked) -> Result<()> {
-    let few = ["training.steps=40", "start.count=2000", "most=4000"].map(str::to_owned);
+    let few = ["training.steps=40", "start.count=2000", "most=4000"];
     reconstruct("gaussians", &format!("wgpu:{}", asked.adapter), if asked.software { &few } else { &[] })
 }
 
-/// A spec on the kit's scan, as a user runs it: seconds of the whole command and of the method alone, and PSNR.
-fn reconstruct(spec: &str, backend: &str, settings: &[String]) -> Result<()> {
-    let run = run_folder();
-    let mut command = Command::new(file("conefield")?);
-    command.arg("reconstruct").arg(file("scan")?).args(["--spec", spec, "--force", "-q", "--json", "-o"]).arg(&run);
-    command.args(["--backend", backend, "--reference", "truth"]);
-    command.args(settings.iter().flat_map(|set| ["--set", set]));
-    let started = Instant::now();
-    let done = command.output()?;
-    let seconds = started.elapsed().as_secs_f64();
-    let _ = std::fs::remove_dir_all(&run);
-    if !done.status.success() {
-        return Err(String::from_utf8_lossy(&done.stderr).into());
-    }
-    let record: Value = serde_json::from_slice(&done.stdout)?;
+/// A spec on the kit's scan: seconds of the whole command and of the method alone, and PSNR.
+fn reconstruct(spec: &str, backend: &str, settings: &[&str]) -> Result<()> {
+    let settings = settings.iter().flat_map(|set| ["--set", *set]);
+    let (said, _, seconds) = program(spec, backend, &["--json"].into_iter().chain(settings).collect::<Vec<_>>())?;
+    let record: Value = serde_json::from_slice(&said)?;
     let (train_s, psnr) = (&record["train_s"], &record["scores"]["psnr"]);
     say(&json!({ "spec": spec, "backend": backend, "seconds": seconds, "train_s": train_s, "psnr": psnr }));
     Ok(())
 }
 
-/// Sixty seconds of `balanced` on the kit's scan, as a user runs it: the seconds to marks of PSNR, and the last one.
+/// Sixty seconds of `balanced` on the kit's scan: the seconds to marks of PSNR, and the last one.
 pub fn training(asked: &Asked) -> Result<()> {
-    let run = run_folder();
-    let mut command = Command::new(file("conefield")?);
-    command.arg("reconstruct").arg(file("scan")?).args(["--spec", "balanced", "--seconds", "60s", "--force"]);
-    command.args(["--reference", "truth", "--set", "training.report_every=25", "-q", "-o"]).arg(&run);
-    command.args(["--backend", &format!("wgpu:{}", asked.adapter)]);
+    let mut arguments = vec!["--seconds", "60s", "--set", "training.report_every=25"];
     if asked.software {
-        command.args(["--set", "training.rays=64", "--set", "projector.samples=64"]);
+        arguments.extend(["--set", "training.rays=64", "--set", "projector.samples=64"]);
     }
-    let done = command.output()?;
-    let metrics = std::fs::read_to_string(run.join("metrics.jsonl"));
-    let _ = std::fs::remove_dir_all(&run);
-    if !done.status.success() {
-        return Err(String::from_utf8_lossy(&done.stderr).into());
-    }
+    let (_, metrics, _) = program("balanced", &format!("wgpu:{}", asked.adapter), &arguments)?;
     let records: Vec<Value> = metrics?.lines().map(serde_json::from_str).collect::<std::result::Result<_, _>>()?;
     let points: Vec<(f64, f64)> =
         records.iter().filter_map(|r| r["seconds"].as_f64().zip(r["psnr"].as_f64())).collect();

@@ -110,15 +110,7 @@ impl<R: Real> Kernel<R> for SirenField {
         }
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        tape: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        grads: Grads<'_, R>,
-        mut dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, tape, dy, grads, mut dx }: Backward<'_, R>) {
         let rows = x.rows;
         let size = self.settings.width * rows;
         let hidden = self.settings.depth * size;

@@ -45,15 +45,7 @@ impl<R: Real> Kernel<R> for RaySmoothStage {
         }
     }
 
-    fn backward(
-        &self,
-        _: &[R],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        _: Grads<'_, R>,
-        dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { x, dy, dx, .. }: Backward<'_, R>) {
         let Some(mut dx) = dx else { return };
         let (own, each) = (R::of(1.0 - self.strength), R::of(0.5 * self.strength));
         let last = x.rows - 1;

@@ -224,15 +224,7 @@ impl<R: Real> Kernel<R> for TriplaneStage {
         self.factors[pass].forward(&params[self.ranges[pass].clone()], x, &mut y);
     }
 
-    fn backward(
-        &self,
-        params: &[R],
-        x: Tile<'_, R>,
-        _: TileMut<'_, R>,
-        dy: Tile<'_, R>,
-        mut grads: Grads<'_, R>,
-        mut dx: Option<TileMut<'_, R>>,
-    ) {
+    fn backward(&self, Backward { params, x, dy, mut grads, mut dx, .. }: Backward<'_, R>) {
         if let Some(dx) = &mut dx {
             dx.data.fill(R::ZERO);
         }

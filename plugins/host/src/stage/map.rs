@@ -275,15 +275,7 @@ macro_rules! kernel {
                 self.own.filled(call!(self.own, $forward(params, x, out, tape)), y.data);
             }
 
-            fn backward(
-                &self,
-                params: &[$real],
-                x: Tile<'_, $real>,
-                tape: TileMut<'_, $real>,
-                dy: Tile<'_, $real>,
-                grads: Grads<'_, $real>,
-                dx: Option<TileMut<'_, $real>>,
-            ) {
+            fn backward(&self, Backward { params, x, tape, dy, grads, dx }: Backward<'_, $real>) {
                 let (rows, params) = (x.rows, params.as_ptr());
                 let (x, tape, dy) = (x.data.across(rows), tape.data.across(rows), dy.data.across(rows));
                 let dx = dx.map(|dx| dx.data).unwrap_or_default();

@@ -150,9 +150,12 @@ unsafe fn run_backward<R: Real>(
         tape.write(|tape| {
             let (x, tape, dy) = (Tile::new(&x, rows), TileMut::new(tape, rows), Tile::new(&dy, rows));
             if wanted {
-                dx.write(|dx| kernel.backward(params, x, tape, dy, grads, Some(TileMut::new(dx, rows))));
+                dx.write(|dx| {
+                    let dx = Some(TileMut::new(dx, rows));
+                    kernel.backward(Backward { params, x, tape, dy, grads, dx });
+                });
             } else {
-                kernel.backward(params, x, tape, dy, grads, None);
+                kernel.backward(Backward { params, x, tape, dy, grads, dx: None });
             }
         });
     }

@@ -226,7 +226,7 @@ mod tests {
     use super::*;
     use conefield_core::registry::{Kind, find};
     use conefield_core::settings::EncoderSpec;
-    use conefield_core::stage::{Encoder, GradKind, Grads, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
+    use conefield_core::stage::{Backward, Encoder, GradKind, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
     use schemars::JsonSchema;
     use serde::{Deserialize, Serialize};
 
@@ -252,15 +252,7 @@ mod tests {
             tape.data.copy_from_slice(&x.data[..x.rows]);
         }
 
-        fn backward(
-            &self,
-            params: &[f32],
-            x: Tile<'_, f32>,
-            tape: TileMut<'_, f32>,
-            dy: Tile<'_, f32>,
-            grads: Grads<'_, f32>,
-            dx: Option<TileMut<'_, f32>>,
-        ) {
+        fn backward(&self, Backward { params, x, tape, dy, grads, dx }: Backward<'_, f32>) {
             assert_eq!(*tape.data, x.data[..x.rows]);
             grads.values[0] += dy.data.iter().zip(x.data).map(|(d, x)| d * x).sum::<f32>();
             if let Some(dx) = dx {
