@@ -207,7 +207,7 @@ impl<'a> Machine<'_, 'a> {
     }
 
     /// An error at the current opcode.
-    fn wrong(&self, found: impl ToString, expected: impl Into<String>) -> Error {
+    fn wrong(&self, found: impl ToString, expected: impl ToString) -> Error {
         let name = self.bytes.get(self.start).and_then(|c| op::name(*c));
         let field = match name {
             Some(name) => format!("byte {} ({name})", self.start),
