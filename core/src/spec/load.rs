@@ -373,16 +373,9 @@ impl Set {
                     if i + 1 == path.len() && step == "type" && entries.iter().any(retyped) {
                         entries.retain(|e| LABEL.contains(&&*e.key));
                     }
-                    let found = entries.iter().position(|e| e.key == *step);
-                    let index = found.unwrap_or_else(|| {
-                        // A number as the next key makes it a list.
-                        let list = path.get(i + 1).is_some_and(|next| next.parse::<usize>().is_ok());
-                        let kind = if list { Is::Array(vec![]) } else { Is::Table(vec![]) };
-                        let fresh = Node { at: at.clone(), kind };
-                        entries.push(Entry { key: step.clone(), at: at.clone(), value: fresh });
-                        entries.len() - 1
-                    });
-                    let entry = &mut entries[index];
+                    // A number as the next key makes it a list.
+                    let list = path.get(i + 1).is_some_and(|next| next.parse::<usize>().is_ok());
+                    let entry = Entry::of(entries, step, &at, list);
                     entry.at = at.clone();
                     node = &mut entry.value;
                 }
