@@ -92,13 +92,11 @@ pub struct InitReport {
 impl Weights {
     /// The blocks of `layout` for which `take` holds.
     pub fn from_arena(layout: &Layout, params: &[f32], take: impl Fn(&str) -> bool) -> Self {
-        let tensors = layout
-            .blocks
-            .iter()
-            .filter(|b| take(&b.name))
-            .map(|b| (b.name.clone(), (b.shape.clone(), params[b.range.clone()].to_vec())))
-            .collect();
-        Self { tensors, notes: BTreeMap::new() }
+        let mut weights = Self::default();
+        let taken = layout.blocks.iter().filter(|b| take(&b.name));
+        let tensor = |b: &Block| (b.name.clone(), (b.shape.clone(), params[b.range.clone()].to_vec()));
+        weights.tensors.extend(taken.map(tensor));
+        weights
     }
 
     /// Copies every block for which `take` holds into `params`, after [`Weights::check`].

@@ -114,8 +114,8 @@ impl Resume {
             let prefix = format!("{}{prefix}{part}.", self.prefix);
             let own =
                 |(k, v): (&String, &(Vec<usize>, Vec<f32>))| Some((k.strip_prefix(&prefix)?.to_owned(), v.clone()));
-            let tensors = self.weights.tensors.iter().filter_map(own).collect();
-            let weights = Weights { tensors, ..Weights::default() };
+            let mut weights = Weights::default();
+            weights.tensors.extend(self.weights.tensors.iter().filter_map(own));
             let report = weights.load(&self.place, layout, values, |_| true)?;
             if let Some((tensor, why)) = report.unused.first() {
                 return Err(Error::invalid(&self.place, tensor, why, "only tensors of this pipeline"));

@@ -349,12 +349,6 @@ fn weights_block<S: Simd, R: Real, const M: usize, const K: usize>(
 fn lane_sums<S: Simd, R: Real>(mut v: [V<S, R>; 16]) -> [R; 16] {
     let len = V::<S, R>::LEN;
     let mut out = [R::ZERO; 16];
-    if len > 16 {
-        for (o, v) in out.iter_mut().zip(v) {
-            *o = v.as_slice().iter().copied().sum();
-        }
-        return out;
-    }
     let mut live = 16;
     let mut width = len;
     while width > 1 {

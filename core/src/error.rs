@@ -83,13 +83,15 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 impl Error {
     /// An unusable value; see [`Error::Invalid`].
-    pub fn invalid(
-        place: impl Into<String>,
-        field: impl Into<String>,
-        found: impl ToString,
-        expected: impl Into<String>,
-    ) -> Self {
-        Self::Invalid { place: place.into(), field: field.into(), found: found.to_string(), expected: expected.into() }
+    pub fn invalid(place: impl ToString, field: impl ToString, found: impl ToString, expected: impl ToString) -> Self {
+        Self::of([&place, &field, &found, &expected])
+    }
+
+    /// [`Error::invalid`], compiled once for all types of its parts.
+    #[cold]
+    fn of(parts: [&dyn ToString; 4]) -> Self {
+        let [place, field, found, expected] = parts.map(|part| part.to_string());
+        Self::Invalid { place, field, found, expected }
     }
 
     /// The same error with `key` prepended to the field of a spec. The owner of a stage calls this, as a stage does not
@@ -112,12 +114,12 @@ impl Error {
     }
 
     /// An unsupported request, with the reason.
-    pub fn unsupported(what: impl Into<String>, why: impl Into<String>) -> Self {
-        Self::Unsupported { what: what.into(), why: why.into() }
+    pub fn unsupported(what: impl ToString, why: impl ToString) -> Self {
+        Self::Unsupported { what: what.to_string(), why: why.to_string() }
     }
 }
 
 /// Returns [`Error::Invalid`] unless `ok`.
-pub fn ensure(ok: bool, place: &str, field: &str, found: impl ToString, expected: impl Into<String>) -> Result<()> {
+pub fn ensure(ok: bool, place: &str, field: &str, found: impl ToString, expected: impl ToString) -> Result<()> {
     if ok { Ok(()) } else { Err(Error::invalid(place, field, found, expected)) }
 }

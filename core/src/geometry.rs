@@ -272,18 +272,12 @@ impl Geometry {
     /// All lengths multiplied by `factor`.
     pub fn scaled(&self, factor: f64) -> Self {
         let s = |v: Vec3| v.map(|x| x * factor);
+        let view = |w: &View| View { source: s(w.source), detector: s(w.detector), u: s(w.u), v: s(w.v) };
+        let volume = &self.volume;
         Self {
             detector: self.detector,
-            views: self
-                .views
-                .iter()
-                .map(|w| View { source: s(w.source), detector: s(w.detector), u: s(w.u), v: s(w.v) })
-                .collect(),
-            volume: VoxelGrid {
-                shape: self.volume.shape,
-                spacing: s(self.volume.spacing),
-                center: s(self.volume.center),
-            },
+            views: self.views.iter().map(view).collect(),
+            volume: VoxelGrid { spacing: s(volume.spacing), center: s(volume.center), ..*volume },
         }
     }
 

@@ -152,7 +152,7 @@ impl Arcs {
     pub fn of(angles: &[f64]) -> Self {
         let angles: Vec<f64> = angles.iter().map(|a| a.rem_euclid(TAU)).collect();
         let mut order: Vec<usize> = (0..angles.len()).collect();
-        order.sort_by(|&a, &b| angles[a].total_cmp(&angles[b]));
+        order.sort_unstable_by(|&a, &b| angles[a].total_cmp(&angles[b]).then(a.cmp(&b)));
         let n = order.len();
         // The gap after each view, in the order of angles.
         let gaps: Vec<f64> = (0..n).map(|i| (angles[order[(i + 1) % n]] - angles[order[i]]).rem_euclid(TAU)).collect();
@@ -186,7 +186,7 @@ impl Arcs {
             [start - 0.5 * rest, last + rest]
         });
         let mut arcs: Vec<[f64; 2]> = arcs.collect();
-        arcs.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        arcs.sort_unstable_by(|a, b| a[0].total_cmp(&b[0]));
         Self { angles, steps, order, arcs, same }
     }
 
@@ -217,7 +217,7 @@ impl Arcs {
 /// Indices of the gaps that end an arc, ascending: as many of the widest as exceed all others clearly.
 fn ends(gaps: &[f64]) -> Vec<usize> {
     let mut wide: Vec<usize> = (0..gaps.len()).collect();
-    wide.sort_by(|&a, &b| gaps[b].total_cmp(&gaps[a]));
+    wide.sort_unstable_by(|&a, &b| gaps[b].total_cmp(&gaps[a]).then(a.cmp(&b)));
     let clear = |k: &usize| {
         let [sum, squares] = wide[*k..].iter().fold([0.0, 0.0], |[s, q], &g| [s + gaps[g], q + gaps[g] * gaps[g]]);
         gaps[wide[k - 1]] * sum > ENDS[usize::from(*k > 1)] * squares

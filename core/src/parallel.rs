@@ -34,11 +34,13 @@ pub fn over<T: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(usize, T)
 
 /// The result of `work` for every item, in order.
 pub fn map<T: Send, U: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(usize, T) -> U + Sync) -> Vec<U> {
-    let items: Vec<T> = items.into_iter().collect();
-    let mut results: Vec<Option<U>> = items.iter().map(|_| None).collect();
-    over(items.into_iter().zip(&mut results), |n, (item, result)| *result = Some(work(n, item)));
-    let done = |result: Option<U>| result.unwrap_or_else(|| unreachable!("every item is worked on"));
-    results.into_iter().map(done).collect()
+    let cells: Vec<_> = items.into_iter().map(|item| Mutex::new((Some(item), None))).collect();
+    each(cells.len(), &|n| {
+        let mut cell = cells[n].lock().unwrap_or_else(PoisonError::into_inner);
+        cell.1 = cell.0.take().map(|item| work(n, item));
+    });
+    let done = |cell: Mutex<(Option<T>, Option<U>)>| cell.into_inner().unwrap_or_else(PoisonError::into_inner).1;
+    cells.into_iter().map(|cell| done(cell).unwrap_or_else(|| unreachable!("every item is worked on"))).collect()
 }
 
 /// Calls `work` with parts of `out` and the same parts of `with`, which have its length.

@@ -118,16 +118,16 @@ pub fn write<S: Serializer>(settings: &dyn Registered, to: S) -> Result<S::Ok, S
 
 /// Reads settings from a table with a `type`, or from the name of a type.
 pub fn read<T: Settings + ?Sized + 'static>(value: Value) -> Result<Box<T>, String> {
-    let (found, name, keys) = typed(T::KIND, value)?;
-    let settings = found.and_then(|t| match &t.origin {
+    let (found, keys) = resolved(T::KIND, value)?;
+    let settings = match &found.origin {
         Origin::Linked { make, .. } => make().call(keys),
         Origin::Loaded { make, .. } => make.call(keys),
-    });
-    settings.unwrap_or_else(|| Err(format!("found type {name}, expected {}", names(T::KIND).join(", "))))
+    };
+    settings.unwrap_or_else(|| unreachable!("a type makes settings of its own kind"))
 }
 
-/// What [`read`] does for all kinds alike: the type, if there is one of this name, its name, and the other keys.
-fn typed(kind: Kind, mut value: Value) -> Result<(Option<&'static StageType>, Value, Value), String> {
+/// The type that a value names, and the other keys of its table.
+fn resolved(kind: Kind, mut value: Value) -> Result<(&'static StageType, Value), String> {
     if value.is_string() {
         value = json!({ "type": value });
     }
@@ -135,7 +135,9 @@ fn typed(kind: Kind, mut value: Value) -> Result<(Option<&'static StageType>, Va
         return Err(format!("found {value}, expected a table or the name of a type ({kind})"));
     }
     let name = value.as_object_mut().and_then(|table| table.remove("type")).ok_or("missing field `type`")?;
-    Ok((name.as_str().and_then(|name| find(kind, name)), name, value))
+    let found = name.as_str().and_then(|name| find(kind, name));
+    let found = found.ok_or_else(|| format!("found type {name}, expected {}", names(kind).join(", ")))?;
+    Ok((found, value))
 }
 
 /// Reads the settings of a type from the keys of its table. It reads tables only: what `serde` derives for settings in a
@@ -226,6 +228,13 @@ impl Make {
 }
 
 impl StageType {
+    /// A type of a loaded library `owner`, in readable form. Its texts live as long as the library: it is never unloaded.
+    pub fn loaded(owner: &str, name: String, doc: String, schema: Value, make: Make) -> Self {
+        let (kind, owner) = (make.kind, owner.into());
+        let origin = Origin::Loaded { owner, schema, make };
+        Self { kind, name: name.leak(), doc: doc.leak(), origin }
+    }
+
     /// JSON Schema of its settings, without `type`.
     pub fn schema(&self) -> Value {
         match &self.origin {
@@ -262,7 +271,7 @@ static LOADED: RwLock<Vec<&'static StageType>> = RwLock::new(vec![]);
 pub fn stage_types() -> Vec<&'static StageType> {
     let loaded = LOADED.read().unwrap_or_else(PoisonError::into_inner);
     let mut all: Vec<_> = inventory::iter::<StageType>.into_iter().chain(loaded.iter().copied()).collect();
-    all.sort_by_key(|t| (t.kind, t.name));
+    all.sort_unstable_by_key(|t| (t.kind, t.name));
     all
 }
 
@@ -276,48 +285,19 @@ pub fn names(kind: Kind) -> Vec<&'static str> {
     stage_types().into_iter().filter(|t| t.kind == kind).map(|t| t.name).collect()
 }
 
-/// Adds the types of one library `owner` (in readable form). Adds all or none: if a name is taken, the error names both
-/// owners.
-pub fn add(owner: &str, types: Vec<NewType>) -> Result<()> {
+/// Adds the types of a library. Adds all or none: if a name is taken, the error names both owners.
+pub fn add(types: Vec<StageType>) -> Result<()> {
     let mut loaded = LOADED.write().unwrap_or_else(PoisonError::into_inner);
-    let mut fresh: Vec<&NewType> = vec![];
-    for t in &types {
-        let kind = t.make.kind;
-        let taken = inventory::iter::<StageType>.into_iter().chain(loaded.iter().copied());
-        let taken = taken.filter(|s| s.kind == kind && s.name == t.name).map(StageType::owner).next();
-        let twin = fresh.iter().any(|s| s.make.kind == kind && s.name == t.name).then(|| owner.to_string());
-        if let Some(other) = taken.or(twin) {
-            let found = format!("a name that {other} has");
-            return Err(Error::invalid(owner, format!("{kind} type {:?}", t.name), found, "a unique name"));
+    for (i, t) in types.iter().enumerate() {
+        let same = |s: &&StageType| (s.kind, s.name) == (t.kind, t.name);
+        let mut known = inventory::iter::<StageType>.into_iter().chain(loaded.iter().copied());
+        if let Some(other) = known.find(same).or(types[..i].iter().find(same)) {
+            let found = format!("a name that {} has", other.owner());
+            return Err(Error::invalid(t.owner(), format!("{} type {:?}", t.kind, t.name), found, "a unique name"));
         }
-        fresh.push(t);
     }
-    loaded.extend(types.into_iter().map(|t| &*Box::leak(Box::new(t.owned_by(owner)))));
+    loaded.extend(types.into_iter().map(|t| &*Box::leak(Box::new(t))));
     Ok(())
-}
-
-/// A type to [`add`].
-pub struct NewType {
-    /// The value of `type`.
-    pub name: String,
-    /// A one-line description.
-    pub doc: String,
-    /// JSON Schema of its settings, without `type`.
-    pub schema: Value,
-    /// Builds its settings.
-    pub make: Make,
-}
-
-impl NewType {
-    fn owned_by(self, owner: &str) -> StageType {
-        let Self { name, doc, schema, make } = self;
-        StageType {
-            kind: make.kind,
-            name: name.leak(),
-            doc: doc.leak(),
-            origin: Origin::Loaded { owner: owner.into(), schema, make },
-        }
-    }
 }
 
 #[doc(hidden)]
@@ -372,20 +352,21 @@ mod tests {
     use super::*;
     use crate::settings::ProjectorSpec;
 
-    fn new(name: &str) -> NewType {
+    fn new(owner: &str, name: &str) -> StageType {
         let make: MakeFn<dyn ProjectorSpec> = Box::new(|_| Err("it makes nothing".into()));
-        let schema = serde_json::json!({});
-        NewType { name: name.into(), doc: "for tests".into(), schema, make: Make::new(make) }
+        StageType::loaded(owner, name.into(), "for tests".into(), json!({}), Make::new(make))
     }
 
     #[test]
     fn a_name_that_is_taken_is_refused_with_both_owners_and_nothing_is_added() {
-        add("one 1.0 (one.so)", vec![new("test-one")]).unwrap();
-        let e = add("two 1.0 (two.so)", vec![new("test-two"), new("test-one")]).unwrap_err().to_string();
+        add(vec![new("one 1.0 (one.so)", "test-one")]).unwrap();
+        let refused =
+            |owner: &str, names: [&str; 2]| add(names.map(|name| new(owner, name)).into()).unwrap_err().to_string();
+        let e = refused("two 1.0 (two.so)", ["test-two", "test-one"]);
         assert!(e.contains("one 1.0 (one.so)") && e.contains("two 1.0 (two.so)") && e.contains("test-one"), "{e}");
         assert!(find(Kind::Projector, "test-two").is_none());
         assert!(find(Kind::Projector, "test-one").is_some_and(|t| t.owner() == "one 1.0 (one.so)"));
-        let e = add("three", vec![new("test-twin"), new("test-twin")]).unwrap_err().to_string();
+        let e = refused("three", ["test-twin"; 2]);
         assert!(e.contains("test-twin"), "{e}");
     }
 }

@@ -59,9 +59,9 @@ impl Serialize for Spec {
 impl<'de> Deserialize<'de> for Spec {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
         let mut method = Map::<String, Value>::deserialize(from)?;
-        let label = LABEL.iter().filter_map(|key| method.remove_entry(*key)).collect();
-        let Label { name, description, plugins } =
-            serde_json::from_value(Value::Object(label)).map_err(D::Error::custom)?;
+        let mut label = Map::new();
+        label.extend(LABEL.iter().filter_map(|key| method.remove_entry(*key)));
+        let Label { name, description, plugins } = serde_json::from_value(label.into()).map_err(D::Error::custom)?;
         let method = crate::registry::read(Value::Object(method)).map_err(D::Error::custom)?;
         Ok(Self { name, description, plugins, method })
     }

@@ -80,6 +80,8 @@ mod tests {
         assert_eq!(t.nearest(&["b", "y", "1"]).at.to_string(), "a.toml:3:13");
         assert_eq!(j.nearest(&["b", "y", "1"]).at.to_string(), "a.json:4:13");
         assert_eq!(j.nearest(&["b", "z"]).at.to_string(), "a.json:2:7");
+        let e = parse_json("a.json", "{\n \"x\": }", 1).unwrap_err().to_string();
+        assert!(e.starts_with("a.json:2:") && e.contains("syntax"), "{e}");
     }
 
     #[test]

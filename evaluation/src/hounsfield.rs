@@ -130,30 +130,23 @@ impl FromStr for KnownValue {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let wrong = || format!("expected {FORMS}");
         let numbers = |list: &str| -> Option<Vec<f64>> {
             list.split(',').map(|x| x.trim().parse().ok().filter(|x: &f64| x.is_finite())).collect()
         };
-        match text.split_once(':') {
-            None => match numbers(text).as_deref() {
-                Some([mu]) => Ok(Self::Given(*mu)),
-                _ => Err(wrong()),
-            },
-            Some(("sphere", list)) => match numbers(list).as_deref() {
-                Some(&[x, y, z, radius]) if radius > 0.0 => {
-                    Ok(Self::Median(Region::Sphere { center: [x, y, z], radius }))
-                }
-                _ => Err("expected sphere:X,Y,Z,R with a radius above 0, in mm".into()),
-            },
-            Some(("box", list)) => match numbers(list).as_deref() {
-                Some(&[a, b, c, d, e, f]) => Ok(Self::Median(Region::Box {
-                    low: [a.min(d), b.min(e), c.min(f)],
-                    high: [a.max(d), b.max(e), c.max(f)],
-                })),
-                _ => Err("expected box:X,Y,Z,X,Y,Z, two corners in mm".into()),
-            },
-            _ => Err(wrong()),
-        }
+        let (shape, list) = text.split_once(':').map_or((None, text), |(shape, list)| (Some(shape), list));
+        Ok(match (shape, numbers(list).as_deref()) {
+            (None, Some(&[mu])) => Self::Given(mu),
+            (Some("sphere"), Some(&[x, y, z, radius])) if radius > 0.0 => {
+                Self::Median(Region::Sphere { center: [x, y, z], radius })
+            }
+            (Some("sphere"), _) => return Err("expected sphere:X,Y,Z,R with a radius above 0, in mm".into()),
+            (Some("box"), Some(&[a, b, c, d, e, f])) => {
+                let (low, high) = ([a.min(d), b.min(e), c.min(f)], [a.max(d), b.max(e), c.max(f)]);
+                Self::Median(Region::Box { low, high })
+            }
+            (Some("box"), _) => return Err("expected box:X,Y,Z,X,Y,Z, two corners in mm".into()),
+            _ => return Err(format!("expected {FORMS}")),
+        })
     }
 }
 

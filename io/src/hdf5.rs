@@ -137,7 +137,7 @@ impl Container {
     }
 
     /// An error about `field` of this file.
-    pub fn invalid(&self, field: &str, found: impl ToString, expected: impl Into<String>) -> Error {
+    pub fn invalid(&self, field: &str, found: impl ToString, expected: impl ToString) -> Error {
         Error::invalid(&self.place, field, found, expected)
     }
 

@@ -88,7 +88,7 @@ impl Input {
     }
 
     /// An error about this file.
-    pub fn invalid(&self, field: impl Into<String>, found: impl ToString, expected: impl Into<String>) -> Error {
+    pub fn invalid(&self, field: impl ToString, found: impl ToString, expected: impl ToString) -> Error {
         Error::invalid(self.place(), field, found, expected)
     }
 

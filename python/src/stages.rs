@@ -7,7 +7,7 @@ use crate::errors::{OrRaise, raised as exception};
 use crate::regularizer::PythonRegularizer;
 use crate::work::without_lock;
 use conefield_conformance::{Outcome, Report, With, check_type};
-use conefield_core::registry::{self, Kind, Make, NewType, Registered};
+use conefield_core::registry::{self, Kind, Make, Registered, StageType};
 use conefield_core::regularizer::{Regularizer, RegularizerSpec};
 use conefield_core::settings::EncoderSpec;
 use conefield_core::stage::Encoder;
@@ -161,7 +161,7 @@ pub fn register(py: Python<'_>, kind_name: &str, name: String, doc: String, clas
         };
         // The settings are known only to the class, which may be replaced: any key is allowed here.
         let schema = json!({ "type": "object" });
-        registry::add(OWNER, vec![NewType { name, doc, schema, make }]).or_raise(py)?;
+        registry::add(vec![StageType::loaded(OWNER, name, doc, schema, make)]).or_raise(py)?;
     }
     let old = locked(&CLASSES).insert(key, class);
     drop(old);

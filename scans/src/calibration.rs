@@ -145,14 +145,11 @@ impl Calibration {
     /// Corrects the geometry of `scan` and records the correction and the path of the original scan in its provenance.
     pub fn correct(&self, scan: &mut Scan, source: &str) {
         scan.geometry.views = self.correction.views(&scan.geometry.views);
-        let corrected: serde_json::Map<String, Value> = self
-            .found
-            .iter()
-            .filter(|f| f.verdict == Verdict::Corrected)
-            .map(|f| {
-                (f.parameter.to_string(), json!({ "change": f.change, "uncertainty": f.uncertainty, "unit": f.unit }))
-            })
-            .collect();
+        let mut corrected = json!({});
+        for f in self.found.iter().filter(|f| f.verdict == Verdict::Corrected) {
+            let Found { change, uncertainty, unit, .. } = f;
+            corrected[f.parameter.name()] = json!({ "change": change, "uncertainty": uncertainty, "unit": unit });
+        }
         *provenance::entry(scan, "calibrated") =
             json!({ "from": source, "corrected": corrected, "held_out": self.held_out });
     }
@@ -239,7 +236,7 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     }
     found.extend(by_pairs);
     found.extend(open);
-    found.sort_by_key(|f| f.parameter);
+    found.sort_unstable_by_key(|f| f.parameter);
     if settings.curves {
         let middle = Search { level: &levels[levels.len().saturating_sub(2)], ..coarse };
         put_curves(&mut found, &middle, pairs.as_ref(), correction)?;
@@ -392,7 +389,7 @@ fn settle<F>(
         };
         let Some(gone) = vaguest(Verdict::NotDetermined).or_else(|| vaguest(Verdict::Kept)) else {
             found.append(&mut all);
-            found.sort_by_key(|f| f.parameter);
+            found.sort_unstable_by_key(|f| f.parameter);
             return Ok((found, fit));
         };
         found.extend(all.into_iter().filter(|f| f.parameter == gone));

@@ -14,12 +14,7 @@ use std::fmt;
 
 struct Nobody;
 
-impl Watch for Nobody {
-    fn cancelled(&self) -> bool {
-        false
-    }
-    fn progress(&self, _: f64) {}
-}
+impl Watch for Nobody {}
 
 /// What a scan is like.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]

@@ -2,7 +2,7 @@
 
 use conefield_core::finite::range;
 use conefield_core::scan::Scan;
-use ndarray::{Array2, ArrayView2, s};
+use ndarray::{Array2, ArrayView2};
 
 /// Upper limit of smoothed pixels in air: the noise's standard deviation, estimated from differences of neighbouring
 /// pixels, or 1/500 of the largest values, whichever is larger.
@@ -24,7 +24,7 @@ pub fn air_level(scan: &Scan) -> f32 {
 /// Differences of neighbours along the rows of `image` that are both below a tenth of `top`.
 pub fn dark_differences(image: ArrayView2<'_, f32>, top: f32) -> Vec<f32> {
     let dark = |x: f32| x < 0.1 * top;
-    let pairs = image.slice(s![.., ..-1]).into_iter().zip(image.slice(s![.., 1..]));
+    let pairs = image.rows().into_iter().flat_map(|row| row.into_iter().zip(row.into_iter().skip(1)));
     pairs.filter(|&(a, b)| dark(*a) && dark(*b)).map(|(a, b)| (a - b).abs()).collect()
 }
 
@@ -55,6 +55,15 @@ fn box_filter<T: Copy>(mut image: Array2<T>, reach: usize, f: impl Fn(&[T]) -> T
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn differences_are_those_of_dark_neighbours_in_a_row() {
+        let image = ndarray::array![[1.0, 3.0, 30.0], [4.0, 9.0, 2.0]];
+        assert_eq!(dark_differences(image.view(), 100.0), [2.0, 5.0, 7.0]);
+        for columns in [0, 1] {
+            assert!(dark_differences(Array2::zeros((3, columns)).view(), 100.0).is_empty());
+        }
+    }
 
     #[test]
     fn a_shadow_covers_the_object_and_its_margin_but_not_noise() {

@@ -128,6 +128,11 @@ impl Ranks {
         self.wire.peers.count()
     }
 
+    /// What `of` says of each process.
+    fn each<T>(&self, of: impl FnMut(usize) -> T) -> Vec<T> {
+        (0..self.count()).map(of).collect()
+    }
+
     /// The planes of process `rank` in an array with this many.
     fn part(&self, rank: usize, planes: usize) -> Range<usize> {
         let bound = |rank| rank * planes / self.count();
@@ -156,7 +161,7 @@ impl Ranks {
         let (size, me) = (rows * columns, self.rank());
         let mut found = Array3::zeros([wanted[me].len(), rows, columns]);
         let all = found.as_slice_mut().unwrap_or_default();
-        let parts: Vec<Range<usize>> = (0..self.count()).map(|rank| self.part(rank, planes)).collect();
+        let parts = self.each(|rank| self.part(rank, planes));
         let mut i = 0;
         for run in wanted[me].chunk_by(|a, b| parts[me].contains(a) == parts[me].contains(b)) {
             if parts[me].contains(&run[0]) {
@@ -179,7 +184,7 @@ impl Ranks {
                 self.read_planes(x, &planes, &mut out).map(|()| out)
             };
             let out = (0..self.count()).map(out).collect::<Result<Vec<_>>>()?;
-            let mut into: Vec<_> = (0..self.count()).map(|of| vec![0.0; now(me, of).count() * size]).collect();
+            let mut into = self.each(|of| vec![0.0; now(me, of).count() * size]);
             self.wire.exchange(&out, &mut into);
             let mut next = vec![0; self.count()];
             for (i, &plane) in wanted[me].iter().enumerate().skip(turn).take(together) {
@@ -229,17 +234,16 @@ impl Ranks {
 
     /// The planes of a slab of `x`, with its neighbours'.
     fn near(&self, x: &Array, slab: &Slab) -> Result<Array> {
-        let wanted = |rank| around(self.part(rank, slab.whole), slab.halo, slab.whole).collect();
-        self.gathered(x, &(0..self.count()).map(wanted).collect::<Vec<_>>(), slab.planes.len())
+        let wanted = self.each(|rank| around(self.part(rank, slab.whole), slab.halo, slab.whole).collect());
+        self.gathered(x, &wanted, slab.planes.len())
     }
 
     /// Renews the copies of its neighbours' planes in an array of a slab.
     fn renew(&self, x: &mut Array, slab: &Slab) -> Result<()> {
-        let wanted = |rank| {
+        let wanted = self.each(|rank| {
             let own = self.part(rank, slab.whole);
             around(own.clone(), slab.halo, slab.whole).filter(|plane| !own.contains(plane)).collect()
-        };
-        let wanted: Vec<Vec<usize>> = (0..self.count()).map(wanted).collect();
+        });
         let found = self.collected(x, &wanted)?;
         for (plane, &i) in found.outer_iter().zip(&wanted[self.rank()]) {
             self.load(plane.insert_axis(Axis(0)), x, i)?;
@@ -385,7 +389,7 @@ impl Place for Ranks {
             return Ok(array.into());
         }
         let all = |rank| if rank == 0 { (0..x.shape()[0]).collect() } else { vec![] };
-        Ok(self.collected(x, &(0..self.count()).map(all).collect::<Vec<_>>())?.into())
+        Ok(self.collected(x, &self.each(all))?.into())
     }
 
     fn fill(&self, x: &mut Array, value: f32) -> Result<()> {
@@ -393,11 +397,10 @@ impl Place for Ranks {
     }
 
     fn scatter(&self, from: &Array, first: usize, out: &mut Array, at: &[usize]) -> Result<()> {
-        let wanted = |rank| {
+        let wanted = self.each(|rank| {
             let part = self.part(rank, out.shape()[0]);
-            (0..at.len()).filter(|&i| part.contains(&at[i])).map(|i| first + i).collect::<Vec<usize>>()
-        };
-        let wanted: Vec<_> = (0..self.count()).map(wanted).collect();
+            (0..at.len()).filter(|&i| part.contains(&at[i])).map(|i| first + i).collect()
+        });
         let found = self.collected(from, &wanted)?;
         for (plane, &i) in found.outer_iter().zip(&wanted[self.rank()]) {
             self.load(plane.insert_axis(Axis(0)), out, at[i - first])?;
@@ -452,7 +455,7 @@ impl Place for Ranks {
                 rest = others;
                 block.to_vec()
             };
-            let mut out: Vec<_> = (0..self.count()).map(block).collect();
+            let mut out = self.each(block);
             let own = std::mem::take(&mut out[self.rank()]);
             let mut into = vec![vec![0.0; own.len()]; out.len()];
             into[self.rank()].clear();
@@ -489,11 +492,7 @@ impl Place for Ranks {
         let weights = match by.weights {
             None => None,
             Some(weights) => {
-                let wanted = |rank| {
-                    let part = self.part(rank, count);
-                    part.filter_map(|i| views.get(i)).copied().collect::<Vec<usize>>()
-                };
-                let wanted: Vec<_> = (0..self.count()).map(wanted).collect();
+                let wanted = self.each(|rank| self.part(rank, count).filter_map(|i| views.get(i)).copied().collect());
                 Some(self.gathered(weights, &wanted, at_hand(images)?.1.shape()[0])?)
             }
         };

@@ -6,13 +6,13 @@ use super::one_of;
 use super::schema::{NESTED, label, of_type};
 use crate::error::{Error, Result};
 use crate::registry::{Kind, find, names};
-use crate::written::{At, Is, Node, listed, parse, suggest};
+use crate::written::{Is, Node, listed, parse, suggest};
 use serde_json::Value;
 
 /// Refuses unknown keys, unknown types and values of the wrong type.
 pub(super) fn spec(root: &Node) -> Result<()> {
     if !matches!(root.kind, Is::Table(_)) {
-        return Err(invalid(&root.at, "spec", root.shown(), "a table".into()));
+        return Err(Error::invalid(&root.at, "spec", root.shown(), "a table"));
     }
     for (key, schema) in label() {
         if let Some(value) = root.get(key) {
@@ -43,16 +43,16 @@ fn stage(node: &Node, kind: Kind, path: &str) -> Result<()> {
     let at = if alone { path.into() } else { join(path, "type") };
     let name = if alone { Some(node) } else { node.get("type") };
     if !alone && !matches!(node.kind, Is::Table(_)) {
-        return Err(invalid(&node.at, path, node.shown(), format!("a table, or the name of {}", types())));
+        return Err(Error::invalid(&node.at, path, node.shown(), format!("a table, or the name of {}", types())));
     }
-    let Some(name) = name else { return Err(invalid(&node.at, &at, "nothing".into(), types())) };
-    let Some(text) = name.text() else { return Err(invalid(&name.at, &at, name.shown(), types())) };
+    let Some(name) = name else { return Err(Error::invalid(&node.at, &at, "nothing", types())) };
+    let Some(text) = name.text() else { return Err(Error::invalid(&name.at, &at, name.shown(), types())) };
     let Some(found) = find(kind, text) else {
         let mut expected = suggest(text, &known);
         if kind.is_of_plugins() {
             expected += "; if it comes from a plugin, load it with --plugin PATH";
         }
-        return Err(invalid(&name.at, &at, format!("no {} type {text:?}", kind.name()), expected));
+        return Err(Error::invalid(&name.at, &at, format!("no {} type {text:?}", kind.name()), expected));
     };
     let schema = of_type(found);
     let cx = Context::new(&schema, Some(kind));
@@ -88,7 +88,7 @@ fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<
         return stage(node, kind, path);
     }
     one_of::check(node, schema, cx, path)?;
-    let wrong = || invalid(&node.at, path, node.shown(), wanted(schema, cx));
+    let wrong = || Error::invalid(&node.at, path, node.shown(), wanted(schema, cx));
     let choices: Vec<&Value> =
         ["anyOf", "oneOf"].iter().filter_map(|k| schema[*k].as_array()).flatten().map(|s| cx.resolve(s)).collect();
     if !choices.is_empty() {
@@ -149,7 +149,7 @@ fn object(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<(
             None if schema["additionalProperties"] == Value::Bool(false) => {
                 let own = properties.keys().map(String::as_str).filter(|k| *k != "type");
                 let known: Vec<&str> = label.iter().copied().chain(own).collect();
-                return Err(invalid(&e.at, &at, "an unknown key".into(), suggest(&e.key, &known)));
+                return Err(Error::invalid(&e.at, &at, "an unknown key", suggest(&e.key, &known)));
             }
             None => {}
         }
@@ -157,7 +157,7 @@ fn object(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<(
     for key in schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str) {
         if node.get(key).is_none() {
             let want = properties.get(key).map_or("a value".into(), |s| wanted(cx.resolve(s), cx));
-            return Err(invalid(&node.at, &join(path, key), "nothing".into(), want));
+            return Err(Error::invalid(&node.at, &join(path, key), "nothing", want));
         }
     }
     Ok(())
@@ -269,13 +269,9 @@ fn plain(value: &Value) -> String {
 fn misnamed(node: &Node, path: &str, allowed: &[Value]) -> Option<Error> {
     let names: Vec<&str> = allowed.iter().filter_map(Value::as_str).collect();
     let text = node.text().filter(|_| !names.is_empty())?;
-    Some(invalid(&node.at, path, format!("{text:?}"), suggest(text, &names)))
+    Some(Error::invalid(&node.at, path, format!("{text:?}"), suggest(text, &names)))
 }
 
 pub(super) fn join(path: &str, key: &str) -> String {
     if path.is_empty() { key.into() } else { format!("{path}.{key}") }
-}
-
-pub(super) fn invalid(at: &At, path: &str, found: String, expected: String) -> Error {
-    Error::invalid(at.to_string(), path, found, expected)
 }

@@ -56,11 +56,8 @@ pub struct Draft {
 impl Draft {
     /// See [`load`].
     pub fn find(what: &str, sets: &[String], shipped: &[Shipped]) -> Result<Self> {
-        let layer = Layer::find(what, None, shipped).map_err(|e| match e {
-            Unfound::Nothing => Error::invalid("spec", what, NOTHING, format!("a file or {}", names(what, shipped))),
-            Unfound::Unreadable(e) => e,
-        })?;
-        Self::layered(layer, sets, shipped)
+        let none = || Error::invalid("spec", what, NOTHING, format!("a file or {}", names(what, shipped)));
+        Self::layered(Layer::find(what, None, shipped)?.ok_or_else(none)?, sets, shipped)
     }
 
     /// See [`parse`].
@@ -131,8 +128,10 @@ pub fn to_toml(spec: &Spec) -> Result<String> {
 
 fn without_nulls(value: Value) -> Value {
     match value {
-        Value::Object(map) => {
-            map.into_iter().filter(|(_, v)| !v.is_null()).map(|(k, v)| (k, without_nulls(v))).collect()
+        Value::Object(mut map) => {
+            map.retain(|_, value| !value.is_null());
+            map.values_mut().for_each(|value| *value = without_nulls(value.take()));
+            map.into()
         }
         Value::Array(items) => items.into_iter().map(without_nulls).collect(),
         other => other,
@@ -142,7 +141,8 @@ fn without_nulls(value: Value) -> Value {
 impl Loaded {
     /// Files and shipped specs that this one is made of, as they were named.
     pub fn sources(&self) -> BTreeSet<String> {
-        let mut all = BTreeSet::from([self.source.clone()]);
+        let mut all = BTreeSet::new();
+        all.insert(self.source.clone());
         self.written.sources(&mut all);
         all
     }
@@ -184,15 +184,7 @@ enum Origin {
     Text(String),
 }
 
-/// Why a layer was not found.
-enum Unfound {
-    /// Nothing has this name.
-    Nothing,
-    /// A file that cannot be read.
-    Unreadable(Error),
-}
-
-/// [`Unfound::Nothing`] in words.
+/// What is found where nothing has a name.
 const NOTHING: &str = "neither a shipped spec nor a file";
 
 /// One spec file before merging.
@@ -202,20 +194,20 @@ struct Layer {
 }
 
 impl Layer {
-    /// Finds `what`, as written in a file of `folder`, or says why it was not found.
-    fn find(what: &str, folder: Option<&Path>, shipped: &[Shipped]) -> Result<Self, Unfound> {
+    /// Finds `what`, as written in a file of `folder`; `None` if nothing has this name. Refuses a file that cannot be read.
+    fn find(what: &str, folder: Option<&Path>, shipped: &[Shipped]) -> Result<Option<Self>> {
         if let Some(s) = shipped.iter().find(|s| s.name == what) {
-            return Ok(Self { origin: Origin::Shipped(s.name), text: s.text.into() });
+            return Ok(Some(Self { origin: Origin::Shipped(s.name), text: s.text.into() }));
         }
         if let Some(t) = registry::find(registry::Kind::Method, what) {
             let text = format!("type = {name:?}\nname = {name:?}\ndescription = {:?}\n", t.doc, name = t.name);
-            return Ok(Self { origin: Origin::Shipped(t.name), text });
+            return Ok(Some(Self { origin: Origin::Shipped(t.name), text }));
         }
         let path = folder.map_or_else(|| PathBuf::from(what), |f| f.join(what));
         match files::read_text(&path, LONGEST) {
-            Ok(text) => Ok(Self { origin: Origin::File(path), text }),
-            Err(Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => Err(Unfound::Nothing),
-            Err(e) => Err(Unfound::Unreadable(e)),
+            Ok(text) => Ok(Some(Self { origin: Origin::File(path), text })),
+            Err(Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => Ok(None),
+            Err(e) => Err(e),
         }
     }
 
@@ -259,13 +251,11 @@ impl Layer {
             Origin::File(p) => p.parent(),
             _ => None,
         };
-        let base = Self::find(what, folder, shipped).map_err(|e| match e {
-            Unfound::Nothing => {
-                let expected = format!("a file or {}", names(what, shipped));
-                Error::invalid(&at, "extends", format!("{what:?}, {NOTHING}"), expected)
-            }
-            Unfound::Unreadable(e) => Error::invalid(&at, "extends", e, "a spec that can be read"),
-        })?;
+        let refused = |found: String, expected: String| Error::invalid(&at, "extends", found, expected);
+        let base = Self::find(what, folder, shipped);
+        let base = base.map_err(|e| refused(e.to_string(), "a spec that can be read".into()))?;
+        let none = || refused(format!("{what:?}, {NOTHING}"), format!("a file or {}", names(what, shipped)));
+        let base = base.ok_or_else(none)?;
         if above.iter().any(|o| same(o, &base.origin)) {
             return Err(Error::invalid(at, "extends", format!("{what:?}, which extends this one"), "no circle"));
         }
@@ -370,7 +360,7 @@ impl Set {
                     let index = step.parse::<usize>().ok().filter(|k| *k <= n).ok_or_else(|| {
                         let range =
                             if n == 0 { "0, to add one".into() } else { format!("0 to {}, or {n} to add one", n - 1) };
-                        Error::invalid(at.to_string(), &so_far, format!("{step:?}"), range)
+                        Error::invalid(&at, &so_far, format!("{step:?}"), range)
                     })?;
                     if index == n {
                         items.push(Node::empty_table(at.clone()));
@@ -383,23 +373,16 @@ impl Set {
                     if i + 1 == path.len() && step == "type" && entries.iter().any(retyped) {
                         entries.retain(|e| LABEL.contains(&&*e.key));
                     }
-                    let found = entries.iter().position(|e| e.key == *step);
-                    let index = found.unwrap_or_else(|| {
-                        // A number as the next key makes it a list.
-                        let list = path.get(i + 1).is_some_and(|next| next.parse::<usize>().is_ok());
-                        let kind = if list { Is::Array(vec![]) } else { Is::Table(vec![]) };
-                        let fresh = Node { at: at.clone(), kind };
-                        entries.push(Entry { key: step.clone(), at: at.clone(), value: fresh });
-                        entries.len() - 1
-                    });
-                    let entry = &mut entries[index];
+                    // A number as the next key makes it a list.
+                    let list = path.get(i + 1).is_some_and(|next| next.parse::<usize>().is_ok());
+                    let entry = Entry::of(entries, step, &at, list);
                     entry.at = at.clone();
                     node = &mut entry.value;
                 }
                 _ => {
                     let above = path[..i].join(".");
                     let found = format!("a key below {above}, which is {shown}");
-                    return Err(Error::invalid(at.to_string(), so_far, found, format!("{above}=value")));
+                    return Err(Error::invalid(at, so_far, found, format!("{above}=value")));
                 }
             }
             if i + 1 < path.len() {
@@ -637,9 +620,11 @@ mod tests {
         assert_eq!(alone.tree["encoder"]["levels"], 4);
         let e = alone.locate(plan(&alone).err().unwrap()).to_string();
         assert!(e.starts_with("a.toml:2:11: encoder.levels"), "{e}");
-        // Over another type, by `--set`, and within a stage.
+        // Over another type, in a file and by `--set`, and within a stage.
         let base = "extends = 'plain'\n";
-        assert_eq!(read(base, &["encoder=test-grid"]).unwrap().tree["encoder"]["levels"], 4);
+        for (text, sets) in [(&*format!("{base}encoder = 'test-grid'\n"), &[][..]), (base, &["encoder=test-grid"])] {
+            assert_eq!(read(text, sets).unwrap().tree["encoder"]["levels"], 4, "{text}");
+        }
         let l = read("type = 'test-field'\nencoder = 'test-grid'\n", &["encoder.levels=8"]).unwrap();
         assert_eq!((&l.tree["encoder"]["type"], &l.tree["encoder"]["levels"]), (&"test-grid".into(), &8.into()));
         read(base, &["encoder={type='test-stack', below='test-grid'}"]).unwrap();
@@ -731,12 +716,13 @@ mod tests {
     }
 
     #[test]
-    fn a_type_alone_is_a_spec() {
-        let l = load("test-clock", &["seconds=3".into()], SHIPPED).unwrap();
-        assert_eq!(
-            (&l.tree["type"], &l.tree["name"], &l.tree["seconds"]),
-            (&"test-clock".into(), &"test-clock".into(), &3.0.into())
-        );
+    fn a_type_alone_is_a_spec_also_below_another() {
+        let alone = load("test-clock", &["seconds=3".into()], SHIPPED).unwrap();
+        let below = read("extends = 'test-clock'\nseconds = 3\n", &[]).unwrap();
+        for tree in [alone.tree, below.tree] {
+            let values = ["type", "name", "seconds"].map(|key| tree[key].clone());
+            assert_eq!(Value::from_iter(values), serde_json::json!(["test-clock", "test-clock", 3.0]));
+        }
     }
 
     #[test]

@@ -62,7 +62,7 @@ fn each(value: &Value, path: &str, mut f: impl FnMut(Option<&str>, &Value, &str)
 mod tests {
     use super::*;
     use crate::input_file::FORMAT;
-    use crate::registry::{Make, NewType, add};
+    use crate::registry::{Make, StageType, add};
     use crate::settings::LossSpec;
     use serde_json::json;
 
@@ -79,13 +79,13 @@ mod tests {
             "$defs": { "Deep": { "properties": { "file": file } } },
         });
         let make = Make::new::<dyn LossSpec>(Box::new(|_| Err("this type is never built".into())));
-        add("a test", vec![NewType { name: "reads-files".into(), doc: "test".into(), schema, make }]).unwrap();
+        add(vec![StageType::loaded("a test", "reads-files".into(), "test".into(), schema, make)]).unwrap();
         let stage = json!({
             "type": "reads-files", "atlas": "a.nii", "maps": ["b.npy", "c.npy"], "deep": { "file": "d.mha" }, "note": "e",
         });
         let tree = json!({ "methods": [{ "loss": stage }, { "type": "unknown", "atlas": "f" }] });
         let mut found = marked(&tree, &|schema| schema["format"] == FORMAT);
-        found.sort_by(|a, b| a.0.cmp(&b.0));
+        found.sort_unstable_by(|a, b| a.0.cmp(&b.0));
         let want = [("atlas", "a.nii"), ("deep.file", "d.mha"), ("maps.0", "b.npy"), ("maps.1", "c.npy")];
         let want = want.map(|(path, file)| (format!("methods.0.loss.{path}"), Value::from(file)));
         assert_eq!(found, want);

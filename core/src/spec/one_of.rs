@@ -1,9 +1,9 @@
 //! Mutually exclusive keys of a table. A key of an upper layer replaces the alternatives of lower ones; one layer with
 //! two of them is refused.
 
-use super::check::{Context, invalid, join};
+use super::check::{Context, join};
 use super::schema::{NESTED, ONE_OF, of_type};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::registry::{Kind, find};
 use crate::written::{Entry, Is, Node, listed};
 use serde_json::Value;
@@ -54,7 +54,7 @@ pub(super) fn check(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -
         said.sort_by_key(|e| e.at.offset());
         if let [first, second, ..] = said[..] {
             let found = format!("{} beside it", first.key);
-            return Err(invalid(&second.at, &join(path, &second.key), found, listed(&group)));
+            return Err(Error::invalid(&second.at, &join(path, &second.key), found, listed(&group)));
         }
     }
     Ok(())

@@ -1,7 +1,7 @@
 //! Values with their locations.
 
 use super::location;
-use serde_json::{Number, Value};
+use serde_json::{Map, Number, Value};
 use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
@@ -91,6 +91,19 @@ pub(crate) struct Entry {
     pub(crate) value: Node,
 }
 
+impl Entry {
+    /// The entry of a key; a missing one is added at `at`, as an empty list or an empty table.
+    pub(crate) fn of<'a>(entries: &'a mut Vec<Entry>, key: &str, at: &At, list: bool) -> &'a mut Entry {
+        let found = entries.iter().position(|e| e.key == key);
+        let i = found.unwrap_or_else(|| {
+            let kind = if list { Is::Array(vec![]) } else { Is::Table(vec![]) };
+            entries.push(Entry { key: key.into(), at: at.clone(), value: Node { at: at.clone(), kind } });
+            entries.len() - 1
+        });
+        &mut entries[i]
+    }
+}
+
 impl Node {
     /// Adds the names of all sources used here.
     pub(crate) fn sources(&self, all: &mut BTreeSet<String>) {
@@ -174,14 +187,7 @@ impl Node {
         let at = items.at.clone();
         match (path, &mut self.kind, items.kind) {
             ([key, rest @ ..], Is::Table(entries), kind) => {
-                let found = entries.iter().position(|e| e.key == *key);
-                let i = found.unwrap_or_else(|| {
-                    let fresh = if rest.is_empty() { Is::Array(vec![]) } else { Is::Table(vec![]) };
-                    let value = Node { at: at.clone(), kind: fresh };
-                    entries.push(Entry { key: (*key).into(), at: at.clone(), value });
-                    entries.len() - 1
-                });
-                entries[i].value.push_all(rest, Node { at, kind });
+                Entry::of(entries, key, &at, rest.is_empty()).value.push_all(rest, Node { at, kind });
             }
             ([], Is::Array(all), Is::Array(items)) => all.extend(items),
             _ => {}
@@ -224,7 +230,12 @@ impl Node {
             Is::Number(n) => Value::Number(n.clone()),
             Is::String(s) | Is::Date(s) => Value::String(s.clone()),
             Is::Array(items) => Value::Array(items.iter().map(Node::to_json).collect()),
-            Is::Table(entries) => Value::Object(entries.iter().map(|e| (e.key.clone(), e.value.to_json())).collect()),
+            Is::Table(entries) => {
+                // Collecting sorts first, by code that is compiled for each iterator.
+                let mut table = Map::new();
+                table.extend(entries.iter().map(|e| (e.key.clone(), e.value.to_json())));
+                table.into()
+            }
         }
     }
 

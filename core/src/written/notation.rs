@@ -13,7 +13,7 @@ pub(super) fn parse_toml(source: &str, text: &str, depth: usize) -> Result<Node>
     let source = Source::new(source, text, depth);
     let root = DeTable::parse(text).map_err(|e| {
         let at = At::byte(&source, e.span().map_or(0, |s| s.start));
-        Error::invalid(at.to_string(), "syntax", e.message().replace('\n', ", "), "TOML")
+        Error::invalid(at, "syntax", e.message().replace('\n', ", "), "TOML")
     })?;
     toml_table(&source, root.get_ref(), At::byte(&source, 0))
 }
@@ -30,7 +30,7 @@ fn toml_table(source: &Arc<Source>, table: &DeTable<'_>, at: At) -> Result<Node>
 }
 
 fn toml_value(source: &Arc<Source>, value: &DeValue<'_>, at: At) -> Result<Node> {
-    let refuse = |found: &dyn fmt::Display, expected: &str| Error::invalid(at.to_string(), "", found, expected);
+    let refuse = |found: &dyn fmt::Display, expected: &str| Error::invalid(&at, "", found, expected);
     let kind = match value {
         DeValue::String(s) => Is::String(s.to_string()),
         DeValue::Boolean(b) => Is::Bool(*b),
@@ -101,7 +101,7 @@ impl Json<'_> {
         let at = self.place();
         let piece = self.text.get(self.at..self.at + len).unwrap_or_default();
         self.at += len;
-        serde_json::from_str(piece).map_err(|_| Error::invalid(at.to_string(), "value", piece, "a JSON value"))
+        serde_json::from_str(piece).map_err(|_| Error::invalid(at, "value", piece, "a JSON value"))
     }
 
     fn string(&mut self) -> Result<String> {
@@ -129,7 +129,7 @@ impl Json<'_> {
                     let at = self.place();
                     let key = self.string()?;
                     if !keys.insert(key.clone()) {
-                        return Err(Error::invalid(at.to_string(), key, "the key a second time", "each key once"));
+                        return Err(Error::invalid(at, key, "the key a second time", "each key once"));
                     }
                     self.eat(b':');
                     entries.push(Entry { key, at, value: self.value()? });

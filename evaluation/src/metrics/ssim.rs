@@ -11,7 +11,7 @@ use ndarray::{Array3, ArrayView2, ArrayView3, Axis, Slice, s};
 pub(crate) fn ssim_2d(result: ArrayView3<f32>, reference: ArrayView3<f32>, peak: f64) -> Result<f64> {
     check::reach("ssim_2d", result, reference, peak)?;
     let window = SsimWindow::gaussian();
-    let mean = over_axes(result, reference, |x, y| {
+    let mean = over_axes(result, reference, &|x, y| {
         y.iter().any(|&v| v > 0.0).then(|| slice_ssim(x, y, &window, window.len() / 2, peak))
     });
     ensure(mean.is_some(), "ssim_2d", "reference", "no positive value", "a slice that is not empty")?;
@@ -25,14 +25,14 @@ pub(crate) fn ssim_skimage(result: ArrayView3<f32>, reference: ArrayView3<f32>, 
     check::reach("ssim_skimage", result, reference, peak)?;
     let window = SsimWindow::uniform();
     check::window("ssim_skimage", result.shape(), window.len())?;
-    Ok(over_axes(result, reference, |x, y| Some(slice_ssim(x, y, &window, 0, peak))).unwrap_or(0.0))
+    Ok(over_axes(result, reference, &|x, y| Some(slice_ssim(x, y, &window, 0, peak))).unwrap_or(0.0))
 }
 
 /// Mean over the slices with a score, then over the axes; `None` if an axis has none.
 fn over_axes(
     result: ArrayView3<f32>,
     reference: ArrayView3<f32>,
-    score: impl Fn(ArrayView2<f32>, ArrayView2<f32>) -> Option<f64> + Sync,
+    score: &(dyn Fn(ArrayView2<f32>, ArrayView2<f32>) -> Option<f64> + Sync),
 ) -> Option<f64> {
     // Slices across z touch every cache line of the volume: copying a few at once reads each line only once.
     const BLOCK: usize = 16;

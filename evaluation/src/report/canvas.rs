@@ -105,11 +105,6 @@ impl Canvas {
             }
         }
     }
-
-    /// Writes the picture as PNG.
-    pub fn write_png(&self, path: &Path) -> Result<()> {
-        write_png(path, &self.image)
-    }
 }
 
 /// Writes a picture as PNG.

@@ -4,7 +4,8 @@ use crate::report::canvas::{number, write_png};
 use crate::report::pixels::{Pixels, Rgb};
 use conefield_core::{Error, Result};
 use plotters::coord::Shift;
-use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
+use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
+use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 use std::ops::Range;
@@ -101,8 +102,47 @@ pub fn panels_png(path: impl AsRef<Path>, panels: &[Panel<'_>]) -> Result<()> {
     write_png(path, &picture)
 }
 
-type Area<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
-type Chart<'a, 'b, X, Y> = ChartContext<'a, BitMapBackend<'b>, Cartesian2d<X, Y>>;
+pub(crate) type Area<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
+pub(crate) type Chart<'a, 'b> = ChartContext<'a, BitMapBackend<'b>, Cartesian2d<Axis, Axis>>;
+
+/// An axis of either kind: with one type, drawing is compiled once.
+pub(crate) enum Axis {
+    Even(RangedCoordf64),
+    Logarithmic(LogCoord<f64>),
+}
+
+impl Axis {
+    pub fn new(range: Range<f64>, log: bool) -> Self {
+        if log { Self::Logarithmic(range.log_scale().into()) } else { Self::Even(range.into()) }
+    }
+}
+
+impl Ranged for Axis {
+    type FormatOption = DefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
+        match self {
+            Self::Even(axis) => axis.map(value, limit),
+            Self::Logarithmic(axis) => axis.map(value, limit),
+        }
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
+        match self {
+            Self::Even(axis) => axis.key_points(hint),
+            Self::Logarithmic(axis) => axis.key_points(hint),
+        }
+    }
+
+    fn range(&self) -> Range<f64> {
+        match self {
+            Self::Even(axis) => axis.range(),
+            Self::Logarithmic(axis) => axis.range(),
+        }
+    }
+}
+
 /// Drawing; an error is text.
 pub(crate) type Drawn = Result<(), String>;
 
@@ -130,22 +170,11 @@ impl Panel<'_> {
         let edges = options.bands.iter().flat_map(|(_, b)| b).flat_map(|(x, ys)| ys.map(|y| (*x, y)));
         let y = range(all.iter().copied().chain(edges.filter(|p| options.shows(p))).map(|p| p.1), options.log_y, 0.05);
         let corner = emptiest(&all, &x, &y, options);
-        let drawn = match (options.log_x, options.log_y) {
-            (false, false) => self.draw_on(area, x, y, corner),
-            (true, false) => self.draw_on(area, x.log_scale(), y, corner),
-            (false, true) => self.draw_on(area, x, y.log_scale(), corner),
-            (true, true) => self.draw_on(area, x.log_scale(), y.log_scale(), corner),
-        };
+        let drawn = self.draw_on(area, Axis::new(x, options.log_x), Axis::new(y, options.log_y), corner);
         drawn.map_err(|e| Error::invalid(place, "plot", e, "a series that can be drawn"))
     }
 
-    fn draw_on<X, Y>(&self, area: &Area<'_>, x: X, y: Y, corner: SeriesLabelPosition) -> Drawn
-    where
-        X: AsRangedCoord<Value = f64>,
-        Y: AsRangedCoord<Value = f64>,
-        X::CoordDescType: ValueFormatter<f64>,
-        Y::CoordDescType: ValueFormatter<f64>,
-    {
+    fn draw_on(&self, area: &Area<'_>, x: Axis, y: Axis, corner: SeriesLabelPosition) -> Drawn {
         let em = self.em();
         area.fill(&WHITE).map_err(text_of)?;
         let mut chart = ChartBuilder::on(area)
@@ -200,7 +229,7 @@ impl Panel<'_> {
         COLOURS[names.iter().position(|n| *n == name).unwrap_or(0) % COLOURS.len()]
     }
 
-    fn bands<X: Ranged<ValueType = f64>, Y: Ranged<ValueType = f64>>(&self, chart: &mut Chart<'_, '_, X, Y>) -> Drawn {
+    fn bands(&self, chart: &mut Chart<'_, '_>) -> Drawn {
         for (name, band) in &self.options.bands {
             for part in band.split(|(x, ys)| !ys.iter().all(|y| self.options.shows(&(*x, *y)))).filter(|b| b.len() > 1)
             {
@@ -212,7 +241,7 @@ impl Panel<'_> {
         Ok(())
     }
 
-    fn lines<X: Ranged<ValueType = f64>, Y: Ranged<ValueType = f64>>(&self, chart: &mut Chart<'_, '_, X, Y>) -> Drawn {
+    fn lines(&self, chart: &mut Chart<'_, '_>) -> Drawn {
         let em = self.em();
         let (stroke, length) = (((em / 8.0).round() as u32).max(2), (em * 1.6) as i32);
         let mut seen: Vec<&str> = vec![];

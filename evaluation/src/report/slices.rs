@@ -1,6 +1,6 @@
 //! Pictures of volumes: middle slices side by side, with differences.
 
-use crate::report::canvas::{Align, Canvas, diverging, grey, number, round_above};
+use crate::report::canvas::{Align, Canvas, diverging, grey, number, round_above, write_png};
 use crate::report::middle::MiddleSlices;
 use crate::report::pixels::Rgb;
 use conefield_core::{Error, Result};
@@ -179,7 +179,7 @@ fn draw(path: &Path, captions: &[&str], rows: &[Row], window: [f32; 2]) -> Resul
         let bar = [bar[0] + (text * 4.0) as u32, bar[1], bar[2], bar[3]];
         draw_bar(&mut canvas, bar, text, [-f64::from(s), f64::from(s)], |t| diverging(2.0 * t - 1.0));
     }
-    canvas.write_png(path)
+    write_png(path, &canvas.image)
 }
 
 fn most(all: impl Iterator<Item = f64>) -> f64 {

@@ -1,12 +1,11 @@
 //! A picture of a scan's geometry: source path, detector, volume, and the part of it seen by the views.
 
 use crate::report::canvas::{number, sequential, write_png};
-use crate::report::curves::{Drawn, FONT, register, text_of};
+use crate::report::curves::{Area, Axis, Chart, Drawn, FONT, register, text_of};
 use crate::report::pixels::{Pixels, Rgb};
 use conefield_core::geometry::{Geometry, Vec3, View};
 use conefield_core::{Error, Result};
 use conefield_scans::diagnosis::{Setup, setup, share_of_views};
-use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use std::ops::Range;
@@ -25,13 +24,6 @@ const POINTS: usize = 160;
 const SOURCE: RGBColor = RGBColor(213, 94, 0);
 const DETECTOR: RGBColor = RGBColor(0, 114, 178);
 const INK: RGBColor = RGBColor(20, 20, 20);
-
-type Area<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
-type Chart<'a, 'b> = ChartContext<
-    'a,
-    BitMapBackend<'b>,
-    Cartesian2d<plotters::coord::types::RangedCoordf64, plotters::coord::types::RangedCoordf64>,
->;
 
 /// Draws `geometry` from above (x to the right, y up) and from the side of its first view. Beside them it maps the
 /// share of views that see each point of the volume's central slices x–y and x–z.
@@ -79,9 +71,9 @@ impl Frame<'_> {
         let size = [self.x[1] - self.x[0], self.y[1] - self.y[0]];
         // A millimetre is the same in both directions: the tighter one determines the scale.
         let mm = (size[0] / inner[0]).max(size[1] / inner[1]);
-        let range = |r: [f64; 2], pixels: f64| -> Range<f64> {
+        let range = |r: [f64; 2], pixels: f64| {
             let middle = (r[0] + r[1]) / 2.0;
-            middle - mm * pixels / 2.0..middle + mm * pixels / 2.0
+            Axis::new(middle - mm * pixels / 2.0..middle + mm * pixels / 2.0, false)
         };
         let at = ((edge + left + inner[0] / 2.0) as i32, (EM * 0.5) as i32);
         let style = (FONT, EM * 1.05).into_font().color(&INK).pos(Pos::new(HPos::Center, VPos::Top));
@@ -127,12 +119,10 @@ fn line(chart: &mut Chart, points: Vec<(f64, f64)>, style: impl Into<ShapeStyle>
     chart.draw_series([PathElement::new(points, style)]).map(|_| ()).map_err(text_of)
 }
 
-/// Dashes: a line from each even-numbered point to the next.
-fn dashed(chart: &mut Chart, points: &[(f64, f64)], style: ShapeStyle) -> Drawn {
-    for pair in points.chunks(2).filter(|c| c.len() == 2) {
-        line(chart, pair.to_vec(), style)?;
-    }
-    Ok(())
+/// The volume between two corners.
+fn volume(chart: &mut Chart, corners: [(f64, f64); 2]) -> Drawn {
+    let styles: [ShapeStyle; 2] = [RGBColor(94, 201, 98).mix(0.5).filled(), INK.stroke_width(2 * FINER)];
+    chart.draw_series(styles.map(|style| Rectangle::new(corners, style))).map(|_| ()).map_err(text_of)
 }
 
 fn label(chart: &mut Chart, at: (f64, f64), anchor: Pos, colour: RGBColor, text: &str) -> Drawn {
@@ -191,12 +181,8 @@ impl Picture<'_> {
         }
         let fov = circle(self.setup.field_of_view.radius_mm);
         line(&mut chart, fov, INK.mix(0.5).stroke_width(FINER))?;
-        let corners = [(low[0], low[1]), (high[0], high[1])];
-        chart.draw_series([Rectangle::new(corners, RGBColor(94, 201, 98).mix(0.5).filled())]).map_err(text_of)?;
-        chart.draw_series([Rectangle::new(corners, INK.stroke_width(2 * FINER))]).map_err(text_of)?;
-        let dots = self.views().map(|v| Circle::new(flat(v.source), 3 * FINER as i32, SOURCE.mix(0.6).filled()));
-        chart.draw_series(dots).map_err(text_of)?;
-        self.first_view(&mut chart, 0, flat)?;
+        volume(&mut chart, [(low[0], low[1]), (high[0], high[1])])?;
+        self.sources(&mut chart, 0, flat)?;
         let middle = ((low[0] + high[0]) / 2.0, high[1]);
         label(&mut chart, middle, Pos::new(HPos::Center, VPos::Bottom), INK, "volume")?;
         self.turning(&mut chart, (x[1] - x[0]).max(y[1] - y[0]))?;
@@ -225,8 +211,10 @@ impl Picture<'_> {
         chart.draw_series([Polygon::new(wings.to_vec(), SOURCE.filled())]).map(|_| ()).map_err(text_of)
     }
 
-    /// The first view's source, its detector along u (`axis` 0) or v (1), and the rays between them.
-    fn first_view(&self, chart: &mut Chart, axis: usize, flat: impl Fn(Vec3) -> (f64, f64)) -> Drawn {
+    /// The sources; of the first view also the detector along u (`axis` 0) or v (1), and the rays between them.
+    fn sources(&self, chart: &mut Chart, axis: usize, flat: impl Fn(Vec3) -> (f64, f64)) -> Drawn {
+        let dots = self.views().map(|v| Circle::new(flat(v.source), 3 * FINER as i32, SOURCE.mix(0.6).filled()));
+        chart.draw_series(dots).map_err(text_of)?;
         let view = &self.geometry.views[0];
         let ends = self.ends(view)[axis].map(&flat);
         let source = flat(view.source);
@@ -268,14 +256,13 @@ impl Picture<'_> {
         let mut chart = frame.chart(area)?;
         let left = corners.iter().map(|p| p.0).fold(f64::INFINITY, f64::min);
         let right = corners.iter().map(|p| p.0).fold(f64::NEG_INFINITY, f64::max);
-        let corners = [(left, low[2]), (right, high[2])];
-        chart.draw_series([Rectangle::new(corners, RGBColor(94, 201, 98).mix(0.5).filled())]).map_err(text_of)?;
-        chart.draw_series([Rectangle::new(corners, INK.stroke_width(2 * FINER))]).map_err(text_of)?;
+        volume(&mut chart, [(left, low[2]), (right, high[2])])?;
         let axis: Vec<(f64, f64)> = (0..80).map(|i| (0.0, y[0] + (y[1] - y[0]) * f64::from(i) / 79.0)).collect();
-        dashed(&mut chart, &axis, INK.mix(0.6).stroke_width(FINER))?;
-        let dots = self.views().map(|v| Circle::new(flat(v.source), 3 * FINER as i32, SOURCE.mix(0.6).filled()));
-        chart.draw_series(dots).map_err(text_of)?;
-        self.first_view(&mut chart, 1, flat)
+        // Dashes: a line from each even-numbered point to the next.
+        for pair in axis.chunks(2) {
+            line(&mut chart, pair.to_vec(), INK.mix(0.6).stroke_width(FINER))?;
+        }
+        self.sources(&mut chart, 1, flat)
     }
 
     /// The share of views over the volume's central slice along the axes `seen`, to the right and up.

@@ -202,7 +202,7 @@ impl<'p, 'a> Item<'p, 'a> {
     }
 
     /// An error about this value.
-    pub fn invalid(&self, found: impl ToString, expected: impl Into<String>) -> Error {
+    pub fn invalid(&self, found: impl ToString, expected: impl ToString) -> Error {
         Error::invalid(&self.pickle.place, self.key(), found, expected)
     }
 
@@ -212,11 +212,11 @@ impl<'p, 'a> Item<'p, 'a> {
     }
 
     /// An error about the value at `key`, here or below.
-    pub fn invalid_at(&self, key: String, found: impl ToString, expected: impl Into<String>) -> Error {
+    pub fn invalid_at(&self, key: String, found: impl ToString, expected: impl ToString) -> Error {
         Error::invalid(&self.pickle.place, key, found, expected)
     }
 
-    fn other(&self, expected: impl Into<String>) -> Error {
+    fn other(&self, expected: impl ToString) -> Error {
         self.invalid(self.pickle.heap.kind(self.value), expected)
     }
 

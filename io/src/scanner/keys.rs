@@ -59,7 +59,7 @@ impl Keys {
         &self.place
     }
 
-    pub fn invalid(&self, key: &str, found: impl ToString, expected: impl Into<String>) -> Error {
+    pub fn invalid(&self, key: &str, found: impl ToString, expected: impl ToString) -> Error {
         Error::invalid(&self.place, key, found, expected)
     }
 

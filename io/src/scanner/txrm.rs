@@ -53,7 +53,7 @@ impl Txrm {
         Ok(Self { place, size, file })
     }
 
-    fn invalid(&self, field: &str, found: impl ToString, expected: impl Into<String>) -> Error {
+    fn invalid(&self, field: &str, found: impl ToString, expected: impl ToString) -> Error {
         Error::invalid(&self.place, field, found, expected)
     }
 

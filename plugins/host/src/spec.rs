@@ -10,7 +10,7 @@ use crate::stage::projector::ProjectorStage;
 use crate::stage::regularizer::RegularizerStage;
 use crate::stage::{build, initializer};
 use conefield_core::prelude::*;
-use conefield_core::registry::{self, Kind, Make, NewType, Registered};
+use conefield_core::registry::{self, Kind, Make, Registered, StageType};
 use serde_json::Value;
 use std::sync::Arc;
 
@@ -18,9 +18,9 @@ use std::sync::Arc;
 pub fn register(library: &Library) -> Result<()> {
     let new = |t: &Arc<Type>| {
         let (name, doc, schema) = (t.name.clone(), t.doc.clone(), t.schema.clone());
-        Ok(NewType { name, doc, schema, make: make(t.clone())? })
+        Ok(StageType::loaded(&library.owner(), name, doc, schema, make(t.clone())?))
     };
-    registry::add(&library.owner(), library.types.iter().map(new).collect::<Result<_>>()?)
+    registry::add(library.types.iter().map(new).collect::<Result<_>>()?)
 }
 
 /// Settings of a library's stage, with all defaults written out.

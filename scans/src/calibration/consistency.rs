@@ -362,13 +362,7 @@ pub(crate) mod tests {
     /// A watch that ignores progress and never cancels.
     pub(crate) struct Silent;
 
-    impl Watch for Silent {
-        fn cancelled(&self) -> bool {
-            false
-        }
-
-        fn progress(&self, _: f64) {}
-    }
+    impl Watch for Silent {}
 
     /// Gaussians with known line integrals: centre in mm, width in mm, largest value in 1/mm.
     const OBJECT: [(Vec3, f64, f64); 6] = [
@@ -406,13 +400,17 @@ pub(crate) mod tests {
         Scan { geometry, projections, unit: Unit::default(), provenance: Default::default() }
     }
 
+    fn compared(scan: &Scan) -> Consistency {
+        Consistency::new(scan, 96, &Correction::default()).unwrap()
+    }
+
     fn error(pairs: &Consistency, parameter: Parameter, value: f64) -> f64 {
         pairs.error(&pairs.misfits(&Correction::default().with(parameter, value)))
     }
 
     #[test]
     fn pairs_are_consistent_only_in_the_true_geometry() {
-        let pairs = Consistency::new(&scan(24, 0.0), 96, &Correction::default()).unwrap();
+        let pairs = compared(&scan(24, 0.0));
         let right = error(&pairs, Parameter::OffsetU, 0.0);
         let wrong = [
             (Parameter::OffsetU, 1.0),
@@ -433,7 +431,7 @@ pub(crate) mod tests {
     /// The reason why tilt is not estimated on a circle.
     #[test]
     fn a_tilt_on_a_circle_hardly_changes_the_error() {
-        let pairs = Consistency::new(&scan(24, 0.0), 96, &Correction::default()).unwrap();
+        let pairs = compared(&scan(24, 0.0));
         let right = error(&pairs, Parameter::Tilt, 0.0);
         for degrees in [-3.0f64, 3.0] {
             let tilted = error(&pairs, Parameter::Tilt, degrees.to_radians());
@@ -447,12 +445,11 @@ pub(crate) mod tests {
     fn noise_favours_no_geometry() {
         let mut blank = scan(24, 0.01);
         let object = scan(24, 0.0).projections;
-        let pairs = |scan: &Scan| Consistency::new(scan, 96, &Correction::default()).unwrap();
         let mean = |p: &Consistency, c: Correction| p.misfits(&c).iter().sum::<f64>() / p.planes as f64;
-        let noisy = mean(&pairs(&blank), Correction::default());
+        let noisy = mean(&compared(&blank), Correction::default());
         assert!((noisy - 1.0).abs() < 0.1, "{noisy}");
         // The same pixels with only their noise.
-        let mut only = pairs(&blank);
+        let mut only = compared(&blank);
         blank.projections -= &object;
         for (v, pixels) in only.pixels.iter_mut().enumerate() {
             for x in pixels {
@@ -468,13 +465,13 @@ pub(crate) mod tests {
     #[test]
     fn planes_that_are_cut_off_are_ignored() {
         let whole = scan(24, 0.0);
-        let all = Consistency::new(&whole, 96, &Correction::default()).unwrap().planes();
+        let all = compared(&whole).planes();
         let crop = |rows: usize, columns: usize| {
             let mut cut = whole.clone();
             cut.geometry.detector = [rows, columns];
             let [r, c] = [(96 - rows) / 2, (96 - columns) / 2];
             cut.projections = whole.projections.slice(s![.., r..r + rows, c..c + columns]).to_owned();
-            Consistency::new(&cut, 96, &Correction::default()).unwrap()
+            compared(&cut)
         };
         let (high, narrow) = (crop(40, 96), crop(96, 20));
         assert!((1..all).contains(&high.planes()), "{all} {}", high.planes());

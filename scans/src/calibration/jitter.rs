@@ -16,7 +16,7 @@ use crate::provenance;
 use conefield_core::backend::Backend;
 use conefield_core::error::{Result, ensure};
 use conefield_core::geometry::{Vec3, View, dot, norm, sub};
-use conefield_core::matrix::inverse;
+use conefield_core::matrix::{inner, inverse};
 use conefield_core::scan::Scan;
 use ndarray::{ArrayView2, Zip};
 use serde::Serialize;
@@ -200,17 +200,13 @@ fn remove_motion(views: &[View], center: Vec3, shifts: &mut [[f64; 2]]) {
     let mut matrix = vec![vec![0.0; 3]; 3];
     let mut right = [0.0; 3];
     for (rows, shift) in moved.iter().zip(shifts.iter()) {
-        for a in 0..3 {
-            for k in 0..2 {
-                right[a] += rows[a][k] * shift[k];
-                for b in 0..3 {
-                    matrix[a][b] += rows[a][k] * rows[b][k];
-                }
-            }
+        for (a, k) in (0..6).map(|i| (i / 2, i % 2)) {
+            right[a] += rows[a][k] * shift[k];
+            (0..3).for_each(|b| matrix[a][b] += rows[a][k] * rows[b][k]);
         }
     }
     let Some(inverse) = inverse(matrix) else { return };
-    let by: [f64; 3] = std::array::from_fn(|a| (0..3).map(|b| inverse[a][b] * right[b]).sum());
+    let by: [f64; 3] = std::array::from_fn(|a| inner(&inverse[a], &right));
     for (rows, shift) in moved.iter().zip(shifts) {
         for k in 0..2 {
             shift[k] -= (0..3).map(|a| rows[a][k] * by[a]).sum::<f64>();

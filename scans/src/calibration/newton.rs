@@ -11,7 +11,7 @@
 use crate::calibration::CLEAR;
 use crate::calibration::consistency::Consistency;
 use crate::calibration::parameters::{Correction, Parameter};
-use crate::calibration::search::{Evidence, Meter, REACH, advance, solved};
+use crate::calibration::search::{Evidence, Meter, REACH, Steps, solved};
 use conefield_core::Result;
 use conefield_core::parallel;
 
@@ -58,20 +58,14 @@ impl Newton<'_> {
     /// At most `rounds` steps from `start` in the parameters `active`.
     pub fn refine(&self, active: &[Parameter], start: Correction, rounds: usize) -> Result<Place> {
         let units: Vec<f64> = active.iter().map(|p| p.pixel(&self.pairs.geometry)).collect();
-        let mut here = (start, self.misfits(&start)?);
         let mut evidence = vec![];
-        for _ in 0..rounds.min(rounds * active.len()) {
-            let around = self.around(active, &units, &here)?;
+        let mut step = |here: &Misfits| {
+            let around = self.around(active, &units, here)?;
             evidence = self.evidence(&around, &units);
-            let Some(step) = around.step(None) else { break };
-            let better = |before: &Vec<f64>, there: &Correction| {
-                let found = self.misfits(there)?;
-                Ok((found.iter().sum::<f64>() < before.iter().sum::<f64>()).then_some(found))
-            };
-            if advance(active, &units, &mut here, &step, better)? {
-                break;
-            }
-        }
+            Ok(around.step(None))
+        };
+        let steps = Steps { active, units: &units, rounds };
+        let here = steps.down(start, &|c| self.misfits(c), &|m| m.iter().sum(), &mut step)?;
         for (one, &p) in evidence.iter_mut().zip(active) {
             one.sure = self.surely_better(&here.1, &self.misfits(&here.0.with(p, 0.0))?);
         }

@@ -168,16 +168,12 @@ mod tests {
         for (shift, said) in [(0.0, 0.0), (1.2, 0.0), (-0.5, 0.3), (18.0, 18.0), (18.0, 17.0)] {
             let opposite = Opposite::of(scan(360.0, shift, said));
             assert!(opposite.enough());
-            let none = opposite.opinion(&Correction::default(), Parameter::OffsetU).unwrap();
-            let truth = shift - said;
+            let (u, truth) = (Parameter::OffsetU, shift - said);
+            let opinion = |change: f64| opposite.opinion(&Correction::default().with(u, change), u).unwrap();
+            let [none, right, wrong] = [0.0, truth, truth - 3.0].map(opinion);
             assert!((none.change - truth).abs() < 3.0 * none.deviation + 0.1, "{shift}, {said}: {none:?}");
-            let right =
-                opposite.opinion(&Correction::default().with(Parameter::OffsetU, truth), Parameter::OffsetU).unwrap();
             assert!(right.change.abs() < 3.0 * right.deviation + 0.03, "{shift}, {said}: {right:?}");
             assert_eq!(right.better, truth != 0.0, "{shift}, {said}: {right:?}");
-            let wrong = opposite
-                .opinion(&Correction::default().with(Parameter::OffsetU, truth - 3.0), Parameter::OffsetU)
-                .unwrap();
             assert!(!wrong.better, "{shift}, {said}: {wrong:?}");
         }
     }

@@ -27,9 +27,11 @@ const CUTS: usize = 3;
 /// Receives the progress of the work and can cancel it.
 pub trait Watch: Sync {
     /// Whether the work is cancelled.
-    fn cancelled(&self) -> bool;
+    fn cancelled(&self) -> bool {
+        false
+    }
     /// Reports the approximate share of the work that is done.
-    fn progress(&self, share: f64);
+    fn progress(&self, _share: f64) {}
 }
 
 /// Counts the work for a [`Watch`].
@@ -130,21 +132,15 @@ impl Search<'_> {
     /// At most `rounds` Gauss-Newton steps from `start` in the parameters `active`.
     pub fn refine(&self, active: &[Parameter], start: Correction, rounds: usize) -> Result<Fit> {
         let units: Vec<f64> = active.iter().map(|p| p.pixel(&self.level.geometry)).collect();
-        let mut here = (start, self.predict(&start)?);
         let mut slopes = vec![];
-        for _ in 0..rounds.min(rounds * active.len()) {
-            slopes = self.slopes(active, &units, here.0)?;
-            let normal = Normal::of(&slopes, &here.1);
-            let Some(step) = solved(normal.matrix, &normal.gradient) else { break };
-            let better = |before: &Prediction, there: &Correction| {
-                let found = self.predict(there)?;
-                Ok((found.error < before.error).then_some(found))
-            };
-            if advance(active, &units, &mut here, &step, better)? {
-                break;
-            }
-        }
-        Ok(Fit { correction: here.0, prediction: here.1, active: active.to_vec(), units, slopes })
+        let mut step = |(here, prediction): &(Correction, Prediction)| {
+            slopes = self.slopes(active, &units, *here)?;
+            let normal = Normal::of(&slopes, prediction);
+            Ok(solved(normal.matrix, &normal.gradient))
+        };
+        let steps = Steps { active, units: &units, rounds };
+        let (correction, prediction) = steps.down(start, &|c| self.predict(c), &|p| p.error, &mut step)?;
+        Ok(Fit { correction, prediction, active: active.to_vec(), units, slopes })
     }
 
     /// The fit without the change of one parameter. The derivatives give the best values of the others.
@@ -240,27 +236,42 @@ pub(crate) fn solved(matrix: Vec<Vec<f64>>, gradient: &[f64]) -> Option<Vec<f64>
     Some(inverse(damped(matrix))?.iter().map(|row| -inner(row, gradient)).collect())
 }
 
-/// Moves `here` by the first of ever shorter parts of `step` that is `better` than what has been found there; stays if
-/// none is. Returns whether this is the last step. `units` are pixels of the parameters `active`.
-pub(crate) fn advance<T>(
-    active: &[Parameter],
-    units: &[f64],
-    here: &mut (Correction, T),
-    step: &[f64],
-    better: impl Fn(&T, &Correction) -> Result<Option<T>>,
-) -> Result<bool> {
-    let longest = step.iter().fold(0.0f64, |m, s| m.max(s.abs()));
-    let mut share = (LONGEST / longest.max(1e-12)).min(1.0);
-    for _ in 0..=CUTS {
-        let moves = active.iter().zip(units).zip(step);
-        let there = moves.fold(here.0, |c, ((&p, unit), s)| c.with(p, c.get(p) + share * s * unit));
-        if let Some(found) = better(&here.1, &there)? {
-            *here = (there, found);
-            return Ok(share * longest < SMALL);
+/// At most `rounds` steps in the parameters `active`, whose pixels are `units`.
+pub(crate) struct Steps<'a> {
+    pub active: &'a [Parameter],
+    pub units: &'a [f64],
+    pub rounds: usize,
+}
+
+impl Steps<'_> {
+    /// From `start`, moves by the first of ever shorter parts of each `step` at which `error` falls. Ends if it falls at
+    /// none, or after a short step. Returns the last correction with what is found there.
+    pub fn down<T>(
+        &self,
+        start: Correction,
+        at: &dyn Fn(&Correction) -> Result<T>,
+        error: &dyn Fn(&T) -> f64,
+        step: &mut dyn FnMut(&(Correction, T)) -> Result<Option<Vec<f64>>>,
+    ) -> Result<(Correction, T)> {
+        let mut here = (start, at(&start)?);
+        'steps: for _ in 0..self.rounds.min(self.rounds * self.active.len()) {
+            let Some(step) = step(&here)? else { break };
+            let longest = step.iter().fold(0.0f64, |m, s| m.max(s.abs()));
+            let mut share = (LONGEST / longest.max(1e-12)).min(1.0);
+            for _ in 0..=CUTS {
+                let moves = self.active.iter().zip(self.units).zip(&step);
+                let there = moves.fold(here.0, |c, ((&p, unit), s)| c.with(p, c.get(p) + share * s * unit));
+                let found = at(&there)?;
+                if error(&found) < error(&here.1) {
+                    here = (there, found);
+                    if share * longest < SMALL { break 'steps } else { continue 'steps }
+                }
+                share /= 3.0;
+            }
+            break;
         }
-        share /= 3.0;
+        Ok(here)
     }
-    Ok(true)
 }
 
 /// Adds a small number to the diagonal: a parameter that the views do not determine then keeps its value.

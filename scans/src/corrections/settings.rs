@@ -54,7 +54,7 @@ pub(crate) fn placed(error: Error, name: &str) -> Error {
 
 /// A TOML value, or else a string.
 fn read(text: &str) -> Value {
-    let parsed = format!("value = {text}").parse::<Table>().ok();
+    let parsed = format!("value = {text}").parse::<Table>().ok().filter(|t| t.len() == 1);
     parsed.and_then(|mut t| t.remove("value")).unwrap_or_else(|| Value::String(text.to_owned()))
 }
 
@@ -110,6 +110,7 @@ mod tests {
             (vec!["low-counts.photons=0"], vec!["low-counts.photons"]),
             (vec!["scatter.share=2"], vec!["scatter.share"]),
             (vec!["flux.rows=[5, 5]"], vec!["flux.rows"]),
+            (vec!["rings.window=5\nrest=7"], vec!["rest=7"]),
         ] {
             let e = Corrections::parse(&texts).unwrap_err().to_string();
             assert!(words.iter().all(|w| e.contains(w)), "{texts:?}: {e}");

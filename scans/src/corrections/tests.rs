@@ -50,7 +50,13 @@ fn off(a: &Scan, b: &Scan) -> f64 {
     (squares.sum::<f64>() / a.projections.len() as f64).sqrt()
 }
 
-/// The same for the mean over the views, which makes rings.
+/// `a` differs from `exact` by less than `share` of what `b` does.
+fn nearer(a: &Scan, share: f64, b: &Scan, exact: &Scan, what: &str) {
+    let [a, b] = [a, b].map(|scan| off(scan, exact));
+    assert!(a < share * b, "{what}: {a}, {b}");
+}
+
+/// As [`off`], for the mean over the views, which makes rings.
 fn off_always(a: &Scan, b: &Scan) -> f64 {
     let mean: Array2<f32> = (&a.projections - &b.projections).mean_axis(Axis(0)).unwrap();
     (mean.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / mean.len() as f64).sqrt()
@@ -79,12 +85,7 @@ fn constant_gains_are_removed() {
         assert!(off_always(&mended, &exact) < 0.7 * before, "{method}: {} {before}", off_always(&mended, &exact));
         assert!(found.contains("gains differ"), "{found}");
         let (kept, _) = corrected(&noisy, &[&method]);
-        assert!(
-            off(&kept, &exact) < 1.15 * off(&noisy, &exact),
-            "{method}: {} {}",
-            off(&kept, &exact),
-            off(&noisy, &exact)
-        );
+        nearer(&kept, 1.15, &noisy, &exact, &method);
     }
     assert!(refused(&noisy, &["rings.window=73"]).contains("rings.window: found 73, expected at most 72"));
 }
@@ -109,12 +110,7 @@ fn pixels_that_do_not_measure_are_filled_in() {
         faulty.projections[[v, r, c]] -= 1.0;
     }
     let (mended, found) = corrected(&faulty, &["pixels"]);
-    assert!(
-        off(&mended, &exact) < 1.4 * off(&noisy, &exact),
-        "{found}: {} {}",
-        off(&mended, &exact),
-        off(&noisy, &exact)
-    );
+    nearer(&mended, 1.4, &noisy, &exact, &found);
     assert!(off(&faulty, &exact) > 2.0 * off(&noisy, &exact));
     for clean in [&noisy, &exact] {
         let (kept, found) = corrected(clean, &["pixels"]);
@@ -129,10 +125,10 @@ fn the_tube_s_brightness_is_read_from_air() {
     let faulty = changed(&noisy, |v, _, _, a| a + 0.1 * (v as f32).sin());
     for texts in [vec!["flux"], vec!["flux.rows=[0, 60]", "flux.columns=[0, 5]"]] {
         let (mended, found) = corrected(&faulty, &texts);
-        assert!(off(&mended, &exact) < 1.05 * off(&noisy, &exact), "{texts:?} {found}");
+        nearer(&mended, 1.05, &noisy, &exact, &format!("{texts:?} {found}"));
         assert!(found.starts_with("views of 90."), "{found}");
         let (kept, _) = corrected(&noisy, &texts);
-        assert!(off(&kept, &exact) < 1.02 * off(&noisy, &exact), "{texts:?}");
+        nearer(&kept, 1.02, &noisy, &exact, &format!("{texts:?}"));
     }
     assert!(off(&faulty, &exact) > 5.0 * off(&noisy, &exact));
     // The body is not air.
@@ -146,7 +142,7 @@ fn few_photons_keep_their_mean() {
     let dark = exact(4.0);
     let noisy = counted(&dark, 500.0);
     let (mended, found) = corrected(&noisy, &["low-counts.photons=500"]);
-    assert!(off(&mended, &dark) < 0.6 * off(&noisy, &dark), "{found}: {} {}", off(&mended, &dark), off(&noisy, &dark));
+    nearer(&mended, 0.6, &noisy, &dark, &found);
     // With enough photons, nothing changes.
     let bright = counted(&exact(1.0), 1e4);
     let (kept, found) = corrected(&bright, &["low-counts.photons=1e4"]);
@@ -164,12 +160,7 @@ fn scattered_light_is_subtracted() {
         view.mapv_inplace(|a| -((-a).exp() + even).ln());
     }
     let (mended, found) = corrected(&faulty, &["scatter={ share = 0.2, width = 0.3 }"]);
-    assert!(
-        off(&mended, &exact) < 0.6 * off(&faulty, &exact),
-        "{found}: {} {}",
-        off(&mended, &exact),
-        off(&faulty, &exact)
-    );
+    nearer(&mended, 0.6, &faulty, &exact, &found);
     // Air scatters nothing.
     let air = changed(&exact, |_, _, _, _| 0.0);
     let (kept, found) = corrected(&air, &["scatter.share=0.2"]);
@@ -186,12 +177,12 @@ fn hardening_is_corrected_in_thick_paths() {
     assert!(off(&mended, &exact) < 1e-4, "{found}: {}", off(&mended, &exact));
     // With a tube voltage that is 10 % wrong, most of the error is corrected.
     let (about, _) = corrected(&faulty, &["hardening.water.kvp=108"]);
-    assert!(off(&about, &exact) < 0.3 * off(&faulty, &exact), "{} {}", off(&about, &exact), off(&faulty, &exact));
+    nearer(&about, 0.3, &faulty, &exact, "108 kV");
     // A parabola that meets the exact one at the thickest path.
     let most = exact.projections.iter().copied().fold(0.0, f32::max);
     let bend = f64::from(most - hardened(most)) / f64::from(hardened(most)).powi(2);
     let (about, _) = corrected(&faulty, &[&format!("hardening.polynomial=[1.0, {bend}]")]);
-    assert!(off(&about, &exact) < 0.2 * off(&faulty, &exact), "{} {}", off(&about, &exact), off(&faulty, &exact));
+    nearer(&about, 0.2, &faulty, &exact, "parabola");
     let (kept, _) = corrected(&exact, &["hardening.polynomial=[1]"]);
     assert!(kept.projections == exact.projections);
     let said = refused(&exact, &["hardening.polynomial=[1, -0.5]"]);
@@ -241,7 +232,7 @@ fn rows_are_extended_where_the_detector_cuts_the_object() {
     let mut padded = exact.clone();
     padded.projections.slice_mut(s![.., .., ..18]).fill(0.0);
     padded.projections.slice_mut(s![.., .., 54..]).fill(0.0);
-    assert!(off(&wide, &exact) < 0.85 * off(&padded, &exact), "{} {}", off(&wide, &exact), off(&padded, &exact));
+    nearer(&wide, 0.85, &padded, &exact, "zeros");
     assert_eq!(wide.geometry.ray(3, 5, 20), exact.geometry.ray(3, 5, 20));
 }
 

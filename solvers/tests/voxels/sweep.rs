@@ -246,19 +246,23 @@ const USUAL: [&str; 21] = [
 /// The usual ones are right, and there is nothing to warn of.
 #[test]
 fn no_geometry_gives_wrong_numbers_without_a_word() {
-    let (mut silent, mut right, mut told, mut usual) = (vec![], 0, 0, 0);
+    let (mut silent, mut right, mut told, mut usual) = (vec![], 0, 0, USUAL.to_vec());
     for named in all() {
         let (found, heard) = fdk(&named);
         let is_usual = USUAL.contains(&&named.name[..]);
-        usual += usize::from(is_usual);
-        let Ok(solution) = found else {
-            assert!(!is_usual, "{} is refused", named.name);
-            told += 1;
-            continue;
+        usual.retain(|name| *name != named.name);
+        let solution = match found {
+            Ok(solution) => solution,
+            Err(e) => {
+                assert!(!is_usual, "{}: {e}", named.name);
+                told += 1;
+                continue;
+            }
         };
         let error = error(&named, solution);
-        let warned = !heard.warnings.is_empty() || !surveyed(&named.scan).is_empty();
-        assert!(!is_usual || (error.abs() < RIGHT && !warned), "{}: {error}, {:?}", named.name, heard.notes);
+        let warnings = (&heard.warnings, surveyed(&named.scan));
+        let warned = !warnings.0.is_empty() || !warnings.1.is_empty();
+        assert!(!is_usual || (error.abs() < RIGHT && !warned), "{}: {error}, {warnings:?}", named.name);
         match error.abs() <= RIGHT {
             true => right += 1,
             false if warned => told += 1,
@@ -266,9 +270,9 @@ fn no_geometry_gives_wrong_numbers_without_a_word() {
         }
     }
     println!("{right} right, {told} told");
-    assert!(silent.is_empty(), "{silent:#?}");
+    assert!(silent.is_empty() && usual.is_empty(), "{silent:#?}, not in the sweep: {usual:?}");
     // The sweep has both kinds, and most geometries that fdk can do are right.
-    assert!(right > 60 && told > 20 && usual == USUAL.len(), "{right} right, {told} told, {usual} usual");
+    assert!(right > 60 && told > 20, "{right} right, {told} told");
 }
 
 /// The whole table, beside an iterative method: `cargo test --release -p conefield-solvers --test voxels table_of_geometries

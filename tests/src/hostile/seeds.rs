@@ -51,26 +51,6 @@ fn written(result: conefield_core::Result<()>) {
     result.expect("a valid input is written");
 }
 
-/// `a.nii`.
-pub fn nifti(dir: &Path) {
-    written(conefield_io::write_volume(dir.join("a.nii"), &volume()));
-}
-
-/// `a.nii.gz`.
-pub fn nifti_gz(dir: &Path) {
-    written(conefield_io::write_volume(dir.join("a.nii.gz"), &volume()));
-}
-
-/// `a.npy`, a volume.
-pub fn npy(dir: &Path) {
-    written(conefield_io::write_volume(dir.join("a.npy"), &volume()));
-}
-
-/// `a.mha`, packed.
-pub fn metaimage(dir: &Path) {
-    written(conefield_io::write_volume(dir.join("a.mha"), &volume()));
-}
-
 /// The lines of a MetaImage of 4 × 3 × 2 bytes, whose last says where they are.
 pub fn metaimage_lines(data: &str) -> String {
     format!(
@@ -86,11 +66,6 @@ pub fn metaimage_header(dir: &Path) {
     put(&dir.join("a.raw"), &[7; 24]);
 }
 
-/// `a.nrrd`, packed.
-pub fn nrrd(dir: &Path) {
-    written(conefield_io::write_volume(dir.join("a.nrrd"), &volume()));
-}
-
 /// `a.nhdr` and `a.raw`.
 pub fn nrrd_header(dir: &Path) {
     let text = "NRRD0005\ntype: unsigned char\ndimension: 3\nspace: left-posterior-superior\nsizes: 4 3 2\n\
@@ -99,11 +74,6 @@ pub fn nrrd_header(dir: &Path) {
                 byte skip: -1\nnote:=a test\ndata file: a.raw\n";
     put(&dir.join("a.nhdr"), text.as_bytes());
     put(&dir.join("a.raw"), &[7; 24]);
-}
-
-/// `a.tif`, a volume.
-pub fn tiff_volume(dir: &Path) {
-    written(conefield_io::write_volume(dir.join("a.tif"), &volume()));
 }
 
 /// The folder `a.zarr`: one level in two chunks, which are smaller than those of the project's own writer.
@@ -141,6 +111,25 @@ pub const VECTORS: &str = "[vectors]\ncone_vec = [\n  [500, 0, 0, -300, 0, 0, 0,
 /// The table that names RTK's file.
 pub const RTK: &str = "[rtk]\nfile = \"geometry.xml\"\npixel = { u = 2.0, v = 2.0 }\n";
 
+/// The table that names CIL's file.
+const CIL: &str = "[cil]\nfile = \"counts.h5\"\n";
+
+/// `scanner.toml` with `geometry` and counts in `counts`: the name of a file, or of an array in one.
+fn described(dir: &Path, counts: &str, geometry: &str) {
+    put(&dir.join("scanner.toml"), scanner_toml(counts, geometry).as_bytes());
+}
+
+/// `scanner.toml` with this text, and `file` with these bytes.
+fn stored(dir: &Path, file: &str, bytes: &[u8], scanner: &str) {
+    put(&dir.join(file), bytes);
+    put(&dir.join("scanner.toml"), scanner.as_bytes());
+}
+
+/// The same with a circle and counts in `counts`.
+fn circle(dir: &Path, file: &str, bytes: &[u8], counts: &str) {
+    stored(dir, file, bytes, &scanner_toml(counts, CIRCLE));
+}
+
 fn counts() -> Vec<u16> {
     (0..SHAPE.iter().product::<usize>()).map(|i| 9000 + 97 * i as u16).collect()
 }
@@ -159,22 +148,16 @@ fn counts_npy() -> Vec<u8> {
     npy_bytes("<u2", "(3, 4, 5)", &raw)
 }
 
-/// `scanner.toml` with a circle, `counts.npy`.
-pub fn scanner_npy(dir: &Path) {
-    put(&dir.join("counts.npy"), &counts_npy());
-    put(&dir.join("scanner.toml"), scanner_toml("counts.npy", CIRCLE).as_bytes());
-}
-
 /// `scanner.toml` with ASTRA's vectors, `counts.npy`.
 pub fn scanner_vectors(dir: &Path) {
     scanner_npy(dir);
-    put(&dir.join("scanner.toml"), scanner_toml("counts.npy", VECTORS).as_bytes());
+    described(dir, "counts.npy", VECTORS);
 }
 
 /// `scanner.toml`, `geometry.xml` of RTK, `counts.npy`.
 pub fn scanner_rtk(dir: &Path) {
     scanner_npy(dir);
-    put(&dir.join("scanner.toml"), scanner_toml("counts.npy", RTK).as_bytes());
+    described(dir, "counts.npy", RTK);
     let folder = dir.join("rtk");
     conefield_io::write_rtk(&folder, &scan()).expect("a circle is written");
     fs::rename(folder.join("geometry.xml"), dir.join("geometry.xml")).expect("what was written");
@@ -188,7 +171,7 @@ pub fn scanner_npz(dir: &Path) {
     w.start_file("counts.npy", options).expect("an archive that can be written");
     w.write_all(&counts_npy()).expect("an archive that can be written");
     w.finish().expect("an archive that can be written");
-    put(&dir.join("scanner.toml"), scanner_toml("counts.npz:counts", CIRCLE).as_bytes());
+    described(dir, "counts.npz:counts", CIRCLE);
 }
 
 /// A TIFF of the counts, a page a view.
@@ -209,27 +192,7 @@ pub fn scanner_tiff_of_zeros(dir: &Path, side: u32) {
     for _ in 0..SHAPE[0] {
         w.write_image::<Gray16>(side, side, &vec![0; (side * side) as usize]).expect("a file");
     }
-    put(&dir.join("scanner.toml"), scanner_toml("counts.tif", CIRCLE).as_bytes());
-}
-
-fn scanner_tiff_of(dir: &Path, packing: TiffCompression) {
-    put(&dir.join("counts.tif"), &tiff_bytes(packing));
-    put(&dir.join("scanner.toml"), scanner_toml("counts.tif", CIRCLE).as_bytes());
-}
-
-/// `scanner.toml`, `counts.tif`.
-pub fn scanner_tiff(dir: &Path) {
-    scanner_tiff_of(dir, TiffCompression::Uncompressed);
-}
-
-/// `scanner.toml`, `counts.tif` packed by deflate.
-pub fn scanner_tiff_deflate(dir: &Path) {
-    scanner_tiff_of(dir, TiffCompression::Deflate(Default::default()));
-}
-
-/// `scanner.toml`, `counts.tif` packed by LZW.
-pub fn scanner_tiff_lzw(dir: &Path) {
-    scanner_tiff_of(dir, TiffCompression::Lzw);
+    described(dir, "counts.tif", CIRCLE);
 }
 
 /// A file of the reader's own fixtures, which other programs' libraries wrote.
@@ -240,36 +203,6 @@ macro_rules! fixture {
 }
 pub(super) use fixture;
 
-/// `scanner.toml`, `counts.mat` with a variable.
-pub fn scanner_mat(dir: &Path) {
-    put(&dir.join("counts.mat"), fixture!("counts_plain.mat"));
-    put(&dir.join("scanner.toml"), scanner_toml("counts.mat:counts", CIRCLE).as_bytes());
-}
-
-/// `scanner.toml`, `counts.mat` with a field of a packed struct.
-pub fn scanner_mat_packed(dir: &Path) {
-    put(&dir.join("counts.mat"), fixture!("counts.mat"));
-    put(&dir.join("scanner.toml"), scanner_toml("counts.mat:scan.counts", CIRCLE).as_bytes());
-}
-
-/// `scanner.toml`, `counts.tif` packed by Zstandard.
-pub fn scanner_tiff_zstd(dir: &Path) {
-    put(&dir.join("counts.tif"), fixture!("zstd.tif"));
-    put(&dir.join("scanner.toml"), scanner_toml("counts.tif", CIRCLE).as_bytes());
-}
-
-/// `scanner.toml`, `counts.h5` in the layout of DXchange.
-pub fn scanner_hdf5(dir: &Path) {
-    put(&dir.join("counts.h5"), fixture!("dxchange.h5"));
-    put(&dir.join("scanner.toml"), scanner_of_hdf5().as_bytes());
-}
-
-/// `scanner.toml`, `counts.h5` in the layout of NXtomo, as HDF5 wrote it at first.
-pub fn scanner_nxtomo(dir: &Path) {
-    put(&dir.join("counts.h5"), fixture!("nxtomo.nxs"));
-    put(&dir.join("scanner.toml"), scanner_of_hdf5().as_bytes());
-}
-
 /// A description whose counts, fields and angles are in `counts.h5`.
 fn scanner_of_hdf5() -> String {
     let circle = CIRCLE.replace("range_deg = 360.0", "angles_deg = \"counts.h5\"");
@@ -277,19 +210,18 @@ fn scanner_of_hdf5() -> String {
     scanner_toml("counts.h5", &circle).replace("projections = \"counts.h5\"", files).replace("i0 = 20000.0\n", "")
 }
 
-/// `scanner.toml`, `counts.h5` with geometry, as CIL writes it.
-pub fn scanner_cil(dir: &Path) {
-    put(&dir.join("counts.h5"), fixture!("cil.nxs"));
-    put(&dir.join("scanner.toml"), scanner_toml("counts.h5", "[cil]\nfile = \"counts.h5\"\n").as_bytes());
+/// A TIFF of each view's counts.
+fn images(dir: &Path, name: impl Fn(usize) -> String) {
+    for (i, view) in counts().chunks(SHAPE[1] * SHAPE[2]).enumerate() {
+        let file = File::create(dir.join(name(i))).expect("a file of the test's own folder");
+        let mut w = TiffEncoder::new(file).expect("a file");
+        w.write_image::<Gray16>(SHAPE[2] as u32, SHAPE[1] as u32, view).expect("a file");
+    }
 }
 
 /// `bone.xtekct` of Nikon, with its images.
 pub fn xtekct(dir: &Path) {
-    for (i, view) in counts().chunks(SHAPE[1] * SHAPE[2]).enumerate() {
-        let file = File::create(dir.join(format!("bone_{:04}.tif", i + 1))).expect("a file of the test's own folder");
-        let mut w = TiffEncoder::new(file).expect("a file");
-        w.write_image::<Gray16>(SHAPE[2] as u32, SHAPE[1] as u32, view).expect("a file");
-    }
+    images(dir, |i| format!("bone_{:04}.tif", i + 1));
     let text = "[XTekCT]\nName=bone\nVoxelsX=4\nVoxelSizeX=0.5\nVoxelsY=4\nVoxelSizeY=0.5\nVoxelsZ=3\nVoxelSizeZ=0.75\n\
                 InputSeparator=_\nInputFolderName=\nInputDigits=4\nProjections=3\nWhiteLevel=50000\nDetectorPixelsX=5\n\
                 DetectorPixelSizeX=2\nDetectorPixelsY=4\nDetectorPixelSizeY=1.5\nSrcToObject=500\nSrcToDetector=800\n\
@@ -299,11 +231,7 @@ pub fn xtekct(dir: &Path) {
 
 /// `bone.log` of SkyScan, with its images.
 pub fn skyscan(dir: &Path) {
-    for (i, view) in counts().chunks(SHAPE[1] * SHAPE[2]).enumerate() {
-        let file = File::create(dir.join(format!("bone{i:08}.tif"))).expect("a file of the test's own folder");
-        let mut w = TiffEncoder::new(file).expect("a file");
-        w.write_image::<Gray16>(SHAPE[2] as u32, SHAPE[1] as u32, view).expect("a file");
-    }
+    images(dir, |i| format!("bone{i:08}.tif"));
     let text = "[System]\nScanner=SkyScan1172\n[Acquisition]\nFilename Prefix=bone\nNumber of Files= 3\nNumber of Rows= 4\n\
                 Number of Columns= 5\nImage Pixel Size (um)=   10.5\nObject to Source (mm)=50.5\n\
                 Camera to Source (mm)=200.25\nOptical Axis (line)= 1\nReference Intensity=60000\n\
@@ -336,26 +264,6 @@ pub fn elekta(dir: &Path) {
     let text = "<?xml version=\"1.0\"?>\n<ProjectionSet><Frames><Frame><GantryAngle>-90.5</GantryAngle>\
                 <UCentre>115</UCentre><VCentre>-1.5</VCentre></Frame></Frames></ProjectionSet>";
     put(&dir.join("_Frames.xml"), text.as_bytes());
-}
-
-/// `a.txrm` of Zeiss.
-pub fn txrm(dir: &Path) {
-    put(&dir.join("a.txrm"), fixture!("a.txrm"));
-}
-
-/// `scan.pickle`, with the volume.
-pub fn naf(dir: &Path) {
-    written(conefield_io::write_naf(dir.join("scan.pickle"), &scan(), None, Some(&volume())));
-}
-
-/// The folder `r2`, with the volume.
-pub fn r2(dir: &Path) {
-    written(conefield_io::write_r2(dir.join("r2"), &scan(), None, Some(&volume())));
-}
-
-/// The folder `scan` with `scan.toml`, `projections.npy` and `truth.nii.gz`.
-pub fn scan_toml(dir: &Path) {
-    written(conefield_io::write_scan(dir.join("scan"), &scan(), Some(&volume())));
 }
 
 /// The folder `scan` with `scan.json`.
@@ -394,6 +302,62 @@ pub fn spec_json(dir: &Path) {
     let value: serde_json::Value =
         toml::from_str(include_str!("../../../conefield/specs/naf.toml")).expect("a shipped spec");
     put(&dir.join("spec.json"), value.to_string().as_bytes());
+}
+
+/// Defines seeds that take one call.
+macro_rules! seeds {
+    ($($(#[$about:meta])* $name:ident: |$dir:ident| $work:expr;)*) => {
+        $(
+            $(#[$about])*
+            pub fn $name($dir: &Path) {
+                $work;
+            }
+        )*
+    };
+}
+
+seeds! {
+    /// `a.nii`.
+    nifti: |dir| written(conefield_io::write_volume(dir.join("a.nii"), &volume()));
+    /// `a.nii.gz`.
+    nifti_gz: |dir| written(conefield_io::write_volume(dir.join("a.nii.gz"), &volume()));
+    /// `a.npy`, a volume.
+    npy: |dir| written(conefield_io::write_volume(dir.join("a.npy"), &volume()));
+    /// `a.mha`, packed.
+    metaimage: |dir| written(conefield_io::write_volume(dir.join("a.mha"), &volume()));
+    /// `a.nrrd`, packed.
+    nrrd: |dir| written(conefield_io::write_volume(dir.join("a.nrrd"), &volume()));
+    /// `a.tif`, a volume.
+    tiff_volume: |dir| written(conefield_io::write_volume(dir.join("a.tif"), &volume()));
+    /// `scanner.toml` with a circle, `counts.npy`.
+    scanner_npy: |dir| circle(dir, "counts.npy", &counts_npy(), "counts.npy");
+    /// `scanner.toml`, `counts.tif`.
+    scanner_tiff: |dir| circle(dir, "counts.tif", &tiff_bytes(TiffCompression::Uncompressed), "counts.tif");
+    /// `scanner.toml`, `counts.tif` packed by deflate.
+    scanner_tiff_deflate: |dir|
+        circle(dir, "counts.tif", &tiff_bytes(TiffCompression::Deflate(Default::default())), "counts.tif");
+    /// `scanner.toml`, `counts.tif` packed by LZW.
+    scanner_tiff_lzw: |dir| circle(dir, "counts.tif", &tiff_bytes(TiffCompression::Lzw), "counts.tif");
+    /// `scanner.toml`, `counts.mat` with a variable.
+    scanner_mat: |dir| circle(dir, "counts.mat", fixture!("counts_plain.mat"), "counts.mat:counts");
+    /// `scanner.toml`, `counts.mat` with a field of a packed struct.
+    scanner_mat_packed: |dir| circle(dir, "counts.mat", fixture!("counts.mat"), "counts.mat:scan.counts");
+    /// `scanner.toml`, `counts.tif` packed by Zstandard.
+    scanner_tiff_zstd: |dir| circle(dir, "counts.tif", fixture!("zstd.tif"), "counts.tif");
+    /// `scanner.toml`, `counts.h5` in the layout of DXchange.
+    scanner_hdf5: |dir| stored(dir, "counts.h5", fixture!("dxchange.h5"), &scanner_of_hdf5());
+    /// `scanner.toml`, `counts.h5` in the layout of NXtomo, as HDF5 wrote it at first.
+    scanner_nxtomo: |dir| stored(dir, "counts.h5", fixture!("nxtomo.nxs"), &scanner_of_hdf5());
+    /// `scanner.toml`, `counts.h5` with geometry, as CIL writes it.
+    scanner_cil: |dir| stored(dir, "counts.h5", fixture!("cil.nxs"), &scanner_toml("counts.h5", CIL));
+    /// `a.txrm` of Zeiss.
+    txrm: |dir| put(&dir.join("a.txrm"), fixture!("a.txrm"));
+    /// `scan.pickle`, with the volume.
+    naf: |dir| written(conefield_io::write_naf(dir.join("scan.pickle"), &scan(), None, Some(&volume())));
+    /// The folder `r2`, with the volume.
+    r2: |dir| written(conefield_io::write_r2(dir.join("r2"), &scan(), None, Some(&volume())));
+    /// The folder `scan` with `scan.toml`, `projections.npy` and `truth.nii.gz`.
+    scan_toml: |dir| written(conefield_io::write_scan(dir.join("scan"), &scan(), Some(&volume())));
 }
 
 /// In gzip.

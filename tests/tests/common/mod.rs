@@ -34,16 +34,32 @@ pub fn truth() -> Volume {
     Volume::centered(data, [10.0; 3])
 }
 
-/// Eight views with a detector of 16 × 16 pixels; the keys in `change` replace these.
-pub fn protocol(change: Value) -> Protocol {
-    let mut all = json!({
-        "dso": 500.0, "dsd": 750.0, "detector": [16, 16], "extent": {"side": [280.0, 280.0]},
-        "angles": {"even": {"views": 8}},
-    });
+/// `all` with the keys of `change`, which replace its own.
+fn changed(mut all: Value, change: Value) -> Value {
     if let (Some(all), Value::Object(change)) = (all.as_object_mut(), change) {
         all.extend(change);
     }
-    serde_json::from_value(all).unwrap()
+    all
+}
+
+/// Eight views with a detector of 16 × 16 pixels; the keys in `change` replace these.
+pub fn protocol(change: Value) -> Protocol {
+    let all = json!({
+        "dso": 500.0, "dsd": 750.0, "detector": [16, 16], "extent": {"side": [280.0, 280.0]},
+        "angles": {"even": {"views": 8}},
+    });
+    serde_json::from_value(changed(all, change)).unwrap()
+}
+
+/// A small field with layers of `width` numbers; the keys in `change` replace these.
+pub fn neural_field(width: usize, change: Value) -> Value {
+    let all = json!({
+        "type": "neural-field", "normalizers": [{"type": "layer-norm"}],
+        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
+        "field": {"type": "mlp", "width": width, "depth": 3, "skips": [1]},
+        "projector": {"type": "ray-march", "samples": 20},
+    });
+    changed(all, change)
 }
 
 /// Eight views of [`truth`], 16 × 16 pixels.

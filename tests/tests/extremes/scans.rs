@@ -1,7 +1,7 @@
 //! Scans at the edge: units, objects, photons, views, sizes, distances. A field and the classical solvers meet each.
 
 use crate::case::{Case, Seen};
-use crate::common::{protocol, scan, solve, truth, volume};
+use crate::common::{neural_field, protocol, scan, solve, truth, volume};
 use conefield_core::error::Result;
 use conefield_core::scan::{Scan, Volume};
 use conefield_io::{Conversion, OpenBeam};
@@ -12,13 +12,9 @@ use serde_json::{Value, json};
 
 /// A small field.
 pub fn field() -> Value {
-    json!({
-        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
-        "normalizers": [{"type": "layer-norm"}],
-        "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1]},
-        "projector": {"type": "ray-march", "samples": 20, "sampling": "uniform"},
-        "type": "neural-field", "training": {"steps": 300, "rays": 64}, "optimizer": {"lr": 0.01},
-    })
+    let projector = json!({"type": "ray-march", "samples": 20, "sampling": "uniform"});
+    let training = json!({"steps": 300, "rays": 64});
+    neural_field(12, json!({"projector": projector, "training": training, "optimizer": {"lr": 0.01}}))
 }
 
 /// Solvers of voxels, with few passes.

@@ -110,12 +110,6 @@ impl RowMap for Curves {
         [3, 3]
     }
 
-    fn parameters(&self) -> Vec<(String, Vec<usize>)> {
-        vec![]
-    }
-
-    fn init(&self, _: u64, _: &mut [f32]) {}
-
     #[inline(always)]
     fn forward<N: Lanes>(&self, _: &[N::Real], x: Channels<N>, y: &mut ChannelsMut<N>) {
         let s = x.at(0).sin_cos().0;

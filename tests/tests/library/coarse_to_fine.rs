@@ -1,6 +1,6 @@
 //! Training whose encoder opens level by level.
 
-use crate::common::{bits, goes_on, model, pipeline, planned, psnr, scan};
+use crate::common::{bits, goes_on, model, neural_field, pipeline, planned, psnr, scan};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
 use conefield_core::method::Job;
@@ -8,12 +8,13 @@ use conefield_core::pipeline::Model;
 use serde_json::{Value, json};
 
 fn settings(encoder: Value, callbacks: Value) -> Value {
-    json!({
-        "encoder": encoder, "normalizers": [{"type": "layer-norm"}], "callbacks": callbacks,
-        "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1]},
-        "projector": {"type": "ray-march", "samples": 20},
-        "type": "neural-field", "training": {"steps": 60, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.02},
-    })
+    neural_field(
+        12,
+        json!({
+            "encoder": encoder, "callbacks": callbacks,
+            "training": {"steps": 60, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.02},
+        }),
+    )
 }
 
 fn hash_grid() -> Value {

@@ -1,6 +1,6 @@
 //! The drift that the callback `drift` logs: what it measures, and what it leaves alone.
 
-use crate::common::{Heard, goes_on, model, pipeline, planned, scan, solve, state};
+use crate::common::{Heard, goes_on, model, neural_field, pipeline, planned, scan, solve, state};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::backend::Backend;
@@ -16,13 +16,15 @@ use std::sync::Arc;
 
 /// 40 steps over 8 views: 5 epochs.
 fn settings() -> Value {
-    json!({
-        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
-        "normalizers": [{"type": "layer-norm"}],
-        "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1], "output": "none"},
-        "projector": {"type": "ray-march", "samples": 20},
-        "type": "neural-field", "callbacks": [{"type": "rollback"}, {"type": "drift", "every": 1.5, "points": 300}], "training": {"steps": 40, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.02},
-    })
+    let mut all = neural_field(
+        12,
+        json!({
+            "callbacks": [{"type": "rollback"}, {"type": "drift", "every": 1.5, "points": 300}],
+            "training": {"steps": 40, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.02},
+        }),
+    );
+    all["field"]["output"] = json!("none");
+    all
 }
 
 fn with(path: &str, value: Value) -> Value {

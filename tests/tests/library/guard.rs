@@ -1,6 +1,6 @@
 //! Training that runs away is found out, goes back, and ends in words if that does not help.
 
-use crate::common::{goes_on, model, planned, scan, solve, solve_on, state};
+use crate::common::{goes_on, model, neural_field, planned, scan, solve, solve_on, state};
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Arena;
 use conefield_core::backend::{Adam, Backend, Executable, Explain, StepStats, Work};
@@ -11,13 +11,8 @@ use conefield_core::stage::UnitRay;
 use serde_json::{Value, json};
 
 fn settings(steps: u64) -> Value {
-    json!({
-        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
-        "normalizers": [{"type": "layer-norm"}],
-        "field": {"type": "mlp", "width": 8, "depth": 3, "skips": [1]},
-        "projector": {"type": "ray-march", "samples": 20},
-        "type": "neural-field", "training": {"steps": steps, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.01},
-    })
+    let training = json!({"steps": steps, "rays": 64, "report_every": 5});
+    neural_field(8, json!({"training": training, "optimizer": {"lr": 0.01}}))
 }
 
 /// What goes wrong, decided by the step, so that it goes wrong again after a resumption.

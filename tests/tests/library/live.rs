@@ -1,6 +1,6 @@
 //! Slices of a field while it trains.
 
-use crate::common::{model, planned, scan, volume};
+use crate::common::{model, neural_field, planned, scan, volume};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::geometry::VoxelGrid;
@@ -38,13 +38,13 @@ impl Observer for Slices {
 
 #[test]
 fn slices_are_those_of_the_field_and_change_nothing() {
-    let value = json!({
-        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
-        "normalizers": [{"type": "layer-norm"}],
-        "field": {"type": "mlp", "width": 8, "depth": 3, "skips": [1]},
-        "projector": {"type": "ray-march", "samples": 20},
-        "type": "neural-field", "callbacks": [{"type": "rollback"}, {"type": "fft-mask", "epoch": 2, "threshold": 1e-6}], "training": {"steps": 40, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.01},
-    });
+    let value = neural_field(
+        8,
+        json!({
+            "callbacks": [{"type": "rollback"}, {"type": "fft-mask", "epoch": 2, "threshold": 1e-6}],
+            "training": {"steps": 40, "rays": 64, "report_every": 5}, "optimizer": {"lr": 0.01},
+        }),
+    );
     let (scan, cpu) = (scan(), Cpu::new());
     let mut plan = planned(&value, &cpu).unwrap();
     let mut run = |every: u64| {

@@ -1,6 +1,6 @@
 //! Training that ends when held-out views are no longer predicted better.
 
-use crate::common::{Heard, bits, goes_on, model, planned, scan};
+use crate::common::{Heard, bits, goes_on, model, neural_field, planned, scan};
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::method::{Best, Job, Limits, Record, Solution};
@@ -18,13 +18,14 @@ fn scans(noise: f32) -> (Scan, Scan) {
 }
 
 fn settings(steps: u64, patience: Option<u64>) -> Value {
-    let mut value = json!({
-        "encoder": {"type": "hash-grid", "levels": 4, "base_resolution": 4, "log2_table_size": 12},
-        "normalizers": [{"type": "layer-norm"}],
-        "field": {"type": "mlp", "width": 16, "depth": 3, "skips": [1]},
-        "projector": {"type": "ray-march", "samples": 20},
-        "type": "neural-field", "training": {"steps": steps, "rays": 64, "pixels": "all", "report_every": 20}, "optimizer": {"lr": 0.01, "decay": "none"},
-    });
+    let mut value = neural_field(
+        16,
+        json!({
+            "encoder": {"type": "hash-grid", "levels": 4, "base_resolution": 4, "log2_table_size": 12},
+            "training": {"steps": steps, "rays": 64, "pixels": "all", "report_every": 20},
+            "optimizer": {"lr": 0.01, "decay": "none"},
+        }),
+    );
     if let Some(n) = patience {
         value["callbacks"] = json!([{"type": "rollback"}, {"type": "patience", "records": n}]);
     }

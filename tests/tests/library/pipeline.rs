@@ -2,8 +2,8 @@
 //! scan, and masked channels that leave the work.
 
 use crate::common::{
-    Heard, bits, decibels, model, moved, pipeline, planned, point, protocol, rays, scan, solve, solve_from, truth,
-    volume,
+    Heard, bits, decibels, model, moved, neural_field, pipeline, planned, point, protocol, rays, scan, solve,
+    solve_from, truth, volume,
 };
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
@@ -22,13 +22,13 @@ use conefield_solvers::priors::TotalVariation;
 use serde_json::{Value, json};
 
 fn settings() -> Value {
-    json!({
-        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
-        "normalizers": [{"type": "layer-norm"}],
-        "field": {"type": "mlp", "width": 12, "depth": 3, "skips": [1]},
-        "projector": {"type": "ray-march", "samples": 20, "sampling": "uniform"},
-        "type": "neural-field", "loss": "l2", "training": {"steps": 40, "rays": 128, "report_every": 5}, "optimizer": {"lr": 0.02},
-    })
+    neural_field(
+        12,
+        json!({
+            "projector": {"type": "ray-march", "samples": 20, "sampling": "uniform"}, "loss": "l2",
+            "training": {"steps": 40, "rays": 128, "report_every": 5}, "optimizer": {"lr": 0.02},
+        }),
+    )
 }
 
 // ---- the gradient of a whole step ----

@@ -1,6 +1,8 @@
 //! The wgpu backend against the CPU's: whole steps, runs, masks, weights, checkpoints, refusals.
 
-use crate::common::{Heard, apart, model, moved, pipeline, planned, point, psnr, rays, scan, solve, solve_on};
+use crate::common::{
+    Heard, apart, model, moved, neural_field, pipeline, planned, point, psnr, rays, scan, solve, solve_on,
+};
 use crate::pipeline::pretrained;
 use conefield_backend_cpu::Cpu;
 use conefield_backend_cpu::rows::Kernels;
@@ -26,13 +28,13 @@ use serde_json::{Value, json};
 use std::sync::Arc;
 
 fn settings() -> Value {
-    json!({
-        "encoder": {"type": "hash-grid", "levels": 3, "base_resolution": 3, "log2_table_size": 8},
-        "normalizers": [{"type": "layer-norm"}],
-        "field": {"type": "mlp", "width": 8, "depth": 3, "skips": [1]},
-        "projector": {"type": "ray-march", "samples": 20, "sampling": "stratified"},
-        "type": "neural-field", "loss": "l2", "training": {"steps": 40, "rays": 128, "report_every": 5}, "optimizer": {"lr": 0.02},
-    })
+    neural_field(
+        8,
+        json!({
+            "projector": {"type": "ray-march", "samples": 20, "sampling": "stratified"}, "loss": "l2",
+            "training": {"steps": 40, "rays": 128, "report_every": 5}, "optimizer": {"lr": 0.02},
+        }),
+    )
 }
 
 // ---- whole steps ----

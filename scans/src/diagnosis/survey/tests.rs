@@ -70,7 +70,7 @@ impl Setting {
     }
 
     fn kinds(&self) -> Vec<WarningKind> {
-        survey(&self.scan()).warnings.iter().map(|w| w.kind).collect()
+        kinds(&survey(&self.scan()).warnings)
     }
 
     /// Asserts a single warning, of the given kind, that contains all of `words`.
@@ -80,6 +80,10 @@ impl Setting {
         assert!(found.len() == 1 && found[0].kind == kind, "{kind:?}: {text:?}");
         assert!(words.iter().all(|w| text[0].contains(w)), "{words:?}: {text:?}");
     }
+}
+
+fn kinds(warnings: &[Warning]) -> Vec<WarningKind> {
+    warnings.iter().map(|w| w.kind).collect()
 }
 
 #[test]
@@ -196,7 +200,7 @@ fn metres_read_as_millimetres_give_a_warning_unless_the_unit_has_no_size() {
     let mut scan = clean().scan();
     scan.geometry = scan.geometry.scaled(1e-3);
     let warnings = survey(&scan).warnings;
-    assert_eq!(warnings.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Scale; 2], "{warnings:?}");
+    assert_eq!(kinds(&warnings), [WarningKind::Scale; 2], "{warnings:?}");
     assert!(warnings[0].to_string().contains("not metres"), "{warnings:?}");
     scan.unit.name = "cube half side".into();
     assert_eq!(survey(&scan).warnings, []);
@@ -207,7 +211,7 @@ fn values_that_are_not_line_integrals_give_one_warning() {
     let mut scan = clean().scan();
     scan.projections.mapv_inplace(|a| 20000.0 * (-a).exp());
     let warnings = survey(&scan).warnings;
-    assert_eq!(warnings.iter().map(|w| w.kind).collect::<Vec<_>>(), [WarningKind::Values], "{warnings:?}");
+    assert_eq!(kinds(&warnings), [WarningKind::Values], "{warnings:?}");
 }
 
 #[test]
@@ -231,15 +235,9 @@ fn a_last_view_that_repeats_the_first_gives_a_warning_with_the_right_options() {
             let mut scan = with_both_ends(n, angles);
             scan.projections.iter_mut().enumerate().for_each(|(i, x)| *x += noise(i));
             let warnings = survey(&scan).warnings;
-            assert_eq!(
-                warnings.iter().map(|w| w.kind).collect::<Vec<_>>(),
-                [WarningKind::Repeated],
-                "{n}: {warnings:?}"
-            );
-            assert!(
-                warnings[0].advice.contains(step) && warnings[0].advice.ends_with(&format!("--views 0-{}", n - 2)),
-                "{warnings:?}"
-            );
+            assert_eq!(kinds(&warnings), [WarningKind::Repeated], "{n}: {warnings:?}");
+            let (advice, views) = (&warnings[0].advice, format!("--views 0-{}", n - 2));
+            assert!(advice.contains(step) && advice.ends_with(&views), "{warnings:?}");
         }
         // Angles with both ends agree with the images.
         let right = with_both_ends(n, even(n, TAU * n as f64 / (n - 1) as f64));
