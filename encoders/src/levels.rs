@@ -611,10 +611,12 @@ impl<R: Real> Asked<R> {
     }
 }
 
+/// A level in WGSL: a value of type `stage_Level`, its [`Level::scale`], and the output channels of its features.
+type LevelCode<'a> = (String, [f64; 2], &'a [Option<usize>]);
+
 /// `stage_forward` and `stage_backward` of an encoder with `width` output channels, and `stage_features_grad` for its
-/// levels, which adds `w` times `dy` to the gradients of the entry that begins at parameter `entry`. A level is a value
-/// of type `stage_Level`, its [`Level::scale`], and the output channels of its features.
-fn functions(features: usize, levels: &[(String, [f64; 2], &[Option<usize>])], width: usize) -> String {
+/// levels, which adds `w` times `dy` to the gradients of the entry that begins at parameter `entry`.
+fn functions(features: usize, levels: &[LevelCode<'_>], width: usize) -> String {
     let mut grad =
         String::from("fn stage_features_grad(entry: u32, w: f32, dy: ptr<function, array<f32, stage_FEATURES>>) {\n");
     if features.is_multiple_of(2) {

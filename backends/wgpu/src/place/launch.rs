@@ -25,6 +25,9 @@ const AHEAD: usize = 2;
 const SUMMED: u32 = 4096;
 const SUMS: u32 = 4096;
 
+/// Buffers by their names in a kernel.
+pub(super) type Named<'a> = [(&'a str, &'a wgpu::Buffer)];
+
 /// A kernel, and arrays among its buffers.
 pub(super) struct Task<'a> {
     /// Its name for messages.
@@ -127,7 +130,7 @@ impl Room {
     pub(super) fn run<T: bytemuck::Pod>(
         &mut self,
         task: &Task<'_>,
-        bind: &[(&str, &wgpu::Buffer)],
+        bind: &Named<'_>,
         uniform: impl Fn(u32, u32) -> T,
         count: u32,
     ) -> Result<()> {
@@ -142,7 +145,7 @@ impl Room {
     pub(super) fn sum<T: bytemuck::Pod>(
         &mut self,
         task: &Task<'_>,
-        bind: &[(&str, &wgpu::Buffer)],
+        bind: &Named<'_>,
         uniform: impl Fn(u32, u32) -> T,
         count: u32,
         largest: bool,
@@ -166,7 +169,7 @@ impl Room {
     fn launch<T: bytemuck::Pod>(
         &mut self,
         Task { label, source, uniform, .. }: &Task<'_>,
-        bind: &[(&str, &wgpu::Buffer)],
+        bind: &Named<'_>,
         parts: &[(T, u32)],
         largest: u32,
     ) -> Result<()> {

@@ -1,6 +1,6 @@
 //! Data terms: computed line integrals against measured ones.
 
-use super::launch::{Room, Task};
+use super::launch::{Named, Room, Task};
 use super::{Array, Chunk, DevicePlace, flag, parts, plane};
 use conefield_core::device::{Access, fragment_of};
 use conefield_core::error::Result;
@@ -36,7 +36,7 @@ fn over(
     by: &Weighing<'_>,
     views: &[usize],
     images: &Array,
-    launch: &mut dyn FnMut(&mut Room, &[(&str, &wgpu::Buffer)], u32) -> Result<()>,
+    launch: &mut dyn FnMut(&mut Room, &Named<'_>, u32) -> Result<()>,
 ) -> Result<()> {
     let pixels = plane(images.shape());
     for part in parts(images) {
