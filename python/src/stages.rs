@@ -253,10 +253,9 @@ pub fn check_stage(py: Python<'_>, kind_name: &str, table: &str) -> PyResult<(bo
 }
 
 fn properties(report: Report) -> Properties {
-    let outcome = |(name, outcome)| match outcome {
-        Outcome::Passed(text) => (name, "passed", text),
-        Outcome::Failed(text) => (name, "failed", text),
-        Outcome::Skipped(text) => (name, "skipped", text),
+    let property = |(name, outcome): (_, Outcome)| {
+        let (outcome, text) = outcome.words();
+        (name, outcome, text.into())
     };
-    report.entries.into_iter().map(outcome).collect()
+    report.entries.into_iter().map(property).collect()
 }

@@ -1,7 +1,7 @@
 //! Backward against differences of forward, and single against double precision.
 
-use crate::call::{Draw, Loaded, Subject, error, within};
-use crate::{Options, Outcome};
+use crate::call::{Draw, Loaded, Subject, error, failed, require, skipped, within};
+use crate::{Found, Options, Unmet};
 use conefield_core::simd::Real;
 use conefield_core::stage::Scope;
 
@@ -81,21 +81,20 @@ fn rows_smooth_over<R: Real>(h: f64, of: &Loaded<'_, R>) -> Option<Vec<R>> {
 const NO_ROWS: &str = "no rows found around which the stage is smooth";
 
 /// The gradient of every parameter, one by one and along directions through all of them.
-pub fn parameters(of: &Subject<'_>) -> Outcome {
+pub fn parameters(of: &Subject<'_>) -> Found {
     of.double().map_or_else(|| coarse(parameters_in(of.single())), parameters_in)
 }
 
 /// The outcome of a stage whose differences are in single precision.
-fn coarse(outcome: Outcome) -> Outcome {
-    match outcome {
-        Outcome::Failed(what) => Outcome::Failed(format!(
-            "{what}, in single precision: a kink or a high frequency may cause this; kernels in double precision settle it"
-        )),
-        other => other,
-    }
+fn coarse(found: Found) -> Found {
+    let may = "a kink or a high frequency may cause this; kernels in double precision settle it";
+    found.map_err(|unmet| match unmet {
+        Unmet::Failed(what) => Unmet::Failed(format!("{what}, in single precision: {may}")),
+        skipped => skipped,
+    })
 }
 
-fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
+fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Found {
     let Some((x, _)) = smooth_rows(of) else { return no_rows::<R>() };
     let (info, options, rows) = (&of.info, of.options, of.options.rows);
     let dy: Vec<R> = Draw::new(options.seed, 5).many(&(-1.0..1.0), info.output * rows);
@@ -124,9 +123,7 @@ fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
         moved.params[i] = keep;
         let scale = g[i].f64().abs().max(want.abs()) + 1e-2 * largest + 1e-9;
         let e = (g[i].f64() - want).abs() / scale;
-        if e.is_nan() || e > tolerance {
-            return Outcome::Failed(format!("parameter {i}: gradient {:e}, differences {want:e}", g[i].f64()));
-        }
+        require(e <= tolerance, || format!("parameter {i}: gradient {:e}, differences {want:e}", g[i].f64()))?;
         worst = worst.max(e);
     }
     for direction in 0..DIRECTIONS {
@@ -143,21 +140,19 @@ fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
         let found: f64 = g.iter().zip(&v).map(|(g, v)| g.f64() * v).sum();
         let norm = g.iter().map(|g| g.f64() * g.f64()).sum::<f64>().sqrt();
         let e = (found - want).abs() / (found.abs().max(want.abs()) + 1e-2 * norm + 1e-9);
-        if e.is_nan() || e > tolerance {
-            return Outcome::Failed(format!("direction {direction}: gradient {found:e}, differences {want:e}"));
-        }
+        require(e <= tolerance, || format!("direction {direction}: gradient {found:e}, differences {want:e}"))?;
         worst = worst.max(e);
     }
     let n = chosen.len();
-    Outcome::Passed(format!("{n} of {} and {DIRECTIONS} directions, worst error {worst:.1e}", info.params))
+    Ok(format!("{n} of {} and {DIRECTIONS} directions, worst error {worst:.1e}", info.params))
 }
 
 /// The gradient of every input.
-pub fn inputs(of: &Subject<'_>) -> Outcome {
+pub fn inputs(of: &Subject<'_>) -> Found {
     of.double().map_or_else(|| coarse(inputs_in(of.single())), inputs_in)
 }
 
-fn inputs_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
+fn inputs_in<R: Real>(of: &Loaded<'_, R>) -> Found {
     let Some((x, h)) = smooth_rows(of) else { return no_rows::<R>() };
     let (mut x, h, rows) = (x.clone(), *h, of.options.rows);
     let dy: Vec<R> = Draw::new(of.options.seed, 7).many(&(-1.0..1.0), of.info.output * rows);
@@ -179,22 +174,17 @@ fn inputs_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
         let scale = dx[i].f64().abs().max(want.abs()) + 1e-2 * largest + 1e-9;
         let difference = (dx[i].f64() - want).abs();
         let e = if difference <= rounding { 0.0 } else { difference / scale };
-        if e.is_nan() || e > tolerance {
-            let (c, r) = (i / rows, i % rows);
-            return Outcome::Failed(format!(
-                "channel {c} of row {r}: gradient {:e}, differences {want:e}",
-                dx[i].f64()
-            ));
-        }
+        let (c, row, found) = (i / rows, i % rows, dx[i].f64());
+        require(e <= tolerance, || format!("channel {c} of row {row}: gradient {found:e}, differences {want:e}"))?;
         worst = worst.max(e);
     }
-    Outcome::Passed(format!("{} inputs, worst error {worst:.1e}", x.len().div_ceil(stride)))
+    Ok(format!("{} inputs, worst error {worst:.1e}", x.len().div_ceil(stride)))
 }
 
-pub fn no_rows<R: Real>() -> Outcome {
+pub fn no_rows<R: Real>() -> Found {
     let shortest = steps::<R>(&Options::encoder()).all.last().copied().unwrap_or_default();
     let text = format!("{NO_ROWS} over steps of {shortest:.0e}");
-    if size_of::<R>() == 8 { Outcome::Failed(text) } else { Outcome::Skipped(text) }
+    if size_of::<R>() == 8 { failed(text) } else { skipped(text) }
 }
 
 /// Inputs at which both precisions select the same cells and sides of kinks, and output gradients.
@@ -210,20 +200,19 @@ pub fn narrow(v: &[f64]) -> Vec<f32> {
 
 /// The outcome of a check that needs double precision, for a stage without. A plugin in C may have the functions and not
 /// declare them, and would see no other sign.
-pub fn no_double() -> Outcome {
-    let text = "no double precision (in C, info leaves double_precision 0: functions ending in _f64 are not called)";
-    Outcome::Skipped(text.into())
+pub fn no_double() -> Found {
+    skipped("no double precision (in C, info leaves double_precision 0: functions ending in _f64 are not called)")
 }
 
 /// Calls `compare` with the reference, inputs and output gradients.
-fn with_double(of: &Subject<'_>, compare: impl FnOnce(&Loaded<'_, f64>, &[f64], &[f64]) -> Outcome) -> Outcome {
+fn with_double(of: &Subject<'_>, compare: impl FnOnce(&Loaded<'_, f64>, &[f64], &[f64]) -> Found) -> Found {
     let Some(double) = of.double() else { return no_double() };
     let Some([x, dy]) = shared(double) else { return no_rows::<f64>() };
     compare(double, &x, &dy)
 }
 
 /// Outputs of the training kernel against the reference.
-pub fn single_outputs(of: &Subject<'_>) -> Outcome {
+pub fn single_outputs(of: &Subject<'_>) -> Found {
     with_double(of, |double, x, _| {
         let [want, _] = double.forward(x, of.options.rows);
         let [y, _] = of.single().forward(&narrow(x), of.options.rows);
@@ -232,7 +221,7 @@ pub fn single_outputs(of: &Subject<'_>) -> Outcome {
 }
 
 /// Gradients of the training kernel against the reference.
-pub fn single_gradients(of: &Subject<'_>) -> Outcome {
+pub fn single_gradients(of: &Subject<'_>) -> Found {
     with_double(of, |double, x, dy| {
         let [_, g, dx] = double.pass(x, dy, of.options.rows);
         let [_, g32, dx32] = of.single().pass(&narrow(x), &narrow(dy), of.options.rows);

@@ -21,7 +21,8 @@ mod voxels;
 mod weights;
 mod wgsl;
 
-use call::Subject;
+use call::{Subject, failed, settle};
+use conefield_core::error::Error;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Scope, Stage};
 use std::fmt;
 use std::ops::Range;
@@ -80,6 +81,42 @@ pub enum Outcome {
     Skipped(String),
 }
 
+impl Outcome {
+    /// In a word, and the evidence, finding or reason.
+    pub fn words(&self) -> (&'static str, &str) {
+        match self {
+            Self::Passed(text) => ("passed", text),
+            Self::Failed(text) => ("failed", text),
+            Self::Skipped(text) => ("skipped", text),
+        }
+    }
+}
+
+/// The evidence that a property holds, or why it does not.
+type Found = Result<String, Unmet>;
+
+/// The outcome of a property that does not hold or does not apply.
+enum Unmet {
+    Failed(String),
+    Skipped(String),
+}
+
+impl Unmet {
+    /// The same, with where or when before the finding.
+    fn at(self, place: String) -> Self {
+        match self {
+            Self::Failed(what) => Self::Failed(format!("{place}: {what}")),
+            skipped => skipped,
+        }
+    }
+}
+
+impl From<Error> for Unmet {
+    fn from(e: Error) -> Self {
+        Self::Failed(e.to_string())
+    }
+}
+
 /// The outcomes of all property checks of a stage, in order.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Report {
@@ -104,13 +141,23 @@ impl Report {
         self.failed().is_empty()
     }
 
-    fn add(&mut self, name: &'static str, property: impl FnOnce() -> Outcome) {
-        let outcome = catch_unwind(AssertUnwindSafe(property)).unwrap_or_else(|panic| {
+    fn add(&mut self, name: &'static str, property: impl FnOnce() -> Found) {
+        let found = catch_unwind(AssertUnwindSafe(property)).unwrap_or_else(|panic| {
             let text = panic.downcast_ref::<String>().cloned();
             let text = text.or_else(|| panic.downcast_ref::<&str>().map(|s| s.to_string()));
-            Outcome::Failed(format!("panicked: {}", text.unwrap_or_default()))
+            failed(format!("panicked: {}", text.unwrap_or_default()))
         });
+        let outcome = match found {
+            Ok(text) => Outcome::Passed(text),
+            Err(Unmet::Failed(text)) => Outcome::Failed(text),
+            Err(Unmet::Skipped(text)) => Outcome::Skipped(text),
+        };
         self.entries.push((name, outcome));
+    }
+
+    /// Adds a property that holds without a complaint; `fine` is the evidence.
+    fn holds(&mut self, name: &'static str, fine: &str, complaint: impl FnOnce() -> Option<String>) {
+        self.add(name, || settle(complaint(), fine));
     }
 }
 
@@ -118,10 +165,9 @@ impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}", self.stage)?;
         for (name, outcome) in &self.entries {
-            let (word, text) = match outcome {
-                Outcome::Passed(t) => ("ok", t),
-                Outcome::Failed(t) => ("FAILED", t),
-                Outcome::Skipped(t) => ("skipped", t),
+            let (word, text) = match outcome.words() {
+                ("failed", text) => ("FAILED", text),
+                words => words,
             };
             writeln!(f, "  {word:<8} {name:<34} {text}")?;
         }
@@ -130,7 +176,7 @@ impl fmt::Display for Report {
 }
 
 /// A property, why it does not apply to a stage, and its check.
-type Property = (&'static str, fn(&Info) -> Option<&'static str>, fn(&Subject<'_>) -> Outcome);
+type Property = (&'static str, fn(&Info) -> Option<&'static str>, fn(&Subject<'_>) -> Found);
 
 /// The properties that any stage must have, in order.
 const PROPERTIES: [Property; 23] = [
@@ -181,7 +227,7 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     let of = Subject::new(stage, options);
     for (name, skipped, property) in PROPERTIES {
         report.add(name, || match skipped(&stage.info()) {
-            Some(why) => Outcome::Skipped(why.into()),
+            Some(why) => Err(Unmet::Skipped(why.into())),
             None => property(&of),
         });
     }

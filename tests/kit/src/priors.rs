@@ -1,8 +1,8 @@
 //! Properties of a prior of a field: a correct gradient, additive sums, behaviour for extreme numbers.
 
-use crate::call::{Draw, Guarded, error, no_fault, settle, within};
+use crate::call::{Draw, Guarded, error, no_fault, require, settle, within};
 use crate::gradients::slope;
-use crate::{Outcome, Report};
+use crate::{Found, Report};
 use conefield_core::prior::Prior;
 use conefield_core::runner::Runner;
 
@@ -57,12 +57,10 @@ fn run(prior: &dyn Prior, values: &[f64], scale: f64) -> (f64, Vec<f64>) {
     (value, gradient.into_inner())
 }
 
-fn gradient(prior: &dyn Prior) -> Outcome {
+fn gradient(prior: &dyn Prior) -> Found {
     let mut values = drawn(prior);
     let (value, found) = run(prior, &values, 1.0);
-    if value < 0.0 || !value.is_finite() {
-        return Outcome::Failed(format!("the penalty is {value}"));
-    }
+    require(value >= 0.0 && value.is_finite(), || format!("the penalty is {value}"))?;
     let largest = found.iter().fold(1e-9, |m: f64, g| m.max(g.abs()));
     let mut worst = 0.0f64;
     for i in (0..values.len()).step_by(values.len().div_ceil(SINGLES)) {
@@ -73,15 +71,13 @@ fn gradient(prior: &dyn Prior) -> Outcome {
         });
         values[i] = keep;
         let e = (found[i] - want).abs() / largest;
-        if e.is_nan() || e > TOLERANCE {
-            return Outcome::Failed(format!("point {i}: gradient {:e}, differences {want:e}", found[i]));
-        }
+        require(e <= TOLERANCE, || format!("point {i}: gradient {:e}, differences {want:e}", found[i]))?;
         worst = worst.max(e);
     }
     within("gradient", worst, TOLERANCE)
 }
 
-fn adds(prior: &dyn Prior) -> Outcome {
+fn adds(prior: &dyn Prior) -> Found {
     let values = drawn(prior);
     let (_, clean) = run(prior, &values, 1.0);
     let mut added = Guarded::new(values.len(), 3.0);
@@ -91,37 +87,36 @@ fn adds(prior: &dyn Prior) -> Outcome {
 }
 
 /// The gradient is multiplied by the scale, the penalty is not.
-fn scale(prior: &dyn Prior) -> Outcome {
+fn scale(prior: &dyn Prior) -> Found {
     let values = drawn(prior);
     let ((plain, slopes), (value, scaled)) = (run(prior, &values, 1.0), run(prior, &values, 0.25));
     let want: Vec<f64> = slopes.iter().map(|g| 0.25 * g).collect();
     within("a quarter", error(&scaled, &want).max((value - plain).abs() / plain.abs().max(1e-30)), 1e-12)
 }
 
-fn guards(prior: &dyn Prior) -> Outcome {
+fn guards(prior: &dyn Prior) -> Found {
     let values = drawn(prior);
     let mut gradient = Guarded::new(values.len(), 0.0);
     prior.block(&values, 1.0, gradient.inner());
     settle(gradient.broken("gradient"), "on either side of the gradient")
 }
 
-fn extremes(prior: &dyn Prior) -> Outcome {
+fn extremes(prior: &dyn Prior) -> Found {
     let values = drawn(prior);
     for v in [0.0, -0.0, 1e-40, 1.0, -1.0, 1e30, -1e30] {
         let flat = vec![v; values.len()];
         let mixed: Vec<f64> = values.iter().enumerate().map(|(i, x)| if i % 3 == 0 { v } else { *x }).collect();
         for block in [flat, mixed] {
             let (value, slopes) = run(prior, &block, 1.0);
-            if !value.is_finite() || slopes.iter().any(|g| !g.is_finite()) {
-                return Outcome::Failed(format!("values of {v:e}: penalty {value}, or a derivative, is not finite"));
-            }
+            let finite = value.is_finite() && slopes.iter().all(|g| g.is_finite());
+            require(finite, || format!("values of {v:e}: penalty {value}, or a derivative, is not finite"))?;
         }
     }
-    Outcome::Passed("0, denormal, ±1e30 give finite numbers".into())
+    Ok("0, denormal, ±1e30 give finite numbers".into())
 }
 
 /// Runs are monitored by their sums: NaN must propagate to them.
-fn poison(prior: &dyn Prior) -> Outcome {
+fn poison(prior: &dyn Prior) -> Found {
     let mut values = drawn(prior);
     let middle = values.len() / 2;
     values[middle] = f64::NAN;
@@ -129,15 +124,10 @@ fn poison(prior: &dyn Prior) -> Outcome {
     settle(value.is_finite().then(|| format!("the penalty is {value} where a value is NaN")), "NaN stays visible")
 }
 
-fn parity(prior: &dyn Prior, device: &dyn Runner) -> Outcome {
+fn parity(prior: &dyn Prior, device: &dyn Runner) -> Found {
     let values = drawn(prior);
     let (value, slopes) = run(prior, &values, 1.0);
     let single: Vec<f32> = values.iter().map(|&v| v as f32).collect();
-    match device.penalty(prior, &single) {
-        Ok((found, found_slopes)) => {
-            let e = error(&[found], &[value]).max(error(&found_slopes, &slopes));
-            within("penalty and derivatives", e, SINGLE)
-        }
-        Err(e) => Outcome::Failed(e.to_string()),
-    }
+    let (found, found_slopes) = device.penalty(prior, &single)?;
+    within("penalty and derivatives", error(&[found], &[value]).max(error(&found_slopes, &slopes)), SINGLE)
 }

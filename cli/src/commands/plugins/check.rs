@@ -5,6 +5,7 @@ use clap::Args;
 use conefield::{parse, plugins};
 use conefield_backend_wgpu::Wgpu;
 use conefield_conformance::{Options, Outcome, Report, WIDTHS, With, check_type};
+use conefield_core::registry::Kind;
 use conefield_core::runner::Runner;
 use conefield_core::{Error, Result};
 use conefield_plugins::library::Type;
@@ -72,7 +73,7 @@ struct Checked {
 /// One stage with one set of settings.
 #[derive(Serialize)]
 struct StageReport {
-    kind: String,
+    kind: Kind,
     #[serde(rename = "type")]
     name: String,
     settings: Value,
@@ -200,18 +201,15 @@ impl Check {
     fn stage(&self, t: &Type, settings: &Value, device: &Device, all: &mut Vec<StageReport>) -> Result<()> {
         let mut table = settings.clone();
         table["type"] = t.name.clone().into();
+        let widths: Vec<usize> = self.width.iter().map(|&width| width.into()).collect();
         let with = With {
-            widths: &self.widths(),
+            widths: if widths.is_empty() { &WIDTHS } else { &widths },
             options: &|options| Options { single: self.single, ..options },
             device: &|| device.runner(),
         };
         let found = check_type(t.kind, &table, &with)?;
         all.extend(found.into_iter().map(|(width, report)| StageReport::of(t, settings, width, report)));
         Ok(())
-    }
-
-    fn widths(&self) -> Vec<usize> {
-        if self.width.is_empty() { WIDTHS.to_vec() } else { self.width.iter().map(|&w| w.into()).collect() }
     }
 }
 
@@ -231,23 +229,13 @@ impl Device {
 impl StageReport {
     fn of(t: &Type, settings: &Value, width: Option<usize>, report: Report) -> Self {
         let passed = report.passed();
-        let property = |(name, outcome)| {
-            let (outcome, text) = match outcome {
-                Outcome::Passed(text) => ("passed", text),
-                Outcome::Failed(text) => (FAILED, text),
-                Outcome::Skipped(text) => ("skipped", text),
-            };
-            Property { name, outcome, text }
+        let property = |(name, outcome): (_, Outcome)| {
+            let (outcome, text) = outcome.words();
+            Property { name, outcome, text: text.into() }
         };
-        Self {
-            kind: t.kind.to_string(),
-            name: t.name.clone(),
-            settings: settings.clone(),
-            width,
-            stage: report.stage,
-            properties: report.entries.into_iter().map(property).collect(),
-            passed,
-        }
+        let properties = report.entries.into_iter().map(property).collect();
+        let (name, settings) = (t.name.clone(), settings.clone());
+        Self { kind: t.kind, name, settings, width, stage: report.stage, properties, passed }
     }
 }
 
