@@ -1,13 +1,6 @@
 //! A basis for conefield: a coefficient for each block of voxels.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(BasisSpec, "@name@", Settings, "blocks of voxels");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "blocks of voxels"@
 pub struct Settings {
     /// Voxels along a block's edge.
     pub edge: usize,

@@ -1,14 +1,7 @@
 //! A data term for conefield: `c²·(√(1 + (r/c)²) − 1)` of a residual r, squares that grow like |r| from some times the
 //! noise on.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(DataTermSpec, "@name@", Settings, "quadratic for small residuals, linear for large ones");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "quadratic for small residuals, linear for large ones"@
 pub struct Settings {
     /// Residuals well above this many standard deviations of the noise have a linear cost.
     pub from: f64,

@@ -1,13 +1,6 @@
 //! An encoder for conefield: `y = sin(d·x + p)` with directions `d` and phases `p` that are learned.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(EncoderSpec, "@name@", Settings, "waves of learned directions");
-
-/// What a spec may set.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "waves of learned directions"@
 pub struct Settings {
     /// Number of channels, one per wave.
     pub waves: usize,

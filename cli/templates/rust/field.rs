@@ -1,14 +1,7 @@
 //! A field for conefield: features `[n, F]` to attenuation `[n, 1]`, `y = ln(1 + exp(w·x + b))`, which is never
 //! negative.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(FieldSpec, "@name@", Settings, "a weighted sum through a softplus");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "a weighted sum through a softplus"@
 pub struct Settings {
     /// Initial shift; the lower it is, the closer the first volume is to 0.
     pub bias: f32,

@@ -3,14 +3,7 @@
 //! This start fills every block whose name begins with `prefix` with uniform numbers; every other block keeps the
 //! initialization by its own stage.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(InitializerSpec, "@name@", Settings, "uniform numbers in the blocks of one stage");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "uniform numbers in the blocks of one stage"@
 pub struct Settings {
     /// Fill blocks whose name begins with this, such as `encoder` or `field.0.weight`.
     pub prefix: String,

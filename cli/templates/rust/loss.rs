@@ -1,13 +1,6 @@
 //! A loss for conefield: `sqrt(d² + s²) − s` of the difference `d`, an absolute value that is rounded near 0.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(LossSpec, "@name@", Settings, "the absolute difference, rounded near 0");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "the absolute difference, rounded near 0"@
 pub struct Settings {
     /// Differences well below this have a quadratic loss.
     pub scale: f64,

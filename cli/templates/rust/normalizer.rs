@@ -3,15 +3,7 @@
 //! This start scales and shifts every channel by numbers that are learned: `y = w·x + b`. Its backward pass is written
 //! by hand; `cargo test` compares it with finite differences.
 
-use conefield_plugin::prelude::*;
-use std::ops::Range;
-
-conefield_plugin::export!();
-stage_type!(NormalizerSpec, "@name@", Settings, "a learned scale and shift of every channel");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "a learned scale and shift of every channel"@
 pub struct Settings {
     /// Initial scale.
     pub scale: f32,
@@ -70,7 +62,7 @@ impl RowMap for Affine {
     }
 
     /// Channels are independent: without some, the rest is a smaller stage of the same kind.
-    fn keep(&self, keep: &[usize]) -> Option<(Self, Vec<Range<usize>>)> {
+    fn keep(&self, keep: &[usize]) -> Option<(Self, Vec<std::ops::Range<usize>>)> {
         let part = |start: usize| keep.iter().map(move |&c| start + c..start + c + 1);
         Some((Self { width: keep.len(), scale: self.scale }, part(0).chain(part(self.width)).collect()))
     }

@@ -1,13 +1,6 @@
 //! A prior for conefield: half the squared differences of neighbouring points, in small blocks placed at random.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(PriorSpec, "@name@", Settings, "squared differences of neighbouring points");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "squared differences of neighbouring points"@
 pub struct Settings {
     /// Weight relative to the mean loss of a ray.
     pub weight: f64,

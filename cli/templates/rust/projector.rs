@@ -3,14 +3,7 @@
 //! This start takes the middles of equal intervals within the reconstruction box. The line integral is the sum of
 //! attenuation times length, and its adjoint comes with the trait.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(ProjectorSpec, "@name@", Settings, "equal intervals within the box");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "equal intervals within the box"@
 pub struct Settings {
     /// Samples per ray that meets the box.
     pub samples: usize,

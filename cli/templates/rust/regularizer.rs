@@ -1,13 +1,6 @@
 //! A regularizer for conefield: quadratic smoothness, half the squared differences of neighbouring coefficients.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(RegularizerSpec, "@name@", Settings, "squared differences of neighbours");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+@stage "squared differences of neighbours"@
 pub struct Settings {
     /// Strength, as a multiple of the root mean square of back-projected noise, for differences of 1/mm.
     pub weight: f64,

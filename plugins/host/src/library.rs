@@ -18,8 +18,8 @@ use std::{fmt, ptr, slice};
 
 /// Longest text in a table.
 const LONGEST_TEXT: usize = 1 << 20;
-/// Size in bytes of a stage's table in the first minor version.
-const FIRST_STAGE: usize = size_of::<ConefieldStage>();
+/// Size in bytes of a stage's table in the first minor version, which ended with `basis`.
+const FIRST_STAGE: usize = offset_of!(ConefieldStage, basis) + size_of::<*const ConefieldBasis>();
 /// Maximum number of stages in a library.
 const MOST_STAGES: usize = 1024;
 
@@ -72,7 +72,7 @@ unsafe impl Sync for Type {}
 
 /// Makes the functions of a stage, and their checks, from the list of the contract.
 macro_rules! tables {
-    ($($table:ident $field:ident: $($kind:ident $code:ident),+;)*) => {
+    ($($table:ident $field:ident: $($kind:ident $name:ident $code:ident $spec:ident $place:literal),+;)*) => {
         /// The functions of a stage.
         #[derive(Clone, Copy)]
         #[allow(non_camel_case_types)]
@@ -95,8 +95,7 @@ macro_rules! tables {
                 match t.kind {
                     $($($code)|+ => {
                         let kind = [$(($code, Kind::$kind)),+].into_iter().find(|(code, _)| *code == t.kind);
-                        // A later minor version that adds functions needs the size of this one here.
-                        let least = size_of::<$table>();
+                        let least = $table::FIRST_SIZE;
                         // SAFETY: see the top of this file.
                         let table = unsafe { sized(t.$field, place, &format!("{at}: functions"), least)? };
                         if let Some(missing) = table.missing() {

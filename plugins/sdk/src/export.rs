@@ -57,32 +57,25 @@ impl Plugin {
 
 /// The entry of one stage type; `None` for kinds that cannot be exported.
 fn stage(t: &'static StageType) -> Option<ConefieldStage> {
-    let mut stage = ConefieldStage {
-        kind: 0,
-        name: ConefieldStr::of(t.name),
-        doc: ConefieldStr::of(t.doc),
-        schema: ConefieldStr::of(t.schema().to_string().leak()),
-        context: ptr::from_ref(t).cast(),
-        create: Some(shims::create),
-        destroy: Some(shims::destroy),
-        describe: Some(shims::describe),
-        map: ptr::null(),
-        projector: ptr::null(),
-        initializer: ptr::null(),
-        loss: ptr::null(),
-        prior: ptr::null(),
-        regularizer: ptr::null(),
-        data_term: ptr::null(),
-        basis: ptr::null(),
-    };
     macro_rules! filled {
-        ($($table:ident $field:ident: $($kind:ident $code:ident),+;)*) => {
+        ($($table:ident $field:ident: $($kind:ident $name:ident $code:ident $spec:ident $place:literal),+;)*) => {{
+            let mut stage = ConefieldStage {
+                kind: 0,
+                name: ConefieldStr::of(t.name),
+                doc: ConefieldStr::of(t.doc),
+                schema: ConefieldStr::of(t.schema().to_string().leak()),
+                context: ptr::from_ref(t).cast(),
+                create: Some(shims::create),
+                destroy: Some(shims::destroy),
+                describe: Some(shims::describe),
+                $($field: ptr::null(),)*
+            };
             match t.kind {
                 $($(Kind::$kind => (stage.kind, stage.$field) = ($code, &shims::$field::TABLE),)+)*
                 _ => return None,
             }
-        };
+            Some(stage)
+        }};
     }
     conefield_plugin_abi::kinds! { filled }
-    Some(stage)
 }
