@@ -361,6 +361,7 @@ const ABORTED: &str = "(the process is gone)";
 /// The same with panics in a Rust plugin.
 const PANICS: &[(&str, &str, [&str; 2])] = &[
     ("panics in create", "create", ["create panicked: as ordered, in create"; 2]),
+    ("panics in describe", "describe", ["describe panicked: as ordered, in describe"; 2]),
     ("panics in forward", "forward", ["forward panicked: as ordered, in forward"; 2]),
     ("panics in backward", "backward", ["backward panicked: as ordered, in backward"; 2]),
     ("panics after many rows", "later", ["finite differences: inputs", "forward panicked: as ordered, in call"]),

@@ -365,14 +365,18 @@ impl Drop for Handle {
 }
 
 impl Handle {
-    /// The stage's own description.
-    pub fn describe(&self) -> String {
+    /// The stage's own description; its type if it has none. A panic is an error, as in every function.
+    pub fn describe(&self) -> Result<String> {
         let mut text = Text::new();
         // SAFETY: the stage is alive.
         let status = unsafe { (self.ty.describe)(self.stage, text.room()) };
         let text = text.text();
-        let line = if status == CONEFIELD_OK { text.lines().next().unwrap_or_default() } else { &self.ty.name };
-        if line.starts_with(&self.ty.name) { line.into() } else { format!("{}: {line}", self.ty.name) }
+        let line = match status {
+            CONEFIELD_OK => text.lines().next().unwrap_or_default(),
+            CONEFIELD_PANICKED => return Err(self.ty.failed("describe", status, &text)),
+            _ => &self.ty.name,
+        };
+        Ok(if line.starts_with(&self.ty.name) { line.into() } else { format!("{}: {line}", self.ty.name) })
     }
 }
 

@@ -70,7 +70,7 @@ impl<F: FunctionsOf> Foreign<F> {
     fn new(handle: Handle) -> Result<Self> {
         let another = || handle.ty.failed("create", CONEFIELD_FAILED, "it is of another kind");
         let functions = F::of(handle.ty.functions).ok_or_else(another)?;
-        let describe = handle.describe();
+        let describe = handle.describe()?;
         Ok(Self { handle, functions, describe, fault: Fault::default() })
     }
 
