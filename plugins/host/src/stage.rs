@@ -16,7 +16,6 @@ use crate::trial;
 use conefield_core::prelude::*;
 use conefield_core::wgsl::FOREIGN;
 use conefield_plugin_abi::*;
-use serde_json::Value;
 use std::ffi::c_void;
 use std::ptr;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -55,17 +54,6 @@ pub(crate) struct Foreign<F> {
     fault: Fault,
 }
 
-/// Creates and tries a stage, both within the time limit.
-pub(crate) fn build<T: Send + 'static>(
-    ty: &Arc<Type>,
-    settings: &Value,
-    width: usize,
-    tried: impl FnOnce(Handle) -> Result<T> + Send + 'static,
-) -> Result<T> {
-    let (own, settings) = (ty.clone(), settings.clone());
-    trial::timed(ty, move || tried(own.create(&settings, width)?))
-}
-
 impl<F: FunctionsOf> Foreign<F> {
     fn new(handle: Handle) -> Result<Self> {
         let another = || handle.ty.failed("create", CONEFIELD_FAILED, "it is of another kind");
@@ -102,6 +90,11 @@ impl<F: FunctionsOf> Foreign<F> {
             if known { status } else { CONEFIELD_OK }
         })?;
         Ok(known)
+    }
+
+    /// Refuses the stage with the complaint of its trial, if there is one.
+    fn settled(&self, complaint: Option<String>) -> Result<()> {
+        trial::settled(self.ty(), complaint)
     }
 
     /// The value of a call that cannot return an error: records the error as a fault and returns `instead`.

@@ -4,13 +4,18 @@
 
 use super::{Foreign, SMALL, ask, call, make, raw_grid, said};
 use crate::library::Handle;
-use crate::trial;
+use crate::spec::settings;
+use crate::trial::{Guarded, Marked, drawn};
 use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use ndarray::Array3;
 
 /// Maximum number of coefficients per voxel.
 const MOST: usize = 64;
+
+settings! {
+    basis BasisSpec(self) -> dyn Basis { self.build(0, BasisStage::tried) }
+}
 
 /// A basis from a library.
 pub struct BasisStage(Foreign<ConefieldBasis>);
@@ -19,7 +24,12 @@ impl BasisStage {
     /// The basis of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let stage = Self(Foreign::new(handle)?);
-        trial::basis(stage.0.ty(), SMALL.shape, &stage.made_on(&SMALL)?)?;
+        let made = stage.made_on(&SMALL)?;
+        let coefficients = made.coefficients.shape;
+        let complaint = try_operator(made.operator(), SMALL.shape, coefficients)
+            .or_else(|| try_operator(made.reference()?, SMALL.shape, coefficients));
+        made.fault()?;
+        stage.0.settled(complaint)?;
         Ok(stage)
     }
 
@@ -121,3 +131,21 @@ macro_rules! operator {
 
 operator! { f32, expand adjoint }
 operator! { f64, expand_f64 adjoint_f64 }
+
+/// The first complaint about one of the two operators of a basis.
+fn try_operator<R: Marked>(of: &dyn BasisOperator<R>, voxels: [usize; 3], coefficients: [usize; 3]) -> Option<String> {
+    let count = |shape: [usize; 3]| shape.iter().product::<usize>();
+    let try_one = |what: &str, shapes: [[usize; 3]; 2], back: bool| {
+        let [mut from, mut to] = shapes.map(|shape| Guarded::<R>::new(count(shape)));
+        from.inner().iter_mut().zip(drawn(count(shapes[0]))).for_each(|(x, drawn)| *x = R::of(drawn.into()));
+        let x = ArrayView3::from_shape(shapes[0], &*from.inner()).ok()?;
+        let y = ArrayViewMut3::from_shape(shapes[1], to.inner()).ok()?;
+        if back {
+            of.adjoint(x, y)
+        } else {
+            of.expand(x, y)
+        }
+        to.complaint(what).or_else(|| from.broken("input"))
+    };
+    try_one("voxels", [coefficients, voxels], false).or_else(|| try_one("coefficients", [voxels, coefficients], true))
+}

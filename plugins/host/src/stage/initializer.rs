@@ -3,14 +3,13 @@
 #![allow(unsafe_code)]
 
 use super::{Foreign, call, make, said};
-use crate::library::{self, Handle, Type};
+use crate::library::{self, Handle};
+use crate::spec::{Loaded, settings};
 use crate::trial::{Marked, timed};
 use conefield_core::arena::Block;
 use conefield_core::prelude::*;
 use conefield_core::settings::KnownVolume;
 use conefield_plugin_abi::*;
-use serde_json::Value;
-use std::sync::Arc;
 
 /// An initializer from a library.
 pub struct InitializerStage {
@@ -18,15 +17,16 @@ pub struct InitializerStage {
     volume: Option<KnownVolume>,
 }
 
+settings! {
+    initializer InitializerSpec(self, weights: &dyn Fn(&str) -> Result<Weights>) -> dyn Initializer {
+        build(self, weights).map(Box::new)
+    }
+}
+
 /// Builds an initializer; `weights` reads a file named in its settings.
-pub(crate) fn build(
-    ty: &Arc<Type>,
-    settings: &Value,
-    weights: &dyn Fn(&str) -> Result<Weights>,
-) -> Result<InitializerStage> {
-    let (own, settings) = (ty.clone(), settings.clone());
-    let (own, path) = timed(ty, move || {
-        let own = Foreign::<ConefieldInitializer>::new(own.create(&settings, 0)?)?;
+fn build(loaded: &Loaded, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<InitializerStage> {
+    let (own, path) = *loaded.build(0, |handle| {
+        let own = Foreign::<ConefieldInitializer>::new(handle)?;
         let path = named(&own.handle, "weights", |path| {
             // SAFETY: the stage is alive, `path` is writable.
             own.functions.weights.map(|f| unsafe { f(own.handle.stage, path) })
@@ -34,7 +34,7 @@ pub(crate) fn build(
         Ok((own, path))
     })?;
     let read = path.map(|p| weights(&p)).transpose()?;
-    timed(ty, move || {
+    timed(&loaded.ty, move || {
         let own = match read {
             Some(weights) => with_weights(&own, &weights)?,
             None => own,

@@ -3,10 +3,12 @@
 #![allow(unsafe_code)]
 
 use super::{Foreign, ask, call, said};
-use crate::library::Handle;
-use crate::trial::{self, GUARD, Marked};
+use crate::library::{Handle, Type};
+use crate::spec::settings;
+use crate::trial::{self, GUARD, Guarded, Marked, settled};
 use conefield_core::prelude::*;
 use conefield_core::registry::Kind;
+use conefield_core::stage::TILE_ROWS;
 use conefield_plugin_abi::*;
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -20,6 +22,14 @@ const WIDEST: usize = 1 << 20;
 
 /// Maximum number of forward passes: a host does some work for each.
 const MOST_PASSES: usize = 1 << 16;
+
+settings! {
+    encoder EncoderSpec(self) -> dyn Encoder { self.build(3, |handle| MapStage::tried(handle, 3)) }
+    normalizer NormalizerSpec(self, width: usize) -> dyn Normalizer {
+        self.build(width, move |handle| MapStage::tried(handle, width))
+    }
+    field FieldSpec(self, width: usize) -> dyn Field { self.build(width, move |handle| MapStage::tried(handle, width)) }
+}
 
 /// An encoder, normalizer or field from a library.
 pub struct MapStage {
@@ -39,7 +49,7 @@ impl MapStage {
         let stage = Self::of(Foreign::new(handle)?)?;
         let found = format!("{width} channels for a stage that takes {}", stage.info.input);
         ensure(stage.info.input == width, "spec", "", found, "as many as it was made for")?;
-        trial::map(stage.own.ty(), &stage)?;
+        try_map(stage.own.ty(), &stage)?;
         Ok(stage)
     }
 
@@ -73,7 +83,7 @@ impl MapStage {
         let derived = self.own.derived("reduce", made)?;
         let smaller = trial::timed(self.own.ty(), move || {
             let smaller = Self::of(derived)?;
-            trial::map(smaller.own.ty(), &smaller)?;
+            try_map(smaller.own.ty(), &smaller)?;
             Ok(smaller)
         })?;
         if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
@@ -378,4 +388,62 @@ impl Normalizer for MapStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
         self.reduce(CONEFIELD_INPUTS, keep, |stage| Box::new(stage))
     }
+}
+
+/// Stages with more parameters are not initialized for their trial: it takes long, and the run does it anyway.
+const MANY: usize = 1 << 20;
+
+/// Tries an encoder, normalizer or field of type `ty`.
+fn try_map(ty: &Type, stage: &dyn Stage) -> Result<()> {
+    let info = stage.info();
+    let mut params = Guarded::zeroed(info.params);
+    if info.params <= MANY {
+        stage.init(1, params.inner());
+        stage.fault()?;
+        settled(ty, params.broken("parameters").or_else(|| params.unsound("initial parameters")))?;
+    }
+    for rows in [1, 3, TILE_ROWS] {
+        try_tile(ty, stage, &mut params, rows)?;
+    }
+    Ok(())
+}
+
+/// Tries the kernel of a stage on a tile.
+fn try_tile(ty: &Type, stage: &dyn Stage, params: &mut Guarded<f32>, rows: usize) -> Result<()> {
+    let (info, kernel) = (stage.info(), stage.kernel());
+    let range: Range<usize> = match info.grads {
+        GradKind::Scatter => stage.partition().into_iter().min_by_key(Range::len).unwrap_or(0..info.params),
+        _ => 0..info.params,
+    };
+    let mut x = Guarded::new(info.input * rows);
+    for (i, x) in x.inner().iter_mut().enumerate() {
+        *x = unit(mix(7, i as u64));
+    }
+    let [mut y, mut tape, mut dx] = [info.output, info.tape, info.input].map(|c| Guarded::new(c * rows));
+    let (to, left) = (TileMut::new(y.inner(), rows), TileMut::new(tape.inner(), rows));
+    kernel.forward(params.inner(), Tile::new(x.inner(), rows), to, left);
+    stage.fault()?;
+    settled(ty, y.broken("output").or_else(|| tape.broken("tape")).or_else(|| y.unsound("output")))?;
+    let changed = info.identity && y.inner() != x.inner();
+    settled(ty, changed.then(|| "an identity must return its input unchanged".into()))?;
+    if kernel.passes() > 1 {
+        let [mut again, mut left] = [info.output, info.tape].map(|c| Guarded::new(c * rows));
+        for pass in 0..kernel.passes() {
+            let (y, tape) = (TileMut::new(again.inner(), rows), TileMut::new(left.inner(), rows));
+            kernel.forward_pass(pass, params.inner(), Tile::new(x.inner(), rows), y, tape);
+        }
+        stage.fault()?;
+        settled(ty, again.broken("output in passes").or_else(|| left.broken("tape in passes")))?;
+        let same = again.inner() == y.inner() && left.inner() == tape.inner();
+        settled(ty, (!same).then(|| "its passes together are not its forward".into()))?;
+    }
+    let dy = vec![1.0; info.output * rows];
+    let mut grads = Guarded::zeroed(range.len());
+    let (into, to) = (Grads { values: grads.inner(), range }, TileMut::new(dx.inner(), rows));
+    let (from, left) = (Tile::new(x.inner(), rows), TileMut::new(tape.inner(), rows));
+    kernel.backward(params.inner(), from, left, Tile::new(&dy, rows), into, Some(to));
+    stage.fault()?;
+    settled(ty, grads.broken("gradients").or_else(|| dx.broken("input gradient")))?;
+    settled(ty, tape.broken("tape").or_else(|| x.broken("input")).or_else(|| params.broken("parameters")))?;
+    settled(ty, grads.unsound("gradients").or_else(|| dx.unsound("input gradient")))
 }

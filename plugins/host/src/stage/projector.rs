@@ -4,7 +4,8 @@
 
 use super::{Foreign, call, make, raw_ray, said};
 use crate::library::Handle;
-use crate::trial::{self, Marked};
+use crate::spec::settings;
+use crate::trial::{self, GUARD, Guarded, Marked};
 use conefield_core::prelude::*;
 use conefield_core::stage::Lengths;
 use conefield_plugin_abi::*;
@@ -13,6 +14,10 @@ use std::ptr;
 /// Maximum number of samples per ray: more than any detector resolves.
 const MOST: usize = 1 << 24;
 
+settings! {
+    projector ProjectorSpec(self) -> dyn Projector { self.build(0, ProjectorStage::tried) }
+}
+
 /// A projector from a library.
 pub struct ProjectorStage(Foreign<ConefieldProjector>);
 
@@ -20,12 +25,15 @@ impl ProjectorStage {
     /// The projector of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let stage = Self(Foreign::new(handle)?);
-        trial::projector(stage.0.ty(), |ray, seed, guard| {
+        for (ray, seed) in rays().into_iter().flat_map(|ray| [(ray, None), (ray, Some(3))]) {
             let mut samples = Samples::default();
-            stage.sample_guarded(ray, seed, guard, &mut samples)?;
-            trial::derivatives(stage.0.ty(), samples.weights.len(), |dmu| stage.derive(&samples.weights, 1.0, dmu))?;
-            Ok(stage.integrate(&samples.weights, &vec![1.0; samples.weights.len()]))
-        })?;
+            stage.sample_guarded(&ray, seed, GUARD, &mut samples)?;
+            let mut dmu = Guarded::<f64>::new(samples.weights.len());
+            stage.derive(&samples.weights, 1.0, dmu.inner());
+            stage.0.settled(dmu.complaint("derivatives"))?;
+            let line = stage.integrate(&samples.weights, &vec![1.0; samples.weights.len()]);
+            stage.0.settled((!line.is_finite()).then(|| format!("the line integral of ones is {line}")))?;
+        }
         Ok(stage)
     }
 
@@ -126,4 +134,22 @@ impl Projector for ProjectorStage {
     }
 
     said! { 0: describe fault wgsl }
+}
+
+/// Rays along an axis, across the cube, in the opposite direction, and past the cube.
+fn rays() -> [UnitRay; 4] {
+    let ray = |origin, direction: [f32; 3], inside| UnitRay {
+        origin,
+        direction,
+        inside,
+        published: [0.5, 3.0],
+        per_mm: 0.01,
+    };
+    let third = (1.0f32 / 3.0).sqrt();
+    [
+        ray([-1.0, 0.5, 0.5], [1.0, 0.0, 0.0], [1.0, 2.0]),
+        ray([-third; 3], [third; 3], [1.0, 1.0 + 1.0 / third]),
+        ray([0.5, 2.0, 0.25], [0.0, -1.0, 0.0], [1.0, 2.0]),
+        ray([-1.0, 5.0, 0.5], [1.0, 0.0, 0.0], [0.0, 0.0]),
+    ]
 }

@@ -4,7 +4,8 @@
 
 use super::{Foreign, MOST_BYTES, SMALL, call, make, raw_grid, said};
 use crate::library::{Handle, text};
-use crate::trial;
+use crate::spec::settings;
+use crate::trial::{Guarded, below_zero, drawn};
 use conefield_core::prelude::*;
 use conefield_plugin_abi::*;
 use std::collections::BTreeSet;
@@ -15,6 +16,10 @@ use std::{ptr, slice};
 /// Maximum number of state values per coefficient.
 const MOST_STATE: usize = 64;
 
+settings! {
+    regularizer RegularizerSpec(self) -> dyn Regularizer { self.build(0, RegularizerStage::tried) }
+}
+
 /// A regularizer from a library.
 pub struct RegularizerStage(Foreign<ConefieldRegularizer>);
 
@@ -24,10 +29,16 @@ impl RegularizerStage {
         let stage = Self(Foreign::new(handle)?);
         stage.weight(&SMALL, &mut |k| 0.01 * k)?;
         let mut penalty = stage.made_on(&SMALL)?;
-        trial::regularizer(stage.0.ty(), penalty.count, |v, u| {
-            penalty.try_prox(v, 0.1, u)?;
-            penalty.try_value(v)
-        })?;
+        let mut v = Guarded::of(&drawn(penalty.count).map(|x| x - 0.3).collect::<Vec<f32>>());
+        for _ in 0..2 {
+            let mut u = Guarded::<f32>::new(penalty.count);
+            penalty.try_prox(v.inner(), 0.1, u.inner())?;
+            let value = penalty.try_value(v.inner())?;
+            stage.0.settled(u.complaint("coefficients").or_else(|| v.broken("input")))?;
+            stage.0.settled(below_zero("the penalty", value))?;
+            let negative = u.inner().iter().find(|u| **u < 0.0).map(|u| format!("its proximal map gives {u}"));
+            stage.0.settled(negative)?;
+        }
         Ok(stage)
     }
 
