@@ -11,15 +11,19 @@ pub mod prior;
 pub mod projector;
 pub mod regularizer;
 
-use crate::library::{FunctionsOf, Handle, Text, Type, whole_text};
-use crate::trial;
+// The adapters begin with these imports, too.
+use crate::library::{FunctionsOf, Handle, Text, Type, text, whole_text};
+use crate::spec::settings;
+use crate::trial::{GUARD, Guarded, Marked, below_zero, drawn, settled, timed};
 use conefield_core::prelude::*;
 use conefield_core::wgsl::FOREIGN;
 use conefield_plugin_abi::*;
+use ndarray::Array3;
+use std::collections::BTreeSet;
 use std::ffi::c_void;
-use std::ptr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::{ptr, slice};
 
 /// Bytes that no stage holds: a larger number, such as that of a panic, counts as this one.
 const MOST_BYTES: u64 = 1 << 60;
@@ -94,7 +98,7 @@ impl<F: FunctionsOf> Foreign<F> {
 
     /// Refuses the stage with the complaint of its trial, if there is one.
     fn settled(&self, complaint: Option<String>) -> Result<()> {
-        trial::settled(self.ty(), complaint)
+        settled(self.ty(), complaint)
     }
 
     /// The value of a call that cannot return an error: records the error as a fault and returns `instead`.

@@ -1,14 +1,6 @@
 //! Bases.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, SMALL, ask, call, make, raw_grid, said};
-use crate::library::Handle;
-use crate::spec::settings;
-use crate::trial::{Guarded, Marked, drawn};
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use ndarray::Array3;
+use super::*;
 
 /// Maximum number of coefficients per voxel.
 const MOST: usize = 64;

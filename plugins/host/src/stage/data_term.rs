@@ -1,15 +1,7 @@
 //! Data terms.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, MOST_BYTES, call, make, said};
-use crate::library::Handle;
-use crate::spec::settings;
-use crate::trial::{Guarded, below_zero, drawn};
-use conefield_core::prelude::*;
+use super::*;
 use conefield_core::scan::ScanHeader;
-use conefield_plugin_abi::*;
-use ndarray::Array3;
 
 settings! {
     data_term DataTermSpec(self) -> dyn DataTerm { self.build(0, DataTermStage::tried) }

@@ -1,15 +1,9 @@
 //! Initializers.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, call, make, said};
-use crate::library::{self, Handle};
-use crate::spec::{Loaded, settings};
-use crate::trial::{Marked, timed};
+use super::*;
+use crate::spec::Loaded;
 use conefield_core::arena::Block;
-use conefield_core::prelude::*;
 use conefield_core::settings::KnownVolume;
-use conefield_plugin_abi::*;
 
 /// An initializer from a library.
 pub struct InitializerStage {
@@ -58,7 +52,7 @@ fn named(
     match ask(&mut path) {
         None | Some(CONEFIELD_UNSUPPORTED) => Ok(None),
         // SAFETY: the plugin guarantees that this many bytes are valid while the stage lives.
-        Some(CONEFIELD_OK) => unsafe { library::text(path, &handle.ty.words(), call) }.map(Some),
+        Some(CONEFIELD_OK) => unsafe { text(path, &handle.ty.words(), call) }.map(Some),
         Some(status) => Err(handle.ty.failed(call, status, "")),
     }
 }

@@ -1,13 +1,6 @@
 //! Losses.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, call, make, said};
-use crate::library::Handle;
-use crate::spec::settings;
-use crate::trial::{self, Guarded, Marked};
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
+use super::*;
 
 settings! {
     loss LossSpec(self) -> dyn Loss { self.build(0, LossStage::tried) }
@@ -59,7 +52,7 @@ impl LossStage {
         let NoiseModel { sigma, growth, measured } = *noise;
         let noise = ConefieldNoise { sigma, growth, measured: measured.as_ptr(), count: measured.len() };
         let Some(handle) = make!(self.own, fitted(&noise))? else { return Ok(None) };
-        Ok(Some(Box::new(trial::timed(self.own.ty(), move || Self::tried(handle))?)))
+        Ok(Some(Box::new(timed(self.own.ty(), move || Self::tried(handle))?)))
     }
 }
 

@@ -1,18 +1,9 @@
 //! Encoders, normalizers and fields.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, ask, call, said};
-use crate::library::{Handle, Type};
-use crate::spec::settings;
-use crate::trial::{self, GUARD, Guarded, Marked, settled};
-use conefield_core::prelude::*;
+use super::*;
 use conefield_core::registry::Kind;
 use conefield_core::stage::TILE_ROWS;
-use conefield_plugin_abi::*;
-use std::collections::BTreeSet;
 use std::ops::Range;
-use std::{ptr, slice};
 
 /// Upper bound of the numbers of parameters, channels, … of a stage: more would overflow computations of hosts.
 const MOST: usize = 1 << 40;
@@ -81,7 +72,7 @@ impl MapStage {
             status
         })?;
         let derived = self.own.derived("reduce", made)?;
-        let smaller = trial::timed(self.own.ty(), move || {
+        let smaller = timed(self.own.ty(), move || {
             let smaller = Self::of(derived)?;
             try_map(smaller.own.ty(), &smaller)?;
             Ok(smaller)

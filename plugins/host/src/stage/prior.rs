@@ -1,13 +1,6 @@
 //! Priors of a field.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, ask, call, said};
-use crate::library::Handle;
-use crate::spec::settings;
-use crate::trial::{Guarded, below_zero, drawn};
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
+use super::*;
 
 settings! {
     prior PriorSpec(self) -> dyn Prior { self.build(0, PriorStage::tried) }

@@ -1,15 +1,7 @@
 //! Projectors.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, call, make, raw_ray, said};
-use crate::library::Handle;
-use crate::spec::settings;
-use crate::trial::{self, GUARD, Guarded, Marked};
-use conefield_core::prelude::*;
+use super::*;
 use conefield_core::stage::Lengths;
-use conefield_plugin_abi::*;
-use std::ptr;
 
 /// Maximum number of samples per ray: more than any detector resolves.
 const MOST: usize = 1 << 24;
@@ -130,7 +122,7 @@ impl Projector for ProjectorStage {
         let Lengths { voxel_mm, cell_mm } = lengths;
         let lengths = ConefieldLengths { voxel_mm, cell_mm: cell_mm.unwrap_or(0.0) };
         let Some(handle) = make!(self.0, fitted(&lengths))? else { return Ok(None) };
-        Ok(Some(Box::new(trial::timed(self.0.ty(), move || Self::tried(handle))?)))
+        Ok(Some(Box::new(timed(self.0.ty(), move || Self::tried(handle))?)))
     }
 
     said! { 0: describe fault wgsl }

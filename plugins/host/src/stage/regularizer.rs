@@ -1,17 +1,7 @@
 //! Regularizers.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, MOST_BYTES, SMALL, call, make, raw_grid, said};
-use crate::library::{Handle, text};
-use crate::spec::settings;
-use crate::trial::{Guarded, below_zero, drawn};
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::collections::BTreeSet;
-use std::ffi::c_void;
+use super::*;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::{ptr, slice};
 
 /// Maximum number of state values per coefficient.
 const MOST_STATE: usize = 64;

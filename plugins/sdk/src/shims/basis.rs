@@ -1,10 +1,6 @@
 //! Bases and their expansions on a grid.
 
-use super::{array, array_mut, grid, guard, hand_over, shims, table};
-use crate::built::{OnGrid, settings};
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
+use super::*;
 
 table! {
     ConefieldBasis: on info expand adjoint expand_f64 adjoint_f64;

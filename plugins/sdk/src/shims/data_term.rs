@@ -1,10 +1,6 @@
 //! Data terms and their misfits for a scan.
 
-use super::{array, guard, hand_over, header, many, many_mut, shims, table};
-use crate::built::settings;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
+use super::*;
 
 table! {
     ConefieldDataTerm: bytes of noise differentiate curve spread;

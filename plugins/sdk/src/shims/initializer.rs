@@ -1,11 +1,8 @@
 //! Initializers.
 
-use super::{guard, hand_over, many, many_mut, shims, table, text};
-use crate::built::{Filling, Waiting, settings};
+use super::*;
+use crate::built::{Filling, Waiting};
 use conefield_core::arena::Block;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
 
 table! {
     ConefieldInitializer: apply check weights with_weights volume;

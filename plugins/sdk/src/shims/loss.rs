@@ -1,10 +1,6 @@
 //! Losses.
 
-use super::{guard, hand_over, many, many_mut, shims, table, write_wgsl};
-use crate::built::settings;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
+use super::*;
 
 table! {
     ConefieldLoss: at needs_scan fitted wgsl;

@@ -1,11 +1,8 @@
 //! Encoders, normalizers and fields.
 
-use super::{guard, hand_over, many, many_mut, shims, table, write_wgsl};
-use crate::built::{Map, Rows, settings};
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
+use super::*;
+use crate::built::{Map, Rows};
 use std::borrow::Cow;
-use std::ffi::c_void;
 
 table! {
     ConefieldMap: info parameter init forward backward forward_f64 backward_f64 partition reduce wgsl passes forward_pass resolutions;

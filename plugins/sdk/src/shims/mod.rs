@@ -15,7 +15,8 @@ pub mod prior;
 pub mod projector;
 pub mod regularizer;
 
-use crate::built::{Named, Part};
+// The shims of each kind begin with these imports, too.
+use crate::built::{Named, OnGrid, Part, settings};
 use conefield_core::prelude::*;
 use conefield_core::registry::{Kind, StageType};
 use conefield_core::scan::ScanHeader;

@@ -1,10 +1,6 @@
 //! Priors.
 
-use super::{guard, many, many_mut, shims, table, write_wgsl};
-use crate::built::settings;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
+use super::*;
 
 table! {
     ConefieldPrior: blocks block wgsl;

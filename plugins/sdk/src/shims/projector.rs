@@ -1,12 +1,8 @@
 //! Projectors.
 
-use super::{guard, hand_over, many, many_mut, shims, table, write_wgsl};
-use crate::built::settings;
-use conefield_core::prelude::*;
+use super::*;
 use conefield_core::stage::Lengths;
-use conefield_plugin_abi::*;
 use std::cell::RefCell;
-use std::ffi::c_void;
 
 table! {
     ConefieldProjector: max_samples sample integrate adjoint fitted wgsl;

@@ -1,11 +1,7 @@
 //! Regularizers and their penalties on a grid.
 
-use super::{array, grid, guard, hand_over, header, many, many_mut, shims, table};
-use crate::built::{OnGrid, settings};
+use super::*;
 use conefield_core::place::Host;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
 use std::sync::Arc;
 
 table! {
