@@ -24,6 +24,8 @@ mod wgsl;
 use call::{Subject, failed, settle};
 use conefield_core::error::Error;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Scope, Stage};
+use serde::ser::{Serialize, SerializeStruct, Serializer};
+use serde_json::json;
 use std::fmt;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -158,6 +160,20 @@ impl Report {
     /// Adds a property that holds without a complaint; `fine` is the evidence.
     fn holds(&mut self, name: &'static str, fine: &str, complaint: impl FnOnce() -> Option<String>) {
         self.add(name, || settle(complaint(), fine));
+    }
+}
+
+impl Serialize for Report {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        let property = |(name, outcome): &(&str, Outcome)| {
+            let (outcome, text) = outcome.words();
+            json!({ "name": name, "outcome": outcome, "text": text })
+        };
+        let mut table = to.serialize_struct("Report", 3)?;
+        table.serialize_field("stage", &self.stage)?;
+        table.serialize_field("properties", &self.entries.iter().map(property).collect::<Vec<_>>())?;
+        table.serialize_field("passed", &self.passed())?;
+        table.end()
     }
 }
 

@@ -4,7 +4,7 @@ use crate::{out, program};
 use clap::Args;
 use conefield::{parse, plugins};
 use conefield_backend_wgpu::Wgpu;
-use conefield_conformance::{Options, Outcome, Report, WIDTHS, With, check_type};
+use conefield_conformance::{Options, Report, WIDTHS, With, check_type};
 use conefield_core::registry::Kind;
 use conefield_core::runner::Runner;
 use conefield_core::{Error, Result};
@@ -79,16 +79,8 @@ struct StageReport {
     settings: Value,
     #[serde(skip_serializing_if = "Option::is_none")]
     width: Option<usize>,
-    stage: String,
-    properties: Vec<Property>,
-    passed: bool,
-}
-
-#[derive(Serialize)]
-struct Property {
-    name: &'static str,
-    outcome: &'static str,
-    text: String,
+    #[serde(flatten)]
+    report: Report,
 }
 
 impl Check {
@@ -144,13 +136,8 @@ impl Check {
         } else {
             out::say(&text(&report))?
         }
-        let failed: Vec<String> = report
-            .stages
-            .iter()
-            .flat_map(|s| {
-                s.properties.iter().filter(|p| p.outcome == FAILED).map(|p| format!("{}: {}", s.name, p.name))
-            })
-            .collect();
+        let of = |s: &StageReport| s.report.failed().into_iter().map(|name| format!("{}: {name}", s.name)).collect();
+        let failed: Vec<String> = report.stages.iter().flat_map::<Vec<_>, _>(of).collect();
         if failed.is_empty() {
             return Ok(());
         }
@@ -192,7 +179,7 @@ impl Check {
             licence: library.licence.clone(),
             abi: format!("{}.{}", library.abi.0, library.abi.1),
             path: library.path.display().to_string(),
-            passed: stages.iter().all(|s| s.passed),
+            passed: stages.iter().all(|s| s.report.passed()),
             stages,
         })
     }
@@ -208,12 +195,14 @@ impl Check {
             device: &|| device.runner(),
         };
         let found = check_type(t.kind, &table, &with)?;
-        all.extend(found.into_iter().map(|(width, report)| StageReport::of(t, settings, width, report)));
+        let of = |(width, report)| {
+            let (name, settings) = (t.name.clone(), settings.clone());
+            StageReport { kind: t.kind, name, settings, width, report }
+        };
+        all.extend(found.into_iter().map(of));
         Ok(())
     }
 }
-
-const FAILED: &str = "failed";
 
 /// The device for WGSL, opened when the first stage provides WGSL.
 #[derive(Default)]
@@ -226,31 +215,16 @@ impl Device {
     }
 }
 
-impl StageReport {
-    fn of(t: &Type, settings: &Value, width: Option<usize>, report: Report) -> Self {
-        let passed = report.passed();
-        let property = |(name, outcome): (_, Outcome)| {
-            let (outcome, text) = outcome.words();
-            Property { name, outcome, text: text.into() }
-        };
-        let properties = report.entries.into_iter().map(property).collect();
-        let (name, settings) = (t.name.clone(), settings.clone());
-        Self { kind: t.kind, name, settings, width, stage: report.stage, properties, passed }
-    }
-}
-
 fn text(r: &Checked) -> String {
     let mut lines = vec![format!("{} {}, {}, ABI {}: {}", r.plugin, r.version, r.licence, r.abi, r.path)];
-    for s in &r.stages {
-        let width = s.width.map_or(String::new(), |w| format!(", {w} channels in"));
-        lines.push(format!("\n{} {} {}{width}\n  {}", s.kind, s.name, s.settings, s.stage));
-        for p in &s.properties {
-            let outcome = if p.outcome == FAILED { "FAILED" } else { p.outcome };
-            lines.push(format!("  {outcome:<8} {:<34} {}", p.name, p.text));
-        }
+    for StageReport { kind, name, settings, width, report } in &r.stages {
+        let width = width.map_or(String::new(), |w| format!(", {w} channels in"));
+        lines.push(format!("\n{kind} {name} {settings}{width}\n  {}", report.to_string().trim_end()));
     }
-    let count = |o: &str| r.stages.iter().flat_map(|s| &s.properties).filter(|p| p.outcome == o).count();
-    lines.push(format!("\n{} passed, {} skipped, {} failed", count("passed"), count("skipped"), count(FAILED)));
+    let all = || r.stages.iter().flat_map(|s| &s.report.entries);
+    let [passed, skipped, failed] =
+        ["passed", "skipped", "failed"].map(|word| all().filter(|(_, outcome)| outcome.words().0 == word).count());
+    lines.push(format!("\n{passed} passed, {skipped} skipped, {failed} failed"));
     lines.join("\n")
 }
 
