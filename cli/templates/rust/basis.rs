@@ -1,16 +1,9 @@
 //! A basis for conefield: a coefficient for each block of voxels.
 
-@stage "blocks of voxels"@
-pub struct Settings {
+@stage "blocks of voxels"
     /// Voxels along a block's edge.
-    pub edge: usize,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { edge: 2 }
-    }
-}
+    pub edge: usize = 2,
+@
 
 impl BasisSpec for Settings {
     fn build(&self) -> Result<Box<dyn Basis>> {

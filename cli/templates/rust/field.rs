@@ -1,17 +1,10 @@
 //! A field for conefield: features `[n, F]` to attenuation `[n, 1]`, `y = ln(1 + exp(w·x + b))`, which is never
 //! negative.
 
-@stage "a weighted sum through a softplus"@
-pub struct Settings {
+@stage "a weighted sum through a softplus"
     /// Initial shift; the lower it is, the closer the first volume is to 0.
-    pub bias: f32,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { bias: -1.0 }
-    }
-}
+    pub bias: f32 = -1.0,
+@
 
 impl FieldSpec for Settings {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {

@@ -3,17 +3,10 @@
 //! This start scales and shifts every channel by numbers that are learned: `y = w·x + b`. Its backward pass is written
 //! by hand; `cargo test` compares it with finite differences.
 
-@stage "a learned scale and shift of every channel"@
-pub struct Settings {
+@stage "a learned scale and shift of every channel"
     /// Initial scale.
-    pub scale: f32,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { scale: 1.0 }
-    }
-}
+    pub scale: f32 = 1.0,
+@
 
 impl NormalizerSpec for Settings {
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {

@@ -3,19 +3,12 @@
 //! This start takes the middles of equal intervals within the reconstruction box. The line integral is the sum of
 //! attenuation times length, and its adjoint comes with the trait.
 
-@stage "equal intervals within the box"@
-pub struct Settings {
+@stage "equal intervals within the box"
     /// Samples per ray that meets the box.
-    pub samples: usize,
+    pub samples: usize = 128,
     /// Use a random position in every interval instead of its middle.
-    pub random: bool,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { samples: 128, random: false }
-    }
-}
+    pub random: bool = false,
+@
 
 impl ProjectorSpec for Settings {
     fn build(&self) -> Result<Box<dyn Projector>> {

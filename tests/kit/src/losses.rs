@@ -91,8 +91,8 @@ fn least(loss: &dyn Loss) -> Found {
         let what = || format!("{none:e} and the derivative {slope:e} where both are {measured}");
         require(none == 0.0 && slope == 0.0, what)?;
         let (value, slope) = loss.at(predicted, measured);
-        let uphill = !slope.is_nan() && !(slope * (predicted - measured) < 0.0);
-        require(value >= 0.0 && uphill, || {
+        let downhill = slope.is_nan() || slope * (predicted - measured) < 0.0;
+        require(value >= 0.0 && !downhill, || {
             format!("{}: loss {value:e}, derivative {slope:e}", words(predicted, measured))
         })?;
     }

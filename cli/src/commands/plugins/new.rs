@@ -158,12 +158,26 @@ impl New {
         Ok(Start { files, library, build: "cargo build --release\n  cargo test --release" })
     }
 
-    /// The Rust template of the kind with what all of them have in common.
+    /// The Rust template of the kind with what all of them have in common; a template lists its settings as
+    /// `pub name: type = default,`.
     fn stage(&self) -> String {
         let Template { kind, rust, .. } = self.kind;
         let (above, rest) = rust.split_once("@stage ").unwrap_or_default();
-        let (doc, below) = rest.split_once('@').unwrap_or_default();
-        let stage = template!("rust/stage.rs").trim_end().replace("@kind@", &format!("{kind:?}")).replace("@doc@", doc);
+        let (doc, rest) = rest.split_once('\n').unwrap_or_default();
+        let (listed, below) = rest.split_once("@\n").unwrap_or_default();
+        let (mut settings, mut defaults) = (vec![], vec![]);
+        for line in listed.lines() {
+            match line.trim().strip_prefix("pub ").and_then(|rest| rest.trim_end_matches(',').split_once(" = ")) {
+                Some((field, default)) => {
+                    let name = field.split(':').next().unwrap_or_default();
+                    defaults.push(format!("{name}: {default}"));
+                    settings.push(format!("    pub {field},"));
+                }
+                None => settings.push(line.into()),
+            }
+        }
+        let stage = template!("rust/stage.rs").replace("@kind@", &format!("{kind:?}")).replace("@doc@", doc);
+        let stage = stage.replace("@settings@", &settings.join("\n")).replace("@defaults@", &defaults.join(", "));
         format!("{above}{stage}{below}")
     }
 
