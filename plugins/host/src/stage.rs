@@ -12,7 +12,7 @@ pub mod projector;
 pub mod regularizer;
 
 // The adapters begin with these imports, too.
-use crate::library::{FunctionsOf, Handle, Text, Type, text, whole_text};
+use crate::library::{Handle, Text, Type, text, whole_text};
 use crate::spec::settings;
 use crate::trial::{GUARD, Guarded, Marked, below_zero, drawn, settled, timed};
 use conefield_core::prelude::*;
@@ -58,10 +58,10 @@ pub(crate) struct Foreign<F> {
     fault: Fault,
 }
 
-impl<F: FunctionsOf> Foreign<F> {
+impl<F: Copy + 'static> Foreign<F> {
     fn new(handle: Handle) -> Result<Self> {
         let another = || handle.ty.failed("create", CONEFIELD_FAILED, "it is of another kind");
-        let functions = F::of(handle.ty.functions).ok_or_else(another)?;
+        let functions = *handle.ty.functions.downcast_ref().ok_or_else(another)?;
         let describe = handle.describe()?;
         Ok(Self { handle, functions, describe, fault: Fault::default() })
     }
