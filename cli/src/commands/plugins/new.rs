@@ -63,10 +63,11 @@ struct Start {
 #[derive(Debug, Clone, Copy)]
 struct Template {
     kind: Kind,
-    /// The stage in C, without its tables, and in Rust.
+    /// The stage in C and in Rust, without what all kinds have in common.
     c: &'static str,
     rust: &'static str,
-    /// Where it has its functions in C, and the kind's code.
+    /// The type of its functions in C, the place of these, and the kind's code.
+    functions: &'static str,
     table: &'static str,
     code: &'static str,
     /// A small spec, and the place of the stage there.
@@ -81,6 +82,7 @@ macro_rules! templates {
             kind: Kind::$kind,
             c: template!(concat!("c/", stringify!($name), ".c")),
             rust: template!(concat!("rust/", stringify!($name), ".rs")),
+            functions: stringify!($table),
             table: stringify!($field),
             code: stringify!($code),
             spec: stringify!($spec),
@@ -181,12 +183,24 @@ impl New {
         format!("{above}{stage}{below}")
     }
 
+    /// The C template of the kind with its tables; a template ends with the functions that it has, `of` or `curve=as_is`.
+    fn tables(&self) -> String {
+        let Template { c, functions, table, code, .. } = self.kind;
+        let (above, rest) = c.split_once("@plugin ").unwrap_or_default();
+        let entry = |word: &str| {
+            let (name, function) = word.split_once('=').unwrap_or((word, word));
+            format!("    .{name} = {function},")
+        };
+        let entries: Vec<String> = rest.trim_end().trim_end_matches('@').split(' ').map(entry).collect();
+        let tables =
+            template!("c/plugin.c").replace("@functions@", functions).replace("@entries@", &entries.join("\n"));
+        above.to_owned() + &tables.replace("@kind@", code).replace("@table@", table)
+    }
+
     fn c(&self) -> Start {
-        let Template { c, table, code, .. } = self.kind;
-        let plugin = template!("c/plugin.c").trim_end().replace("@kind@", code).replace("@table@", table);
-        let named = |text: &str| text.replace("@plugin@", &plugin).replace("@name@", &self.name);
+        let named = |text: &str| text.replace("@name@", &self.name);
         let files = vec![
-            (format!("{}.c", self.name), named(c)),
+            (format!("{}.c", self.name), named(&self.tables())),
             ("conefield_plugin.h".into(), conefield_plugin_abi::HEADER.into()),
             ("conefield_helpers.h".into(), conefield_plugin_abi::HELPERS.into()),
             ("Makefile".into(), named(template!("c/Makefile"))),
