@@ -76,6 +76,11 @@ impl<F: Copy + 'static> Foreign<F> {
         Error::unsupported(self.ty().words(), format!("{call}: {what}"))
     }
 
+    /// Refuses a wrong result of `call`.
+    fn require(&self, holds: bool, call: &str, what: impl FnOnce() -> String) -> Result<()> {
+        if holds { Ok(()) } else { Err(self.wrong(call, &what())) }
+    }
+
     /// Calls `f` with the stage and a buffer for the reason. Errors name `call`.
     fn run(&self, call: &str, f: impl FnOnce(*mut c_void, *mut ConefieldText) -> ConefieldStatus) -> Result<()> {
         let mut error = Text::new();

@@ -35,12 +35,10 @@ impl BasisStage {
         coefficients.validate("coefficients").map_err(|e| own.wrong("info", &e.to_string()))?;
         let voxels: usize = grid.shape.iter().product();
         let count = shape.iter().try_fold(1usize, |n, &k| n.checked_mul(k)).filter(|n| *n <= MOST * voxels.max(64));
-        let many = || own.wrong("info", &format!("{shape:?} coefficients for {:?} voxels", grid.shape));
-        count.ok_or_else(many)?;
+        own.require(count.is_some(), "info", || format!("{shape:?} coefficients for {:?} voxels", grid.shape))?;
         let double = own.functions.expand_f64.is_some() && own.functions.adjoint_f64.is_some();
-        if info.double_precision != 0 && !double {
-            return Err(own.wrong("info", "it declares double precision but has no operators for it"));
-        }
+        let able = info.double_precision == 0 || double;
+        own.require(able, "info", || "it declares double precision but has no operators for it".into())?;
         Ok(ExpansionOn { own, coefficients, info })
     }
 }

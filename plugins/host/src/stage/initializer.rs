@@ -102,9 +102,8 @@ impl Initializer for InitializerStage {
         params.resize(n + GUARD, f32::MARK);
         let mut filled = vec![0u8; blocks.len()];
         call!(self.own, apply(blocks.as_ptr(), blocks.len(), params.as_mut_ptr(), n, filled.as_mut_ptr()))?;
-        if params[n..].iter().any(|v| !v.is_mark()) {
-            return Err(self.own.wrong("apply", "it writes past the parameters"));
-        }
+        let within = params[n..].iter().all(|v| v.is_mark());
+        self.own.require(within, "apply", || "it writes past the parameters".into())?;
         let mut report = InitReport::default();
         for (b, &filled) in layout.blocks.iter().zip(&filled) {
             if filled == 0 {

@@ -18,9 +18,8 @@ impl LossStage {
         let own = Foreign::<ConefieldLoss>::new(handle)?;
         // SAFETY: the stage is alive.
         let needs_scan = own.functions.needs_scan.is_some_and(|f| unsafe { f(own.handle.stage) } != 0);
-        if needs_scan && own.functions.fitted.is_none() {
-            return Err(own.wrong("needs_scan", "it needs a scan with no function fitted"));
-        }
+        let able = !needs_scan || own.functions.fitted.is_some();
+        own.require(able, "needs_scan", || "it needs a scan with no function fitted".into())?;
         let stage = Self { own, needs_scan };
         let values: Vec<f64> = (0..16).map(|i| 0.25 * f64::from(i) - 0.5).collect();
         for shift in [0.0, 0.25, -1.0] {

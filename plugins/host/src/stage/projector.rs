@@ -66,20 +66,19 @@ impl ProjectorStage {
         points: &mut [[f32; 3]],
         weights: &mut [f32],
     ) -> Result<usize> {
-        let failed = |what: &str| Err(self.0.wrong("sample", what));
         let (ray, seed) = (raw_ray(ray), seed.as_ref().map_or(ptr::null(), ptr::from_ref));
         let mut count = 0;
         let (to, by) = (points.as_mut_ptr().cast(), weights.as_mut_ptr());
         call!(self.0, sample(&ray, seed, to, by, capacity, &mut count))?;
-        if count > capacity {
-            return failed(&format!("{count} samples, more than its maximum of {capacity}"));
-        }
-        if points[capacity..].iter().flatten().chain(&weights[capacity..]).any(|v| !v.is_mark()) {
-            return failed(&format!("it writes past the {capacity} samples that there is room for"));
-        }
+        let require = |holds, what: &dyn Fn() -> String| self.0.require(holds, "sample", what);
+        require(count <= capacity, &|| format!("{count} samples, more than its maximum of {capacity}"))?;
+        let within = points[capacity..].iter().flatten().chain(&weights[capacity..]).all(|v| v.is_mark());
+        require(within, &|| format!("it writes past the {capacity} samples that there is room for"))?;
         let bad = |i: &usize| !points[*i].iter().chain([&weights[*i]]).all(|v| v.is_finite());
         match (0..count).find(bad) {
-            Some(i) => failed(&format!("sample {i} is at {:?} with weight {}", points[i], weights[i])),
+            Some(i) => {
+                Err(self.0.wrong("sample", &format!("sample {i} is at {:?} with weight {}", points[i], weights[i])))
+            }
             None => Ok(count),
         }
     }
@@ -89,12 +88,8 @@ impl Projector for ProjectorStage {
     fn max_samples(&self, ray: &UnitRay) -> usize {
         // SAFETY: the stage is alive, the ray lives during the call.
         let most = self.0.functions.max_samples.map_or(0, |f| unsafe { f(self.0.handle.stage, &raw_ray(ray)) });
-        let few = if most > MOST {
-            Err(self.0.wrong("max_samples", &format!("{most} samples for one ray")))
-        } else {
-            Ok(most)
-        };
-        self.0.noted(few, 0)
+        let few = self.0.require(most <= MOST, "max_samples", || format!("{most} samples for one ray"));
+        self.0.noted(few.map(|()| most), 0)
     }
 
     fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples) {

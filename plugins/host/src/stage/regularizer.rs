@@ -104,18 +104,15 @@ impl PenaltyOn {
     }
 
     fn read_state(&self) -> Result<Vec<(String, usize)>> {
-        let wrong = |what: String| self.own.wrong("state", &what);
         let (mut all, mut names, mut numbers) = (vec![], BTreeSet::new(), 0usize);
         while let Some(entry) = self.entry(all.len())? {
             // SAFETY: the plugin guarantees that this many bytes are valid while the penalty lives.
             let name = unsafe { text(entry.name, &self.own.ty().words(), "state") }?;
             numbers = numbers.saturating_add(entry.length);
-            if entry.data.is_null() || entry.length == 0 || numbers > MOST_STATE * self.count.max(64) {
-                return Err(wrong(format!("{name:?} has {} numbers", entry.length)));
-            }
-            if !names.insert(name.clone()) {
-                return Err(wrong(format!("two entries are called {name:?}")));
-            }
+            let sane = !entry.data.is_null() && entry.length > 0 && numbers <= MOST_STATE * self.count.max(64);
+            self.own.require(sane, "state", || format!("{name:?} has {} numbers", entry.length))?;
+            let fresh = names.insert(name.clone());
+            self.own.require(fresh, "state", || format!("two entries are called {name:?}"))?;
             all.push((name, entry.length));
         }
         Ok(all)
