@@ -3,8 +3,8 @@
 use crate::out;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
+use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::{self, Kind};
-use conefield_core::{Error, Result};
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
@@ -106,23 +106,18 @@ impl New {
             && self.name.chars().all(plain)
             && (2..=40).contains(&self.name.len())
             && !self.name.ends_with('-');
-        if !good {
-            let expected = "2 to 40 lower-case letters, digits and hyphens, a letter first";
-            return Err(Error::invalid("plugins new", "NAME", format!("{:?}", self.name), expected));
-        }
-        if RESERVED.contains(&&self.name[..]) {
-            let expected = "a name that is not a Rust keyword or crate";
-            return Err(Error::invalid("plugins new", "NAME", format!("{:?}", self.name), expected));
-        }
+        let own = format!("{:?}", self.name);
+        let expected = "2 to 40 lower-case letters, digits and hyphens, a letter first";
+        ensure(good, "plugins new", "NAME", &own, expected)?;
+        let free = !RESERVED.contains(&&self.name[..]);
+        ensure(free, "plugins new", "NAME", &own, "a name that is not a Rust keyword or crate")?;
         if let Some(taken) = registry::find(self.kind.kind, &self.name) {
-            let found = format!("{:?}, the {} of {}", self.name, taken.kind, taken.owner());
+            let found = format!("{own}, the {} of {}", taken.kind, taken.owner());
             return Err(Error::invalid("plugins new", "NAME", found, "an unused name"));
         }
         let folder = self.into.join(&self.name);
-        if folder.exists() {
-            let expected = "the name of a new folder";
-            return Err(Error::invalid(folder.display().to_string(), "NAME", "an existing file or folder", expected));
-        }
+        let (place, expected) = (folder.display().to_string(), "the name of a new folder");
+        ensure(!folder.exists(), &place, "NAME", "an existing file or folder", expected)?;
         let Start { files, library, build } = match self.lang {
             Language::Rust => self.rust()?,
             Language::C => self.c(),
@@ -134,11 +129,9 @@ impl New {
             conefield_io::write_text_atomic(&path, text)?;
         }
         out::say(&format!(
-            "{}: {} files. Next:\n  cd {}\n  {build}\n  conefield plugins check {library}\n  conefield --plugin {library} \
-             reconstruct SCAN --spec spec.toml -o run",
-            folder.display(),
+            "{place}: {} files. Next:\n  cd {place}\n  {build}\n  conefield plugins check {library}\n  conefield --plugin \
+             {library} reconstruct SCAN --spec spec.toml -o run",
             files.len(),
-            folder.display(),
         ))?;
         match self.lang {
             Language::Rust => out::say("The first build and test compile conefield's crates, too: some minutes each."),
