@@ -5,10 +5,9 @@ use clap::Args;
 use conefield::{parse, plugins};
 use conefield_backend_wgpu::Wgpu;
 use conefield_conformance::{Options, Report, WIDTHS, With, check_type};
+use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::Kind;
 use conefield_core::runner::Runner;
-use conefield_core::{Error, Result};
-use conefield_plugins::library::Type;
 use conefield_plugins::spec::with_defaults;
 use conefield_plugins::{Library, Place};
 use serde::Serialize;
@@ -150,9 +149,21 @@ impl Check {
         Err(Error::unsupported(self.library.display().to_string(), why))
     }
 
+    /// Checks each stage type with each of its settings, at all sensible widths.
     fn report(&self, library: &Library) -> Result<Checked> {
+        // The device for WGSL, opened when the first stage provides WGSL.
+        let opened = OnceLock::new();
+        let device = || {
+            let opened = opened.get_or_init(|| Wgpu::open(None).map_err(|e| e.to_string()));
+            opened.as_ref().map(|device| device as &dyn Runner).map_err(String::clone)
+        };
+        let widths: Vec<usize> = self.width.iter().map(|&width| width.into()).collect();
+        let with = With {
+            widths: if widths.is_empty() { &WIDTHS } else { &widths },
+            options: &|options| Options { single: self.single, ..options },
+            device: &device,
+        };
         let mut stages = vec![];
-        let device = Device::default();
         for t in library.types.iter().filter(|t| self.name.as_ref().is_none_or(|n| *n == t.name)) {
             let mut tries: Vec<Value> = self.settings.clone();
             if tries.is_empty() {
@@ -160,19 +171,21 @@ impl Check {
                 tries.extend((!needed).then(|| serde_json::json!({})));
                 tries.extend(t.schema["examples"].as_array().into_iter().flatten().cloned());
             }
-            if tries.is_empty() {
-                let expected = "--settings, or examples in its schema: it has settings without a default";
-                return Err(Error::invalid(library.owner(), &t.name, "no settings to check", expected));
-            }
+            let expected = "--settings, or examples in its schema: it has settings without a default";
+            ensure(!tries.is_empty(), &library.owner(), &t.name, "no settings to check", expected)?;
             for settings in tries {
-                self.stage(t, &with_defaults(&t.schema, settings), &device, &mut stages)?;
+                let settings = with_defaults(&t.schema, settings);
+                let mut table = settings.clone();
+                table["type"] = t.name.clone().into();
+                for (width, report) in check_type(t.kind, &table, &with)? {
+                    let (name, settings) = (t.name.clone(), settings.clone());
+                    stages.push(StageReport { kind: t.kind, name, settings, width, report });
+                }
             }
         }
-        if stages.is_empty() {
-            let known: Vec<&str> = library.types.iter().map(|t| &t.name[..]).collect();
-            let expected = format!("one of {}", known.join(", "));
-            return Err(Error::invalid(library.owner(), "--type", self.name.clone().unwrap_or_default(), expected));
-        }
+        let known: Vec<&str> = library.types.iter().map(|t| &t.name[..]).collect();
+        let (name, expected) = (self.name.as_deref().unwrap_or_default(), format!("one of {}", known.join(", ")));
+        ensure(!stages.is_empty(), &library.owner(), "--type", name, expected)?;
         Ok(Checked {
             plugin: library.name.clone(),
             version: library.version.clone(),
@@ -182,36 +195,6 @@ impl Check {
             passed: stages.iter().all(|s| s.report.passed()),
             stages,
         })
-    }
-
-    /// Checks one stage type with one set of settings, at all sensible widths.
-    fn stage(&self, t: &Type, settings: &Value, device: &Device, all: &mut Vec<StageReport>) -> Result<()> {
-        let mut table = settings.clone();
-        table["type"] = t.name.clone().into();
-        let widths: Vec<usize> = self.width.iter().map(|&width| width.into()).collect();
-        let with = With {
-            widths: if widths.is_empty() { &WIDTHS } else { &widths },
-            options: &|options| Options { single: self.single, ..options },
-            device: &|| device.runner(),
-        };
-        let found = check_type(t.kind, &table, &with)?;
-        let of = |(width, report)| {
-            let (name, settings) = (t.name.clone(), settings.clone());
-            StageReport { kind: t.kind, name, settings, width, report }
-        };
-        all.extend(found.into_iter().map(of));
-        Ok(())
-    }
-}
-
-/// The device for WGSL, opened when the first stage provides WGSL.
-#[derive(Default)]
-struct Device(OnceLock<Result<Wgpu, String>>);
-
-impl Device {
-    fn runner(&self) -> Result<&dyn Runner, String> {
-        let opened = self.0.get_or_init(|| Wgpu::open(None).map_err(|e| e.to_string()));
-        opened.as_ref().map(|device| device as &dyn Runner).map_err(String::clone)
     }
 }
 
