@@ -81,14 +81,19 @@ impl With<'static> {
 /// Numbers of input channels at which normalizers and fields are checked by default.
 pub const WIDTHS: [usize; 4] = [1, 3, 8, 20];
 
-/// Checks every stage type that the crate `package` registers, with the settings of its registration, for the tests of
-/// a plugin.
+/// Checks every stage type that the crate `package` registers, for the tests of a plugin: with the settings of its
+/// registration, and with the `examples` of its schema.
 pub fn check_package(package: &str) -> Result<Vec<Report>> {
     let mut reports = vec![];
     for t in stage_types() {
         if matches!(t.origin, Origin::Linked { package: own, .. } if own == package) {
-            let found = check_type(t.kind, &t.example(), &With::ON_THE_HOST)?;
-            reports.extend(found.into_iter().map(|(_, report)| report));
+            let mut tries = vec![t.example()];
+            tries.extend(t.schema()["examples"].as_array().into_iter().flatten().cloned());
+            for mut settings in tries {
+                settings["type"] = t.name.into();
+                let found = check_type(t.kind, &settings, &With::ON_THE_HOST)?;
+                reports.extend(found.into_iter().map(|(_, report)| report));
+            }
         }
     }
     ensure(!reports.is_empty(), package, "stages", "none", "at least one registered stage type")?;

@@ -11,6 +11,7 @@ stage_type!(FieldSpec, "siren", Siren, "multi-layer perceptron of sines");
 /// Settings of `siren`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
+#[schemars(extend("examples" = [{"width": 5, "depth": 3, "omega": 1.0}]))]
 pub struct Siren {
     /// Channels of every hidden layer.
     pub width: usize,
