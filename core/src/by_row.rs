@@ -259,7 +259,7 @@ impl<T: RowMap, R: Real> Backward<'_, T, R> {
             let dy = Channels { tile: self.dy, places: outputs, row, zero };
             let (tile, places) = match &mut self.dx {
                 Some(dx) => (TileMut::new(dx.data, dx.rows), &inputs[..]),
-                None => (TileMut::new(&mut [], 0), nowhere),
+                None => (TileMut::new(&mut [], 1), nowhere),
             };
             let params = Grads { values: self.grads.values, range: self.grads.range.clone() };
             let inputs = ChannelsMut { tile, places, row, zero };
