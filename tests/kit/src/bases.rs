@@ -3,7 +3,7 @@
 use crate::call::{differing, no_fault, on_threads, require, settle, skipped};
 use crate::gradients::no_double;
 use crate::voxels::{apart, flat, mismatch, noise, nonlinear};
-use crate::{Found, Report};
+use crate::{Outcome, Report};
 use conefield_core::basis::{Basis, BasisOperator, Expansion};
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::simd::Real;
@@ -86,7 +86,7 @@ fn back<R: Real>(of: &dyn BasisOperator<R>, coefficients: [usize; 3], y: &Array3
     out
 }
 
-fn adjoint<R: Real>(all: &Made, of: impl Fn(&dyn Expansion) -> &dyn BasisOperator<R>, most: f64) -> Found {
+fn adjoint<R: Real>(all: &Made, of: impl Fn(&dyn Expansion) -> &dyn BasisOperator<R>, most: f64) -> Outcome {
     let mut worst = 0.0f64;
     for (grid, basis) in all {
         let (op, shape) = (of(basis.as_ref()), basis.coefficients().shape);
@@ -99,7 +99,7 @@ fn adjoint<R: Real>(all: &Made, of: impl Fn(&dyn Expansion) -> &dyn BasisOperato
     Ok(format!("off by {worst:.1e} at most"))
 }
 
-fn single_precision(all: &Made) -> Found {
+fn single_precision(all: &Made) -> Outcome {
     let wide = |a: &Array3<f32>| a.mapv(f64::from);
     let complaint = all.iter().find_map(|(grid, basis)| {
         let shape = basis.coefficients().shape;
@@ -132,7 +132,7 @@ fn overwrites((grid, basis): &(VoxelGrid, Box<dyn Expansion>)) -> Option<String>
         .or_else(|| differing("coefficient", &flat(&coefficients), &flat(&back(op, shape, &y))))
 }
 
-fn no_negative_entries(all: &Made) -> Found {
+fn no_negative_entries(all: &Made) -> Outcome {
     let mut coefficients = 0;
     if all.iter().any(|(_, basis)| basis.are_samples()) {
         return skipped("coefficients are samples");
@@ -155,7 +155,7 @@ fn no_negative_entries(all: &Made) -> Found {
 }
 
 /// Coefficients that are samples fill the same box, preserve constants, and change nothing if the grids are equal.
-fn samples(all: &Made, close: f64) -> Found {
+fn samples(all: &Made, close: f64) -> Outcome {
     if !all.iter().any(|(_, basis)| basis.are_samples()) {
         return skipped("coefficients are none");
     }

@@ -3,7 +3,7 @@
 use crate::call::{
     Before, Guarded, Loaded, Subject, differing, error, none, require, rows_of, settle, skipped, within,
 };
-use crate::{Found, Options};
+use crate::{Options, Outcome};
 use conefield_core::arena::{Block, Layout, Weights};
 use conefield_core::stage::{GradKind, Grads, Tile, TileMut};
 use std::collections::BTreeSet;
@@ -12,7 +12,7 @@ use std::collections::BTreeSet;
 const ROWS: usize = 301;
 
 /// Counts and kinds are consistent, and an identity stage is one.
-pub fn info(of: &Subject<'_>) -> Found {
+pub fn info(of: &Subject<'_>) -> Outcome {
     let info = of.stage.info();
     let channels = info.input > 0 && info.output > 0;
     require(channels, || format!("{} channels in, {} out", info.input, info.output))?;
@@ -29,7 +29,7 @@ pub fn info(of: &Subject<'_>) -> Found {
 }
 
 /// Blocks are consecutive, cover all parameters and have unique names.
-pub fn parameters(of: &Subject<'_>) -> Found {
+pub fn parameters(of: &Subject<'_>) -> Outcome {
     let mut names = BTreeSet::new();
     let mut end = 0;
     for p in of.stage.parameters() {
@@ -45,7 +45,7 @@ pub fn parameters(of: &Subject<'_>) -> Found {
 }
 
 /// Initial parameters are finite, complete and repeatable.
-pub fn init(of: &Subject<'_>) -> Found {
+pub fn init(of: &Subject<'_>) -> Outcome {
     let n = of.stage.info().params;
     let (mut a, mut b) = (vec![f32::NAN; n], vec![1e9; n]);
     of.stage.init(of.options.seed, &mut a);
@@ -55,7 +55,7 @@ pub fn init(of: &Subject<'_>) -> Found {
 }
 
 /// Rows do not depend on their tile.
-pub fn tile_outputs(of: &Subject<'_>) -> Found {
+pub fn tile_outputs(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let (x, dy) = s.data(ROWS);
     let [y, _, dx] = s.pass(&x, &dy, ROWS);
@@ -73,7 +73,7 @@ pub fn tile_outputs(of: &Subject<'_>) -> Found {
 }
 
 /// The kernel for points off any ray treats each row as a ray of one sample.
-pub fn points(of: &Subject<'_>) -> Found {
+pub fn points(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let Some(kernel) = s.kernel.points() else { return skipped("none") };
     let n = 37;
@@ -91,7 +91,7 @@ pub fn points(of: &Subject<'_>) -> Found {
 }
 
 /// All passes in order give the result of forward.
-pub fn passes(of: &Subject<'_>) -> Found {
+pub fn passes(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let n = 37;
     let (x, _) = s.data(n);
@@ -102,7 +102,7 @@ pub fn passes(of: &Subject<'_>) -> Found {
 }
 
 /// Gradients do not depend on the split into tiles, except for rounding.
-pub fn tile_gradients(of: &Subject<'_>) -> Found {
+pub fn tile_gradients(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let (x, dy) = s.data(ROWS);
     let [_, whole, _] = s.pass(&x, &dy, ROWS);
@@ -120,7 +120,7 @@ pub fn tile_gradients(of: &Subject<'_>) -> Found {
 }
 
 /// Previous contents of output and tape do not matter.
-pub fn outputs_overwrite(of: &Subject<'_>) -> Found {
+pub fn outputs_overwrite(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let n = 37;
     let (x, _) = s.data(n);
@@ -131,7 +131,7 @@ pub fn outputs_overwrite(of: &Subject<'_>) -> Found {
 }
 
 /// Parameter gradients are accumulated, with and without an input gradient.
-pub fn gradients_add(of: &Subject<'_>) -> Found {
+pub fn gradients_add(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let n = 37;
     let (x, dy) = s.data(n);
@@ -146,7 +146,7 @@ pub fn gradients_add(of: &Subject<'_>) -> Found {
 }
 
 /// The input gradient is overwritten.
-pub fn input_gradient_overwrites(of: &Subject<'_>) -> Found {
+pub fn input_gradient_overwrites(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let n = 37;
     let (x, dy) = s.data(n);
@@ -159,7 +159,7 @@ pub fn input_gradient_overwrites(of: &Subject<'_>) -> Found {
 }
 
 /// Ranges are disjoint and cover every parameter.
-pub fn partition(of: &Subject<'_>) -> Found {
+pub fn partition(of: &Subject<'_>) -> Outcome {
     let params = of.stage.info().params;
     let mut ranges = of.stage.partition();
     ranges.sort_by_key(|r| r.start);
@@ -173,7 +173,7 @@ pub fn partition(of: &Subject<'_>) -> Found {
 }
 
 /// A range's gradients are bit-identical to that part of all gradients.
-pub fn partition_gradients(of: &Subject<'_>) -> Found {
+pub fn partition_gradients(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let (x, dy) = s.data(ROWS);
     let [_, all, _] = s.pass(&x, &dy, ROWS);
@@ -187,7 +187,7 @@ pub fn partition_gradients(of: &Subject<'_>) -> Found {
 }
 
 /// Nothing outside the buffers is written, and inputs stay unchanged.
-pub fn guards(of: &Subject<'_>) -> Found {
+pub fn guards(of: &Subject<'_>) -> Outcome {
     // Parameters that no call has seen.
     let s = &Loaded::of(of.stage, of.options);
     let ranges = if s.info.grads == GradKind::Scatter { of.stage.partition() } else { vec![] };
@@ -223,7 +223,7 @@ pub fn guards(of: &Subject<'_>) -> Found {
 }
 
 /// Concurrent calls from several threads are bit-identical to a single call.
-pub fn threads(of: &Subject<'_>) -> Found {
+pub fn threads(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let n = 100;
     let (x, dy) = s.data(n);
@@ -239,7 +239,7 @@ pub fn threads(of: &Subject<'_>) -> Found {
 }
 
 /// Finite inputs at the limits of their range give finite outputs, and backward does not panic.
-pub fn extremes(of: &Subject<'_>) -> Found {
+pub fn extremes(of: &Subject<'_>) -> Outcome {
     let as_it_starts = Options { params: None, ..of.options.clone() };
     let s = Loaded::of(of.stage, &as_it_starts);
     let values = [0.0f32, -0.0, 1e-40, -1e-40, f32::MIN_POSITIVE, 1.0, -1.0, 1e30, -1e30];
@@ -270,7 +270,7 @@ const SIDE: usize = 17;
 
 /// Outputs and input gradients are finite for all usual inputs: for a stage that reads points, a grid that includes the
 /// faces and corners of the cube, since random points miss a corner.
-pub fn finite(of: &Subject<'_>) -> Found {
+pub fn finite(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let n = SIDE.pow(3);
     let (mut x, dy) = s.data(n);
@@ -290,7 +290,7 @@ pub fn finite(of: &Subject<'_>) -> Found {
 }
 
 /// NaN and infinities do not leave their rows.
-pub fn poison(of: &Subject<'_>) -> Found {
+pub fn poison(of: &Subject<'_>) -> Outcome {
     let s = of.single();
     let n = 83;
     let (clean, dy) = s.data(n);
@@ -318,7 +318,7 @@ pub fn poison(of: &Subject<'_>) -> Found {
 }
 
 /// Parameters are restored by name.
-pub fn save_and_load(of: &Subject<'_>) -> Found {
+pub fn save_and_load(of: &Subject<'_>) -> Outcome {
     let p = &of.single().params;
     let block = |b: conefield_core::stage::Parameter| Block {
         range: b.range(),

@@ -1,6 +1,6 @@
 //! Calls of a stage's kernels on random data, and comparisons.
 
-use crate::{Found, Options, Unmet};
+use crate::{Options, Outcome, Unmet};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Grads, Info, Kernel, Stage, Tile, TileMut};
@@ -225,12 +225,12 @@ pub fn error<A: Real, B: Real>(a: &[A], b: &[B]) -> f64 {
 }
 
 /// The outcome of a comparison.
-pub fn within(what: &str, found: f64, limit: f64) -> Found {
+pub fn within(what: &str, found: f64, limit: f64) -> Outcome {
     held(found <= limit, format!("{what}: error {found:.1e}, limit {limit:.0e}"))
 }
 
 /// Passed or failed with this text.
-pub fn held(holds: bool, text: String) -> Found {
+pub fn held(holds: bool, text: String) -> Outcome {
     if holds { Ok(text) } else { failed(text) }
 }
 
@@ -240,7 +240,7 @@ pub fn failed<T>(what: impl Into<String>) -> Result<T, Unmet> {
 }
 
 /// Not applicable, with the reason.
-pub fn skipped(why: impl Into<String>) -> Found {
+pub fn skipped(why: impl Into<String>) -> Outcome {
     Err(Unmet::Skipped(why.into()))
 }
 
@@ -250,7 +250,7 @@ pub fn none(complaint: Option<String>) -> Result<(), Unmet> {
 }
 
 /// Failed with the complaint, or passed without one.
-pub fn settle(complaint: Option<String>, fine: &str) -> Found {
+pub fn settle(complaint: Option<String>, fine: &str) -> Outcome {
     none(complaint).map(|()| fine.into())
 }
 
@@ -275,6 +275,6 @@ pub fn on_threads<T: Send>(
 }
 
 /// Passed if no function reported a fault.
-pub fn no_fault(fault: conefield_core::Result<()>) -> Found {
+pub fn no_fault(fault: conefield_core::Result<()>) -> Outcome {
     settle(fault.err().map(|e| e.to_string()), "none was reported")
 }

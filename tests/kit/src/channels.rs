@@ -1,7 +1,7 @@
 //! Stages reduced to some of their channels.
 
 use crate::call::{Loaded, channels_of, differing, error, none, require, skipped};
-use crate::{Found, Options, Unmet, check};
+use crate::{Options, Outcome, Unmet, check};
 use conefield_core::error::Error;
 use conefield_core::stage::{Encoder, Field, Normalizer, Reduced, Stage};
 use std::collections::BTreeSet;
@@ -85,7 +85,7 @@ fn same_outputs(
 }
 
 /// Calls `one` with each choice of `n` channels.
-fn each(n: usize, mut one: impl FnMut(&[usize]) -> Checked) -> Found {
+fn each(n: usize, mut one: impl FnMut(&[usize]) -> Checked) -> Outcome {
     let all = choices(n);
     for keep in &all {
         one(keep).map_err(|unmet| unmet.at(format!("keeping {keep:?}")))?;
@@ -103,7 +103,7 @@ fn reduced<S: ?Sized>(found: Result<Reduced<S>, Error>) -> Result<Reduced<S>, Un
 }
 
 /// An encoder with fewer outputs.
-pub fn encoder_outputs(stage: &dyn Encoder, options: &Options) -> Found {
+pub fn encoder_outputs(stage: &dyn Encoder, options: &Options) -> Outcome {
     let n = stage.info().output;
     each(n, |keep| {
         let r = reduced(stage.keep_outputs(keep))?;
@@ -122,7 +122,7 @@ pub fn encoder_outputs(stage: &dyn Encoder, options: &Options) -> Found {
 }
 
 /// Resolutions of channels: one number each, the same for that channel in a reduced encoder.
-pub fn resolutions(stage: &dyn Encoder) -> Found {
+pub fn resolutions(stage: &dyn Encoder) -> Outcome {
     let Some(cells) = stage.resolutions() else {
         return skipped("it does not say how fine its channels are");
     };
@@ -150,7 +150,7 @@ fn some(n: usize, stage: &dyn Stage, options: &Options) -> Checked {
 }
 
 /// A normalizer with fewer inputs is a reduced stage of the same kind.
-pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Found {
+pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
     let info = stage.info();
     each(info.input, |keep| {
         let r = reduced(stage.keep_inputs(keep))?;
@@ -167,7 +167,7 @@ pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Found {
 }
 
 /// A field with fewer inputs equals the field with zeros there.
-pub fn field_inputs(stage: &dyn Field, options: &Options) -> Found {
+pub fn field_inputs(stage: &dyn Field, options: &Options) -> Outcome {
     let info = stage.info();
     each(info.input, |keep| {
         let r = reduced(stage.keep_inputs(keep))?;

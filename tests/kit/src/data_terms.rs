@@ -2,7 +2,7 @@
 
 use crate::call::{differing, no_fault, on_threads, settle};
 use crate::voxels::{above, flat, noise};
-use crate::{Found, Report};
+use crate::{Outcome, Report};
 use conefield_core::data_term::{DataTerm, Misfit};
 use conefield_core::random::{mix, unit};
 use ndarray::{Array3, Axis};
@@ -120,7 +120,7 @@ fn pixels() -> impl Iterator<Item = [usize; 3]> {
 }
 
 /// Central differences over one and two steps. If they disagree, there is a kink nearby, and the pixel is ignored.
-fn differences(of: &On) -> Found {
+fn differences(of: &On) -> Outcome {
     let r = noise::<f32>([3, 24, 40], 3);
     let (_, derivative) = at(of, &ALL, &r);
     let top = derivative.iter().fold(0.0f64, |m, d| m.max(f64::from(d.abs())));
@@ -145,7 +145,7 @@ fn differences(of: &On) -> Found {
 }
 
 /// Second differences lie between 0 and [`Misfit::curve`].
-fn curvature(of: &On) -> Found {
+fn curvature(of: &On) -> Outcome {
     let r = noise::<f32>([3, 24, 40], 4);
     let bound = of.curve();
     let here = at(of, &ALL, &r).0;
@@ -160,7 +160,7 @@ fn curvature(of: &On) -> Found {
     settle(flat.or(complaint), "between 0 and its bound")
 }
 
-fn least(of: &On) -> Found {
+fn least(of: &On) -> Outcome {
     let zero = at(of, &ALL, &Array3::zeros([3, 24, 40]));
     let steep = zero.1.iter().find(|d| **d != 0.0).map(|d| format!("a derivative of {d:e} where nothing is left"));
     let complaint = (0..5).find_map(|seed| {
@@ -188,14 +188,14 @@ fn views_stand_alone(of: &On) -> Option<String> {
 }
 
 /// The noise is found, either of line integrals near 0 or on average over all of them.
-fn sigma(of: &On) -> Found {
+fn sigma(of: &On) -> Outcome {
     let found = of.of.noise() / f64::from(SIGMA);
     let complaint = (!(0.7..5.0).contains(&found)).then(|| format!("{found:.2} times what it is"));
     settle(complaint, &format!("{found:.2} times what it is near 0"))
 }
 
 /// Weighted noise has at most the standard deviation of noise whose variance is the inverse of the curvature.
-fn spread(of: &On) -> Found {
+fn spread(of: &On) -> Outcome {
     let spread = of.spread();
     let bad = spread.iter().find(|s| !s.is_finite() || **s < 0.0).map(|s| format!("a standard deviation of {s}"));
     let curve = of.curve();

@@ -1,7 +1,7 @@
 //! Backward against differences of forward, and single against double precision.
 
 use crate::call::{Draw, Loaded, Subject, error, failed, require, skipped, within};
-use crate::{Found, Options, Unmet};
+use crate::{Options, Outcome, Unmet};
 use conefield_core::simd::Real;
 use conefield_core::stage::Scope;
 
@@ -81,12 +81,12 @@ fn rows_smooth_over<R: Real>(h: f64, of: &Loaded<'_, R>) -> Option<Vec<R>> {
 const NO_ROWS: &str = "no rows found around which the stage is smooth";
 
 /// The gradient of every parameter, one by one and along directions through all of them.
-pub fn parameters(of: &Subject<'_>) -> Found {
+pub fn parameters(of: &Subject<'_>) -> Outcome {
     of.double().map_or_else(|| coarse(parameters_in(of.single())), parameters_in)
 }
 
 /// The outcome of a stage whose differences are in single precision.
-fn coarse(found: Found) -> Found {
+fn coarse(found: Outcome) -> Outcome {
     let may = "a kink or a high frequency may cause this; kernels in double precision settle it";
     found.map_err(|unmet| match unmet {
         Unmet::Failed(what) => Unmet::Failed(format!("{what}, in single precision: {may}")),
@@ -94,7 +94,7 @@ fn coarse(found: Found) -> Found {
     })
 }
 
-fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Found {
+fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
     let Some((x, _)) = smooth_rows(of) else { return no_rows::<R>() };
     let (info, options, rows) = (&of.info, of.options, of.options.rows);
     let dy: Vec<R> = Draw::new(options.seed, 5).many(&(-1.0..1.0), info.output * rows);
@@ -148,11 +148,11 @@ fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Found {
 }
 
 /// The gradient of every input.
-pub fn inputs(of: &Subject<'_>) -> Found {
+pub fn inputs(of: &Subject<'_>) -> Outcome {
     of.double().map_or_else(|| coarse(inputs_in(of.single())), inputs_in)
 }
 
-fn inputs_in<R: Real>(of: &Loaded<'_, R>) -> Found {
+fn inputs_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
     let Some((x, h)) = smooth_rows(of) else { return no_rows::<R>() };
     let (mut x, h, rows) = (x.clone(), *h, of.options.rows);
     let dy: Vec<R> = Draw::new(of.options.seed, 7).many(&(-1.0..1.0), of.info.output * rows);
@@ -181,7 +181,7 @@ fn inputs_in<R: Real>(of: &Loaded<'_, R>) -> Found {
     Ok(format!("{} inputs, worst error {worst:.1e}", x.len().div_ceil(stride)))
 }
 
-pub fn no_rows<R: Real>() -> Found {
+pub fn no_rows<R: Real>() -> Outcome {
     let shortest = steps::<R>(&Options::encoder()).all.last().copied().unwrap_or_default();
     let text = format!("{NO_ROWS} over steps of {shortest:.0e}");
     if size_of::<R>() == 8 { failed(text) } else { skipped(text) }
@@ -200,19 +200,19 @@ pub fn narrow(v: &[f64]) -> Vec<f32> {
 
 /// The outcome of a check that needs double precision, for a stage without. A plugin in C may have the functions and not
 /// declare them, and would see no other sign.
-pub fn no_double() -> Found {
+pub fn no_double() -> Outcome {
     skipped("no double precision (in C, info leaves double_precision 0: functions ending in _f64 are not called)")
 }
 
 /// Calls `compare` with the reference, inputs and output gradients.
-fn with_double(of: &Subject<'_>, compare: impl FnOnce(&Loaded<'_, f64>, &[f64], &[f64]) -> Found) -> Found {
+fn with_double(of: &Subject<'_>, compare: impl FnOnce(&Loaded<'_, f64>, &[f64], &[f64]) -> Outcome) -> Outcome {
     let Some(double) = of.double() else { return no_double() };
     let Some([x, dy]) = shared(double) else { return no_rows::<f64>() };
     compare(double, &x, &dy)
 }
 
 /// Outputs of the training kernel against the reference.
-pub fn single_outputs(of: &Subject<'_>) -> Found {
+pub fn single_outputs(of: &Subject<'_>) -> Outcome {
     with_double(of, |double, x, _| {
         let [want, _] = double.forward(x, of.options.rows);
         let [y, _] = of.single().forward(&narrow(x), of.options.rows);
@@ -221,7 +221,7 @@ pub fn single_outputs(of: &Subject<'_>) -> Found {
 }
 
 /// Gradients of the training kernel against the reference.
-pub fn single_gradients(of: &Subject<'_>) -> Found {
+pub fn single_gradients(of: &Subject<'_>) -> Outcome {
     with_double(of, |double, x, dy| {
         let [_, g, dx] = double.pass(x, dy, of.options.rows);
         let [_, g32, dx32] = of.single().pass(&narrow(x), &narrow(dy), of.options.rows);

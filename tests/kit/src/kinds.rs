@@ -2,7 +2,7 @@
 
 use crate::losses::ready;
 use crate::{
-    Options, Outcome, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
+    Options, Report, Unmet, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
     check_loss_wgsl, check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl,
     check_regularizer, check_voxel_projector, check_wgsl,
 };
@@ -26,7 +26,7 @@ pub struct With<'a> {
 impl With<'_> {
     /// Adds the check of a stage's WGSL to its report.
     fn on_device(&self, mut report: Report, has_wgsl: bool, check: impl FnOnce(&dyn Runner) -> Report) -> Report {
-        let skipped = |why: String| vec![("WGSL parity", Outcome::Skipped(why))];
+        let skipped = |why: String| vec![("WGSL parity", Err(Unmet::Skipped(why)))];
         report.entries.extend(match has_wgsl.then(|| (self.device)()) {
             None => skipped("the stage offers none".into()),
             Some(Err(why)) => skipped(why),

@@ -72,34 +72,15 @@ impl Options {
     }
 }
 
-/// The outcome of a property check.
+/// The outcome of a property check: the evidence that it holds, or why it is not met.
+pub type Outcome = Result<String, Unmet>;
+
+/// Why a property is not met.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Outcome {
-    /// It holds, with the evidence.
-    Passed(String),
+pub enum Unmet {
     /// It does not hold, with the finding.
     Failed(String),
     /// It does not apply, with the reason.
-    Skipped(String),
-}
-
-impl Outcome {
-    /// In a word, and the evidence, finding or reason.
-    pub fn words(&self) -> (&'static str, &str) {
-        match self {
-            Self::Passed(text) => ("passed", text),
-            Self::Failed(text) => ("failed", text),
-            Self::Skipped(text) => ("skipped", text),
-        }
-    }
-}
-
-/// The evidence that a property holds, or why it does not.
-type Found = Result<String, Unmet>;
-
-/// The outcome of a property that does not hold or does not apply.
-enum Unmet {
-    Failed(String),
     Skipped(String),
 }
 
@@ -135,7 +116,7 @@ impl Report {
 
     /// Names of the violated properties.
     pub fn failed(&self) -> Vec<&'static str> {
-        self.entries.iter().filter(|(_, o)| matches!(o, Outcome::Failed(_))).map(|(n, _)| *n).collect()
+        self.entries.iter().filter(|(_, o)| matches!(o, Err(Unmet::Failed(_)))).map(|(n, _)| *n).collect()
     }
 
     /// Whether every property that applies holds.
@@ -143,17 +124,21 @@ impl Report {
         self.failed().is_empty()
     }
 
-    fn add(&mut self, name: &'static str, property: impl FnOnce() -> Found) {
-        let found = catch_unwind(AssertUnwindSafe(property)).unwrap_or_else(|panic| {
+    /// Each property with its outcome in a word, and the evidence, finding or reason.
+    pub fn properties(&self) -> impl Iterator<Item = (&'static str, &'static str, &str)> {
+        self.entries.iter().map(|(name, outcome)| match outcome {
+            Ok(text) => (*name, "passed", text.as_str()),
+            Err(Unmet::Failed(text)) => (*name, "failed", text.as_str()),
+            Err(Unmet::Skipped(text)) => (*name, "skipped", text.as_str()),
+        })
+    }
+
+    fn add(&mut self, name: &'static str, property: impl FnOnce() -> Outcome) {
+        let outcome = catch_unwind(AssertUnwindSafe(property)).unwrap_or_else(|panic| {
             let text = panic.downcast_ref::<String>().cloned();
             let text = text.or_else(|| panic.downcast_ref::<&str>().map(|s| s.to_string()));
             failed(format!("panicked: {}", text.unwrap_or_default()))
         });
-        let outcome = match found {
-            Ok(text) => Outcome::Passed(text),
-            Err(Unmet::Failed(text)) => Outcome::Failed(text),
-            Err(Unmet::Skipped(text)) => Outcome::Skipped(text),
-        };
         self.entries.push((name, outcome));
     }
 
@@ -165,13 +150,10 @@ impl Report {
 
 impl Serialize for Report {
     fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
-        let property = |(name, outcome): &(&str, Outcome)| {
-            let (outcome, text) = outcome.words();
-            json!({ "name": name, "outcome": outcome, "text": text })
-        };
+        let property = |(name, outcome, text)| json!({ "name": name, "outcome": outcome, "text": text });
         let mut table = to.serialize_struct("Report", 3)?;
         table.serialize_field("stage", &self.stage)?;
-        table.serialize_field("properties", &self.entries.iter().map(property).collect::<Vec<_>>())?;
+        table.serialize_field("properties", &self.properties().map(property).collect::<Vec<_>>())?;
         table.serialize_field("passed", &self.passed())?;
         table.end()
     }
@@ -180,11 +162,8 @@ impl Serialize for Report {
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}", self.stage)?;
-        for (name, outcome) in &self.entries {
-            let (word, text) = match outcome.words() {
-                ("failed", text) => ("FAILED", text),
-                words => words,
-            };
+        for (name, outcome, text) in self.properties() {
+            let word = if outcome == "failed" { "FAILED" } else { outcome };
             writeln!(f, "  {word:<8} {name:<34} {text}")?;
         }
         Ok(())
@@ -192,7 +171,7 @@ impl fmt::Display for Report {
 }
 
 /// A property, why it does not apply to a stage, and its check.
-type Property = (&'static str, fn(&Info) -> Option<&'static str>, fn(&Subject<'_>) -> Found);
+type Property = (&'static str, fn(&Info) -> Option<&'static str>, fn(&Subject<'_>) -> Outcome);
 
 /// The properties that any stage must have, in order.
 const PROPERTIES: [Property; 23] = [

@@ -2,7 +2,7 @@
 
 use crate::call::{Draw, no_fault, require, settle, skipped, within};
 use crate::gradients::slope;
-use crate::{Found, Report};
+use crate::{Outcome, Report};
 use conefield_core::loss::{Loss, NoiseModel};
 use conefield_core::runner::Runner;
 
@@ -63,7 +63,7 @@ fn bits((a, b): (f64, f64)) -> [u64; 2] {
     [a.to_bits(), b.to_bits()]
 }
 
-fn derivative(loss: &dyn Loss) -> Found {
+fn derivative(loss: &dyn Loss) -> Outcome {
     let (mut worst, mut seen) = (0.0f64, 0);
     for [predicted, measured] in pairs() {
         let at = |d: f64| loss.at(predicted + d, measured).0;
@@ -85,7 +85,7 @@ fn derivative(loss: &dyn Loss) -> Found {
     within("derivative", worst, TOLERANCE)
 }
 
-fn least(loss: &dyn Loss) -> Found {
+fn least(loss: &dyn Loss) -> Outcome {
     for [predicted, measured] in pairs() {
         let (none, slope) = loss.at(measured, measured);
         let what = || format!("{none:e} and the derivative {slope:e} where both are {measured}");
@@ -99,7 +99,7 @@ fn least(loss: &dyn Loss) -> Found {
     Ok("0 there, and nowhere a way down that leads away".into())
 }
 
-fn extremes(loss: &dyn Loss) -> Found {
+fn extremes(loss: &dyn Loss) -> Outcome {
     let values = [0.0, -0.0, 1e-40, -1e-40, 1.0, -1.0, 1e30, -1e30];
     for [p, m] in values.into_iter().flat_map(|p| values.map(|m| [p, m])) {
         let (value, slope) = loss.at(p, m);
@@ -110,13 +110,13 @@ fn extremes(loss: &dyn Loss) -> Found {
 }
 
 /// Runs are monitored by their loss: NaN must propagate to it.
-fn poison(loss: &dyn Loss) -> Found {
+fn poison(loss: &dyn Loss) -> Outcome {
     let hidden = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY].into_iter().find(|&p| loss.at(p, 0.5).0.is_finite());
     settle(hidden.map(|p| format!("predicted {p}: loss {}", loss.at(p, 0.5).0)), "NaN and infinities stay visible")
 }
 
 /// An adaptive loss gives a loss with all other properties and of the same order.
-fn learns(loss: &dyn Loss) -> Found {
+fn learns(loss: &dyn Loss) -> Outcome {
     let Some(fitted) = ready(loss) else {
         require(!loss.needs_scan(), || "it needs a scan, and learns nothing from one".into())?;
         return skipped("it learns nothing");
@@ -133,7 +133,7 @@ fn learns(loss: &dyn Loss) -> Found {
     )
 }
 
-fn parity(loss: &dyn Loss, device: &dyn Runner) -> Found {
+fn parity(loss: &dyn Loss, device: &dyn Runner) -> Outcome {
     let pairs: Vec<[f32; 2]> = pairs().into_iter().map(|p| p.map(|v| v as f32)).collect();
     let found = device.losses(loss, &pairs)?;
     let mut worst = 0.0f64;

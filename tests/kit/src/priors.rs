@@ -2,7 +2,7 @@
 
 use crate::call::{Draw, Guarded, error, no_fault, require, settle, within};
 use crate::gradients::slope;
-use crate::{Found, Report};
+use crate::{Outcome, Report};
 use conefield_core::prior::Prior;
 use conefield_core::runner::Runner;
 
@@ -57,7 +57,7 @@ fn run(prior: &dyn Prior, values: &[f64], scale: f64) -> (f64, Vec<f64>) {
     (value, gradient.into_inner())
 }
 
-fn gradient(prior: &dyn Prior) -> Found {
+fn gradient(prior: &dyn Prior) -> Outcome {
     let mut values = drawn(prior);
     let (value, found) = run(prior, &values, 1.0);
     require(value >= 0.0 && value.is_finite(), || format!("the penalty is {value}"))?;
@@ -77,7 +77,7 @@ fn gradient(prior: &dyn Prior) -> Found {
     within("gradient", worst, TOLERANCE)
 }
 
-fn adds(prior: &dyn Prior) -> Found {
+fn adds(prior: &dyn Prior) -> Outcome {
     let values = drawn(prior);
     let (_, clean) = run(prior, &values, 1.0);
     let mut added = Guarded::new(values.len(), 3.0);
@@ -87,21 +87,21 @@ fn adds(prior: &dyn Prior) -> Found {
 }
 
 /// The gradient is multiplied by the scale, the penalty is not.
-fn scale(prior: &dyn Prior) -> Found {
+fn scale(prior: &dyn Prior) -> Outcome {
     let values = drawn(prior);
     let ((plain, slopes), (value, scaled)) = (run(prior, &values, 1.0), run(prior, &values, 0.25));
     let want: Vec<f64> = slopes.iter().map(|g| 0.25 * g).collect();
     within("a quarter", error(&scaled, &want).max((value - plain).abs() / plain.abs().max(1e-30)), 1e-12)
 }
 
-fn guards(prior: &dyn Prior) -> Found {
+fn guards(prior: &dyn Prior) -> Outcome {
     let values = drawn(prior);
     let mut gradient = Guarded::new(values.len(), 0.0);
     prior.block(&values, 1.0, gradient.inner());
     settle(gradient.broken("gradient"), "on either side of the gradient")
 }
 
-fn extremes(prior: &dyn Prior) -> Found {
+fn extremes(prior: &dyn Prior) -> Outcome {
     let values = drawn(prior);
     for v in [0.0, -0.0, 1e-40, 1.0, -1.0, 1e30, -1e30] {
         let flat = vec![v; values.len()];
@@ -116,7 +116,7 @@ fn extremes(prior: &dyn Prior) -> Found {
 }
 
 /// Runs are monitored by their sums: NaN must propagate to them.
-fn poison(prior: &dyn Prior) -> Found {
+fn poison(prior: &dyn Prior) -> Outcome {
     let mut values = drawn(prior);
     let middle = values.len() / 2;
     values[middle] = f64::NAN;
@@ -124,7 +124,7 @@ fn poison(prior: &dyn Prior) -> Found {
     settle(value.is_finite().then(|| format!("the penalty is {value} where a value is NaN")), "NaN stays visible")
 }
 
-fn parity(prior: &dyn Prior, device: &dyn Runner) -> Found {
+fn parity(prior: &dyn Prior, device: &dyn Runner) -> Outcome {
     let values = drawn(prior);
     let (value, slopes) = run(prior, &values, 1.0);
     let single: Vec<f32> = values.iter().map(|&v| v as f32).collect();

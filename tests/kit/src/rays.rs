@@ -1,7 +1,7 @@
 //! Properties of a projector that samples rays: bounded, finite, reproducible samples, and an exact adjoint.
 
 use crate::call::{Draw, failed, held, no_fault, require, settle, skipped};
-use crate::{Found, Report};
+use crate::{Outcome, Report};
 use conefield_core::stage::{Lengths, Projector, Samples, UnitRay};
 
 /// Largest mismatch of `<Aμ, y>` and `<μ, Aᵀy>`, relative to their size.
@@ -36,7 +36,7 @@ fn as_it_is(projector: &dyn Projector) -> Report {
 }
 
 /// A projector fitted to a scene has all properties, and is the same each time.
-fn fitted(p: &dyn Projector) -> Found {
+fn fitted(p: &dyn Projector) -> Outcome {
     let lengths = Lengths { voxel_mm: 2.0, cell_mm: Some(3.0) };
     let (one, other) = match (p.fitted(lengths)?, p.fitted(lengths)?) {
         (Some(one), Some(other)) => (one, other),
@@ -162,7 +162,7 @@ fn constant(p: &dyn Projector, r: &UnitRay, s: &Samples) -> Option<String> {
     (!fits).then(|| format!("{line}, where the ray is {:.5} long inside, {:.5} in all", lengths[0], lengths[1]))
 }
 
-fn adjoint(p: &dyn Projector) -> Found {
+fn adjoint(p: &dyn Projector) -> Outcome {
     let mut draw = Draw::new(3, 1);
     let mut worst = 0.0f64;
     for r in rays() {

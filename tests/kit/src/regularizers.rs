@@ -1,7 +1,7 @@
 //! Properties of a regularizer: a convex penalty and its proximal map.
 
 use crate::call::{differing, no_fault, none, on_threads, require, settle};
-use crate::{Found, Report};
+use crate::{Outcome, Report};
 use conefield_core::error::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::place::Host;
@@ -109,12 +109,12 @@ fn weight(regularizer: &dyn Regularizer, grid: &VoxelGrid) -> Option<String> {
 }
 
 /// No other coefficients have a smaller objective: a search from the map's result gains almost nothing.
-fn proximal(regularizer: &dyn Regularizer) -> Found {
+fn proximal(regularizer: &dyn Regularizer) -> Outcome {
     least(regularizer, Bounds::default())
 }
 
 /// The same within bounds, unless the regularizer refuses them.
-fn bounds(regularizer: &dyn Regularizer) -> Found {
+fn bounds(regularizer: &dyn Regularizer) -> Outcome {
     let bounds = Bounds { low: -0.15, high: 0.4 };
     if on(regularizer, &grids()[0]).confine(bounds).is_err() {
         return settle(None, "only 0 and none above, others are refused");
@@ -122,7 +122,7 @@ fn bounds(regularizer: &dyn Regularizer) -> Found {
     least(regularizer, bounds)
 }
 
-fn least(regularizer: &dyn Regularizer, bounds: Bounds) -> Found {
+fn least(regularizer: &dyn Regularizer, bounds: Bounds) -> Outcome {
     let mut worst = 0.0f64;
     for grid in grids() {
         for tau in TAUS {

@@ -1,7 +1,7 @@
 //! Properties of a voxel projector: a linear operator that measures lengths, and its exact adjoint.
 
 use crate::call::{differing, error, none, on_threads, require, settle};
-use crate::{Found, Report};
+use crate::{Outcome, Report};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, Ray, Vec3, View, VoxelGrid};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
@@ -136,7 +136,7 @@ pub(crate) fn apart<A: Real, B: Real>(what: &str, a: &Array3<A>, b: &Array3<B>, 
     above(e, most).then(|| format!("{what}: off by {e:.1e}, at most {most:.0e}"))
 }
 
-fn adjoint<R: Real>(op: &dyn VoxelOperator<R>, most: f64) -> Found {
+fn adjoint<R: Real>(op: &dyn VoxelOperator<R>, most: f64) -> Outcome {
     let mut worst = 0.0f64;
     for (i, g) in geometries().iter().enumerate() {
         let views = all_views(g);
@@ -151,7 +151,7 @@ fn adjoint<R: Real>(op: &dyn VoxelOperator<R>, most: f64) -> Found {
     Ok(format!("off by {worst:.1e} at most"))
 }
 
-fn single_precision(p: &dyn VoxelProjector) -> Found {
+fn single_precision(p: &dyn VoxelProjector) -> Outcome {
     let complaint = geometries().iter().enumerate().find_map(|(i, g)| {
         let views = all_views(g);
         let (x, y) = (noise::<f32>(g.volume.shape, 3), noise::<f32>(pixels(g, views.len()), 4));
@@ -193,7 +193,7 @@ fn gaussian_line(ray: &Ray) -> f64 {
 }
 
 /// Lengths are in mm: a Gaussian's projections converge to their closed form for finer voxels, and their sum is right.
-fn closed_form(op: &dyn VoxelOperator<f32>) -> Found {
+fn closed_form(op: &dyn VoxelOperator<f32>) -> Outcome {
     let of = |n: usize| {
         let g = Geometry {
             detector: [24, 24],
@@ -240,7 +240,7 @@ fn linear(op: &dyn VoxelOperator<f64>) -> Option<String> {
 
 /// A view's line integrals are bit-identical whatever other views are requested, in any order and number; and the
 /// adjoint of several views is the sum of their adjoints.
-fn views_stand_alone(p: &dyn VoxelProjector) -> Found {
+fn views_stand_alone(p: &dyn VoxelProjector) -> Outcome {
     let g = crooked(false);
     let x = noise::<f32>(g.volume.shape, 5);
     let alone: Vec<Array3<f32>> = all_views(&g).iter().map(|&v| forward(p.operator(), &g, &[v], &x)).collect();
@@ -297,7 +297,7 @@ fn threads(op: &dyn VoxelOperator<f32>) -> Option<String> {
 }
 
 /// Rays that miss the voxels give exactly 0 and contribute nothing to the adjoint; empty input gives empty output.
-fn rays_that_miss(p: &dyn VoxelProjector) -> Found {
+fn rays_that_miss(p: &dyn VoxelProjector) -> Outcome {
     let mut g = crooked(false);
     // Twice as far out as the voxels.
     g.detector = [61, 67];
@@ -326,7 +326,7 @@ fn rays_that_miss(p: &dyn VoxelProjector) -> Found {
 }
 
 /// Rays along axes, on faces between voxels and through corners, large and tiny numbers: never NaN or infinity.
-fn finite(op: &dyn VoxelOperator<f32>) -> Found {
+fn finite(op: &dyn VoxelOperator<f32>) -> Outcome {
     // The middle ray runs along x through the faces between voxels, others through their edges.
     let along = |shape: [usize; 3], detector| Geometry {
         detector,

@@ -3,7 +3,7 @@
 use crate::call::{Draw, Subject, error, held, none, require, within};
 use crate::gradients::{narrow, no_rows, shared};
 use crate::rays::{rays, samples};
-use crate::{Found, Options, Report};
+use crate::{Options, Outcome, Report};
 use conefield_core::runner::Runner;
 use conefield_core::stage::{Projector, Stage};
 
@@ -21,7 +21,7 @@ pub fn check_wgsl(stage: &dyn Stage, options: &Options, device: &dyn Runner) -> 
 
 /// Outputs and gradients against double precision, reported beside single precision on the CPU. The device may have the
 /// same error, and four times as much in gradients, because their sums have no fixed order.
-fn parity(of: &Subject<'_>, device: &dyn Runner) -> Found {
+fn parity(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
     let (stage, options) = (of.stage, of.options);
     let rounds = |v: &[f64], change: bool| -> Vec<f64> {
         let n = options.rows;
@@ -60,7 +60,7 @@ fn parity(of: &Subject<'_>, device: &dyn Runner) -> Found {
 }
 
 /// Against single precision on the CPU, if there is no double precision.
-fn single_only(of: &Subject<'_>, device: &dyn Runner) -> Found {
+fn single_only(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
     let (single, rows) = (of.single(), ROUNDS * of.options.rows);
     let (x, dy) = single.data(rows);
     let [y32, g32, dx32] = single.pass(&x, &dy, rows);
@@ -71,7 +71,7 @@ fn single_only(of: &Subject<'_>, device: &dyn Runner) -> Found {
 
 /// The device gives finite numbers wherever the CPU does: for zeros, denormals (which it may flush to zero) and huge
 /// numbers.
-fn extremes(of: &Subject<'_>, device: &dyn Runner) -> Found {
+fn extremes(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
     let (single, options) = (of.single(), of.options);
     let rows = 70;
     for value in [0.0f32, -0.0, 1e-40, 1e-30, 1.0, -1.0, 1e30, -1e30] {
@@ -100,7 +100,7 @@ pub fn check_projector_wgsl(projector: &dyn Projector, device: &dyn Runner) -> R
 /// Largest difference of positions and weights, in cube sides: rounding of positions two cube sides from the origin.
 const PLACES: f32 = 2e-6;
 
-fn same_samples(projector: &dyn Projector, device: &dyn Runner) -> Found {
+fn same_samples(projector: &dyn Projector, device: &dyn Runner) -> Outcome {
     let seeds = [None, Some(5), Some(0xfedc_ba98_7654_3210)];
     let all: Vec<_> = rays().into_iter().flat_map(|r| seeds.map(|s| (r, s))).collect();
     let found = device.samples(projector, &all)?;

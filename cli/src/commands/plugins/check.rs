@@ -204,9 +204,9 @@ fn text(r: &Checked) -> String {
         let width = width.map_or(String::new(), |w| format!(", {w} channels in"));
         lines.push(format!("\n{kind} {name} {settings}{width}\n  {}", report.to_string().trim_end()));
     }
-    let all = || r.stages.iter().flat_map(|s| &s.report.entries);
+    let all = || r.stages.iter().flat_map(|s| s.report.properties());
     let [passed, skipped, failed] =
-        ["passed", "skipped", "failed"].map(|word| all().filter(|(_, outcome)| outcome.words().0 == word).count());
+        ["passed", "skipped", "failed"].map(|word| all().filter(|(_, outcome, _)| *outcome == word).count());
     lines.push(format!("\n{passed} passed, {skipped} skipped, {failed} failed"));
     lines.join("\n")
 }
