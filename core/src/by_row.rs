@@ -256,7 +256,7 @@ impl<T: RowMap, R: Real> Back<'_, T, R> {
             let dy = Channels { tile: self.pass.dy, places: outputs, row, zero };
             let (tile, places) = match &mut self.pass.dx {
                 Some(dx) => (TileMut::new(dx.data, dx.rows), &inputs[..]),
-                None => (TileMut::new(&mut [], 0), nowhere),
+                None => (TileMut::new(&mut [], 1), nowhere),
             };
             let params = Grads { values: self.pass.grads.values, range: self.pass.grads.range.clone() };
             let inputs = ChannelsMut { tile, places, row, zero };

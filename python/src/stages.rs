@@ -6,7 +6,7 @@ use crate::encoder::PythonEncoder;
 use crate::errors::{OrRaise, raised as exception};
 use crate::regularizer::PythonRegularizer;
 use crate::work::without_lock;
-use conefield_conformance::{Outcome, Report, With, check_type};
+use conefield_conformance::{Report, With, check_type};
 use conefield_core::registry::{self, Kind, Make, Registered, StageType};
 use conefield_core::regularizer::{Regularizer, RegularizerSpec};
 use conefield_core::settings::EncoderSpec;
@@ -249,14 +249,9 @@ pub fn check_stage(py: Python<'_>, kind_name: &str, table: &str) -> PyResult<(bo
     let found = without_lock(py, |_| check_type(kind, &table, &With::ON_THE_HOST))?;
     let reports: Vec<Report> = found.into_iter().map(|(_, report)| report).collect();
     let text = reports.iter().map(Report::to_string).collect();
-    Ok((reports.iter().all(Report::passed), text, reports.into_iter().flat_map(properties).collect()))
+    Ok((reports.iter().all(Report::passed), text, reports.iter().flat_map(properties).collect()))
 }
 
-fn properties(report: Report) -> Properties {
-    let outcome = |(name, outcome)| match outcome {
-        Outcome::Passed(text) => (name, "passed", text),
-        Outcome::Failed(text) => (name, "failed", text),
-        Outcome::Skipped(text) => (name, "skipped", text),
-    };
-    report.entries.into_iter().map(outcome).collect()
+fn properties(report: &Report) -> Properties {
+    report.properties().map(|(name, outcome, text)| (name, outcome, text.to_owned())).collect()
 }

@@ -339,7 +339,7 @@ fn a_report_reads_well() {
     let text = check(&Toy::new(Fault::OverwritesGradients), &Options::encoder()).to_string();
     assert!(text.starts_with("toy: OverwritesGradients\n"), "{text}");
     assert!(text.lines().any(|l| l.contains("FAILED") && l.contains("gradients add")), "{text}");
-    assert!(text.lines().any(|l| l.contains("ok") && l.contains("guards")), "{text}");
+    assert!(text.lines().any(|l| l.contains("passed") && l.contains("guards")), "{text}");
 }
 
 faults! {

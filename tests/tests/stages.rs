@@ -3,7 +3,7 @@
 
 mod device;
 
-use conefield_conformance::{Options, Outcome, Report, With, check_encoder, check_settings, check_type, check_wgsl};
+use conefield_conformance::{Options, Report, Unmet, With, check_encoder, check_settings, check_type, check_wgsl};
 use conefield_core::opened::Opened;
 use conefield_core::registry::read;
 use conefield_core::registry::{Kind, stage_types};
@@ -35,7 +35,7 @@ fn try_check(kind: Kind, settings: &Value, width: usize, options: &dyn Fn(Option
 
 /// The description of a stage without failure. Encoders, losses, priors and projectors must run on a device as well.
 fn checked(kind: Kind, report: Report) -> String {
-    let none = Outcome::Skipped("the stage offers none".into());
+    let none = Err(Unmet::Skipped("the stage offers none".into()));
     let on_device = !report.entries.contains(&("WGSL parity", none));
     let may = !matches!(kind, Kind::Encoder | Kind::Loss | Kind::Prior | Kind::Projector);
     assert!(on_device || may, "{} offers no WGSL", report.stage);

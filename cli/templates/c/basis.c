@@ -75,14 +75,4 @@ static size_t count(const struct ConefieldGrid *grid) {
 BOTH(float, expand, adjoint)
 BOTH(double, expand_f64, adjoint_f64)
 
-static const struct ConefieldBasis FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .on = on,
-    .info = info,
-    .expand = expand,
-    .adjoint = adjoint,
-    .expand_f64 = expand_f64,
-    .adjoint_f64 = adjoint_f64,
-};
-
-@plugin@
+@plugin on info expand adjoint expand_f64 adjoint_f64@

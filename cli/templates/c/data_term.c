@@ -80,14 +80,4 @@ static ConefieldStatus as_they_are(const void *misfit, size_t view, const float 
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldDataTerm FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .bytes = bytes,
-    .of = of,
-    .noise = noise,
-    .differentiate = differentiate,
-    .curve = as_they_are,
-    .spread = as_they_are,
-};
-
-@plugin@
+@plugin bytes of noise differentiate curve=as_they_are spread=as_they_are@

@@ -90,14 +90,4 @@ static ConefieldStatus resolutions(const void *stage, double *cells, size_t coun
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldMap FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .info = info,
-    .parameter = parameter,
-    .init = init,
-    .forward = forward,
-    .backward = backward,
-    .resolutions = resolutions,
-};
-
-@plugin@
+@plugin info parameter init forward backward resolutions@

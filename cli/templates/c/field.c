@@ -81,13 +81,4 @@ static ConefieldStatus backward(const void *stage, const float *params, struct C
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldMap FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .info = info,
-    .parameter = parameter,
-    .init = init,
-    .forward = forward,
-    .backward = backward,
-};
-
-@plugin@
+@plugin info parameter init forward backward@

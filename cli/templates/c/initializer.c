@@ -43,9 +43,4 @@ static ConefieldStatus apply(const void *stage, const struct ConefieldBlock *blo
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldInitializer FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .apply = apply,
-};
-
-@plugin@
+@plugin apply@

@@ -38,9 +38,4 @@ static ConefieldStatus at(const void *stage, const double *predicted, const doub
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldLoss FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .at = at,
-};
-
-@plugin@
+@plugin at@

@@ -91,14 +91,4 @@ static ConefieldStatus reduce(const void *stage, uint32_t side, const size_t *ke
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldMap FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .info = info,
-    .parameter = parameter,
-    .init = init,
-    .forward = forward,
-    .backward = backward,
-    .reduce = reduce,
-};
-
-@plugin@
+@plugin info parameter init forward backward reduce@

@@ -1,3 +1,8 @@
+static const struct @functions@ FUNCTIONS = {
+    .size = sizeof FUNCTIONS,
+@entries@
+};
+
 static const struct ConefieldStage STAGES[] = {{
     .kind = @kind@,
     .name = TEXT("@name@"),

@@ -47,10 +47,4 @@ static ConefieldStatus block(const void *stage, const double *values, size_t cou
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldPrior FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .blocks = blocks,
-    .block = block,
-};
-
-@plugin@
+@plugin blocks block@

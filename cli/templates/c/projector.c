@@ -48,10 +48,4 @@ static ConefieldStatus sample(const void *stage, const struct ConefieldRay *ray,
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldProjector FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .max_samples = max_samples,
-    .sample = sample,
-};
-
-@plugin@
+@plugin max_samples sample@

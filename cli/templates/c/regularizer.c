@@ -111,14 +111,4 @@ static ConefieldStatus state(void *penalty, size_t index, struct ConefieldState 
     return CONEFIELD_OK;
 }
 
-static const struct ConefieldRegularizer FUNCTIONS = {
-    .size = sizeof FUNCTIONS,
-    .bytes = bytes,
-    .on = on,
-    .weight = weight,
-    .value = value,
-    .prox = prox,
-    .state = state,
-};
-
-@plugin@
+@plugin bytes on weight value prox state@

@@ -1,23 +1,9 @@
 //! A basis for conefield: a coefficient for each block of voxels.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(BasisSpec, "@name@", Settings, "blocks of voxels");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "blocks of voxels"
     /// Voxels along a block's edge.
-    pub edge: usize,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { edge: 2 }
-    }
-}
+    pub edge: usize = 2,
+@
 
 impl BasisSpec for Settings {
     fn build(&self) -> Result<Box<dyn Basis>> {

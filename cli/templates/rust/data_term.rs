@@ -1,24 +1,10 @@
 //! A data term for conefield: `c²·(√(1 + (r/c)²) − 1)` of a residual r, squares that grow like |r| from some times the
 //! noise on.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(DataTermSpec, "@name@", Settings, "quadratic for small residuals, linear for large ones");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "quadratic for small residuals, linear for large ones"
     /// Residuals well above this many standard deviations of the noise have a linear cost.
-    pub from: f64,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { from: 3.0 }
-    }
-}
+    pub from: f64 = 3.0,
+@
 
 impl DataTermSpec for Settings {
     fn build(&self) -> Result<Box<dyn DataTerm>> {

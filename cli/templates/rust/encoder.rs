@@ -1,25 +1,11 @@
 //! An encoder for conefield: `y = sin(d·x + p)` with directions `d` and phases `p` that are learned.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(EncoderSpec, "@name@", Settings, "waves of learned directions");
-
-/// What a spec may set.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "waves of learned directions"
     /// Number of channels, one per wave.
-    pub waves: usize,
+    pub waves: usize = 32,
     /// Largest initial frequency of a wave, in radians per cube side.
-    pub frequency: f32,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { waves: 32, frequency: 20.0 }
-    }
-}
+    pub frequency: f32 = 20.0,
+@
 
 impl EncoderSpec for Settings {
     fn build(&self) -> Result<Box<dyn Encoder>> {

@@ -1,24 +1,10 @@
 //! A field for conefield: features `[n, F]` to attenuation `[n, 1]`, `y = ln(1 + exp(w·x + b))`, which is never
 //! negative.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(FieldSpec, "@name@", Settings, "a weighted sum through a softplus");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "a weighted sum through a softplus"
     /// Initial shift; the lower it is, the closer the first volume is to 0.
-    pub bias: f32,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { bias: -1.0 }
-    }
-}
+    pub bias: f32 = -1.0,
+@
 
 impl FieldSpec for Settings {
     fn build(&self, width: usize) -> Result<Box<dyn Field>> {

@@ -3,26 +3,12 @@
 //! This start fills every block whose name begins with `prefix` with uniform numbers; every other block keeps the
 //! initialization by its own stage.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(InitializerSpec, "@name@", Settings, "uniform numbers in the blocks of one stage");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "uniform numbers in the blocks of one stage"
     /// Fill blocks whose name begins with this, such as `encoder` or `field.0.weight`.
-    pub prefix: String,
+    pub prefix: String = "encoder".into(),
     /// Numbers are uniform in ± this.
-    pub bound: f32,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { prefix: "encoder".into(), bound: 1e-4 }
-    }
-}
+    pub bound: f32 = 1e-4,
+@
 
 impl InitializerSpec for Settings {
     fn build(&self, _: &dyn Fn(&str) -> Result<Weights>) -> Result<Box<dyn Initializer>> {

@@ -1,23 +1,9 @@
 //! A loss for conefield: `sqrt(d² + s²) − s` of the difference `d`, an absolute value that is rounded near 0.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(LossSpec, "@name@", Settings, "the absolute difference, rounded near 0");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "the absolute difference, rounded near 0"
     /// Differences well below this have a quadratic loss.
-    pub scale: f64,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { scale: 0.01 }
-    }
-}
+    pub scale: f64 = 0.01,
+@
 
 impl LossSpec for Settings {
     fn build(&self) -> Result<Box<dyn Loss>> {

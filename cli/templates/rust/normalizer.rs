@@ -3,25 +3,10 @@
 //! This start scales and shifts every channel by numbers that are learned: `y = w·x + b`. Its backward pass is written
 //! by hand; `cargo test` compares it with finite differences.
 
-use conefield_plugin::prelude::*;
-use std::ops::Range;
-
-conefield_plugin::export!();
-stage_type!(NormalizerSpec, "@name@", Settings, "a learned scale and shift of every channel");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "a learned scale and shift of every channel"
     /// Initial scale.
-    pub scale: f32,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { scale: 1.0 }
-    }
-}
+    pub scale: f32 = 1.0,
+@
 
 impl NormalizerSpec for Settings {
     fn build(&self, width: usize) -> Result<Box<dyn Normalizer>> {
@@ -70,7 +55,7 @@ impl RowMap for Affine {
     }
 
     /// Channels are independent: without some, the rest is a smaller stage of the same kind.
-    fn keep(&self, keep: &[usize]) -> Option<(Self, Vec<Range<usize>>)> {
+    fn keep(&self, keep: &[usize]) -> Option<(Self, Vec<std::ops::Range<usize>>)> {
         let part = |start: usize| keep.iter().map(move |&c| start + c..start + c + 1);
         Some((Self { width: keep.len(), scale: self.scale }, part(0).chain(part(self.width)).collect()))
     }

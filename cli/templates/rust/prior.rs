@@ -1,29 +1,15 @@
 //! A prior for conefield: half the squared differences of neighbouring points, in small blocks placed at random.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(PriorSpec, "@name@", Settings, "squared differences of neighbouring points");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "squared differences of neighbouring points"
     /// Weight relative to the mean loss of a ray.
-    pub weight: f64,
+    pub weight: f64 = 0.1,
     /// Blocks per step.
-    pub blocks: usize,
+    pub blocks: usize = 32,
     /// Points along a block's edge.
-    pub edge: usize,
+    pub edge: usize = 8,
     /// Spacing of the points in voxels.
-    pub spacing: f64,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { weight: 0.1, blocks: 32, edge: 8, spacing: 1.0 }
-    }
-}
+    pub spacing: f64 = 1.0,
+@
 
 impl PriorSpec for Settings {
     fn build(&self) -> Result<Box<dyn Prior>> {

@@ -3,26 +3,12 @@
 //! This start takes the middles of equal intervals within the reconstruction box. The line integral is the sum of
 //! attenuation times length, and its adjoint comes with the trait.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(ProjectorSpec, "@name@", Settings, "equal intervals within the box");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "equal intervals within the box"
     /// Samples per ray that meets the box.
-    pub samples: usize,
+    pub samples: usize = 128,
     /// Use a random position in every interval instead of its middle.
-    pub random: bool,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { samples: 128, random: false }
-    }
-}
+    pub random: bool = false,
+@
 
 impl ProjectorSpec for Settings {
     fn build(&self) -> Result<Box<dyn Projector>> {

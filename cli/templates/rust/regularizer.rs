@@ -1,25 +1,11 @@
 //! A regularizer for conefield: quadratic smoothness, half the squared differences of neighbouring coefficients.
 
-use conefield_plugin::prelude::*;
-
-conefield_plugin::export!();
-stage_type!(RegularizerSpec, "@name@", Settings, "squared differences of neighbours");
-
-/// Settings in a spec.
-#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Settings {
+@stage "squared differences of neighbours"
     /// Strength, as a multiple of the root mean square of back-projected noise, for differences of 1/mm.
-    pub weight: f64,
+    pub weight: f64 = 100.0,
     /// Gradient steps of the proximal map per update.
-    pub inner: usize,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self { weight: 100.0, inner: 4 }
-    }
-}
+    pub inner: usize = 4,
+@
 
 impl RegularizerSpec for Settings {
     fn build(&self) -> Result<Box<dyn Regularizer>> {

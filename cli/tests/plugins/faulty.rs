@@ -1,5 +1,5 @@
 //! Plugins with one fault each, made by an edit of what `plugins new` writes, and the outcome: refused when loaded,
-//! refused in the trial, found by the check, or an error of the run. `faulty.md` is generated from this;
+//! refused in the trial, found by the check, or an error of the run. The table of `faulty.md` is generated from this;
 //! `CONEFIELD_BLESS=1` writes it.
 
 use crate::build::{cc, example, sources};
@@ -361,6 +361,7 @@ const ABORTED: &str = "(the process is gone)";
 /// The same with panics in a Rust plugin.
 const PANICS: &[(&str, &str, [&str; 2])] = &[
     ("panics in create", "create", ["create panicked: as ordered, in create"; 2]),
+    ("panics in describe", "describe", ["describe panicked: as ordered, in describe"; 2]),
     ("panics in forward", "forward", ["forward panicked: as ordered, in forward"; 2]),
     ("panics in backward", "backward", ["backward panicked: as ordered, in backward"; 2]),
     ("panics after many rows", "later", ["finite differences: inputs", "forward panicked: as ordered, in call"]),
@@ -500,17 +501,12 @@ fn shortened(message: &str, want: &str) -> String {
     format!("{}{more}", &message[..end]).replace('|', "\\|").replace('\n', " ")
 }
 
-/// The page of all faults.
+/// The table of all faults, the end of the page.
 fn page(rows: &[Row]) {
-    let mut text = String::from(
-        "# Faulty plugins\n\nWhat happens to plugins with one fault each. `cli/tests/plugins/faulty.rs` makes them and \
-         this table; `CONEFIELD_BLESS=1 cargo test --release --workspace --test plugins` writes it.\n\n- *load*: refused by \
-         `plugins list` (which shows the others), `plugins check` and a reconstruction when the library is loaded.\n- *trial*: \
-         refused when the stage is made. Each stage is tried on a few rows, between guard zones and with a time limit.\n- \
-         *check*: found by `plugins check` only, such as wrong gradients.\n- *run*: an error of the run, which leaves no \
-         volume.\n\nA plugin runs in the process that loads it. One that calls `abort`, or writes far out of bounds, ends that \
-         process; the check runs in a separate process and reports it.\n\n| fault | found by | message |\n| --- | --- | --- |\n",
-    );
+    let path = sources().join("cli/tests/plugins/faulty.md");
+    let found = std::fs::read_to_string(&path).unwrap();
+    let head = "| fault | found by | message |\n| --- | --- | --- |\n";
+    let mut text = format!("{}{head}", found.split_once(head).unwrap().0);
     for Row { what, list, check, run } in rows {
         let found = match (list.is_empty(), check.is_empty(), run.is_empty()) {
             (false, ..) => vec![("load", list)],
@@ -522,10 +518,9 @@ fn page(rows: &[Row]) {
             let _ = writeln!(text, "| {what} | {by} | {said} |");
         }
     }
-    let path = sources().join("cli/tests/plugins/faulty.md");
     if std::env::var_os("CONEFIELD_BLESS").is_some() {
         std::fs::write(&path, &text).unwrap();
+        return;
     }
-    let found = std::fs::read_to_string(&path).unwrap_or_default();
     assert!(found == text, "{} is not current; CONEFIELD_BLESS=1 writes it\n{text}", path.display());
 }

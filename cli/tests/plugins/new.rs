@@ -2,29 +2,32 @@
 
 use crate::build::{cargo, library, sources};
 use crate::common::{Folder, SCAN, text};
+use conefield_core::registry::Kind;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-const KINDS: [&str; 10] = [
-    "encoder", "normalizer", "field", "projector", "initializer", "loss", "prior", "regularizer", "data-term", "basis",
-];
+/// The kinds and the specs of their templates, from the list of the contract.
+macro_rules! kinds {
+    ($($table:ident $field:ident: $($kind:ident $name:ident $code:ident $spec:ident $place:literal),+;)*) => {
+        const KINDS: &[(Kind, &str)] = &[$($((Kind::$kind, stringify!($spec)),)+)*];
+    };
+}
 
-/// Kinds that are parts of iterative methods.
-const PIECES: [&str; 3] = ["regularizer", "data-term", "basis"];
+conefield_plugin_abi::kinds! { kinds }
 
 /// Checks the plugin in the folder `new-KIND`, built to `library`, and runs it briefly.
-fn use_it(d: &Folder, kind: &str, library: &Path) {
+fn use_it(d: &Folder, (kind, spec): (Kind, &str), library: &Path) {
     let (name, library) = (format!("new-{kind}"), text(library));
     let report = d.json(&format!("plugins check {library} --json"));
     assert_eq!(report["passed"], true, "{report:#}");
-    let small = if PIECES.contains(&kind) { "'stop={ passes = 12 }'" } else { "training.rays=32" };
+    let small = if spec == "fista" { "'stop={ passes = 12 }'" } else { "training.rays=32" };
     let run = format!("--spec {name}/spec.toml -o run --force --steps 12 --set {small} --json");
     let record = d.json(&format!("--plugin {library} reconstruct scan {run}"));
     let plugin = &record["plugins"][0];
     assert_eq!([&plugin["name"], &plugin["version"]], [name.as_str(), "0.1.0"]);
     assert_eq!(record["steps"], 12);
-    if kind == "encoder" {
+    if kind == Kind::Encoder {
         // It says how fine it is: a step of the spec is one cell.
         let balanced = format!("--spec balanced --steps 2 --set encoder.type={name} -o cells --force");
         d.done(&format!("--plugin {library} reconstruct scan {balanced}"));
@@ -41,7 +44,7 @@ fn use_it(d: &Folder, kind: &str, library: &Path) {
 /// downloaded, and what the examples' builds have compiled is used again.
 fn workspace(d: &Folder) {
     let examples = sources().join("plugins/examples");
-    for kind in KINDS {
+    for (kind, _) in KINDS {
         let said = d.done(&format!("plugins new new-{kind} --kind {kind} --lang rust"));
         assert!(said.contains("cargo build --release") && said.contains("some minutes"), "{said}");
         let path = format!("new-{kind}/Cargo.toml");
@@ -64,21 +67,22 @@ fn in_rust() {
     workspace(&d);
     cargo(&d.at(""), &["build", "--release"]);
     cargo(&d.at(""), &["test", "--release", "-p", "new-encoder"]);
-    KINDS.iter().for_each(|kind| use_it(&d, kind, &library(&format!("new-{kind}"))));
+    KINDS.iter().for_each(|of| use_it(&d, *of, &library(&format!("new-{}", of.0))));
 }
 
 #[test]
 fn in_c() {
     let d = Folder::after(&[SCAN]);
-    for kind in KINDS {
+    for of in KINDS {
+        let kind = of.0;
         d.done(&format!("plugins new new-{kind} --kind {kind} --lang c"));
         let folder = d.at(format!("new-{kind}"));
         let made =
             Command::new("make").current_dir(&folder).env("CFLAGS", "-O2 -Wall -Wextra -Werror").output().unwrap();
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
         let library = folder.join(format!("new-{kind}.so"));
-        use_it(&d, kind, &library);
-        if kind == "encoder" {
+        use_it(&d, *of, &library);
+        if kind == Kind::Encoder {
             // Its author learns what turns the checks in double precision on.
             let said = d.done(&format!("plugins check {}", text(&library)));
             assert!(said.contains("in C, info leaves double_precision 0"), "{said}");
@@ -111,8 +115,10 @@ fn names_and_folders_are_checked() {
 /// The page shows the output of `plugins new`, which must be short.
 #[test]
 fn the_page_shows_the_encoder_that_is_made() {
+    let d = Folder::new();
+    d.done("plugins new waves --kind encoder --lang rust");
+    let made = d.text("waves/src/lib.rs");
     let read = |path: &str| std::fs::read_to_string(sources().join(path)).unwrap();
-    let made = read("cli/templates/rust/encoder.rs").replace("@name@", "waves");
     let page = read("docs/guide/writing-stages.md");
     let shown = page.split_once("```rust\n").and_then(|(_, rest)| rest.split_once("```")).map(|(code, _)| code);
     assert_eq!(shown, Some(&made[..]));

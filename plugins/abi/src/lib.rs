@@ -23,12 +23,13 @@
 use std::ffi::c_void;
 
 /// Defines tables of functions, each a pointer that is NULL if the function is absent. A plugin without one that is
-/// `required` is refused.
+/// `required` is refused. `since` gives the minor version that brought a function, where it is not the first.
 macro_rules! tables {
     ($(
         $(#[$about:meta])*
         $table:ident {
-            $($(#[$doc:meta])* $need:ident $name:ident($($argument:ident: $type:ty),*) $(-> $result:ty)?;)*
+            $($(#[$doc:meta])* $need:ident $name:ident($($argument:ident: $type:ty),*) $(-> $result:ty)?
+                $(, since $minor:literal)?;)*
         }
     )*) => {$(
         $(#[$about])*
@@ -41,6 +42,9 @@ macro_rules! tables {
         }
 
         impl $table {
+            /// Bytes of this table in the first minor version.
+            pub const FIRST_SIZE: usize = first_size(&[$(stringify!($($minor)?)),*]);
+
             /// The first required function that is absent.
             pub fn missing(&self) -> Option<&'static str> {
                 let all = [$((stringify!($name), stringify!($need), self.$name.is_some())),*];
@@ -48,6 +52,15 @@ macro_rules! tables {
             }
         }
     )*};
+}
+
+/// Bytes of a table whose functions came with these minor versions; "" is the first.
+const fn first_size(minors: &[&str]) -> usize {
+    let mut pointers = 1;
+    while pointers <= minors.len() && minors[pointers - 1].is_empty() {
+        pointers += 1;
+    }
+    pointers * size_of::<usize>()
 }
 
 include!("tables.rs");
@@ -92,21 +105,24 @@ pub const CONEFIELD_DATA_TERM: u32 = 8;
 pub const CONEFIELD_BASIS: u32 = 9;
 
 /// Hands the macro `$then` every kind: for each table of functions its type, its field in [`ConefieldStage`], and the
-/// kinds that use it, by conefield's name and by their code. The host's dispatch, the exports of Rust plugins and new
-/// plugins in C are made from this list.
+/// kinds that use it, each with conefield's name, the name of its files, its code, and a small spec with the place that
+/// such a stage has there. The host's dispatch, the exports of Rust plugins, and new plugins with their tests are made
+/// from this list.
 #[macro_export]
 macro_rules! kinds {
     ($then:ident) => {
         $then! {
             ConefieldMap map:
-                Encoder CONEFIELD_ENCODER, Normalizer CONEFIELD_NORMALIZER, Field CONEFIELD_FIELD;
-            ConefieldProjector projector: Projector CONEFIELD_PROJECTOR;
-            ConefieldInitializer initializer: Initializer CONEFIELD_INITIALIZER;
-            ConefieldLoss loss: Loss CONEFIELD_LOSS;
-            ConefieldPrior prior: Prior CONEFIELD_PRIOR;
-            ConefieldRegularizer regularizer: Regularizer CONEFIELD_REGULARIZER;
-            ConefieldDataTerm data_term: DataTerm CONEFIELD_DATA_TERM;
-            ConefieldBasis basis: Basis CONEFIELD_BASIS;
+                Encoder encoder CONEFIELD_ENCODER fast "[encoder]",
+                Normalizer normalizer CONEFIELD_NORMALIZER fast "[[normalizers]]",
+                Field field CONEFIELD_FIELD fast "[field]";
+            ConefieldProjector projector: Projector projector CONEFIELD_PROJECTOR fast "[projector]";
+            ConefieldInitializer initializer: Initializer initializer CONEFIELD_INITIALIZER fast "[initializer]";
+            ConefieldLoss loss: Loss loss CONEFIELD_LOSS fast "[loss]";
+            ConefieldPrior prior: Prior prior CONEFIELD_PRIOR fast "[[priors]]";
+            ConefieldRegularizer regularizer: Regularizer regularizer CONEFIELD_REGULARIZER fista "[prior]";
+            ConefieldDataTerm data_term: DataTerm data_term CONEFIELD_DATA_TERM fista "[data]";
+            ConefieldBasis basis: Basis basis CONEFIELD_BASIS fista "[basis]";
         }
     };
 }

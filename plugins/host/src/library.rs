@@ -9,6 +9,7 @@ use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::Kind;
 use conefield_plugin_abi::*;
 use serde_json::Value;
+use std::any::Any;
 use std::collections::BTreeMap;
 use std::ffi::c_void;
 use std::mem::{MaybeUninit, offset_of};
@@ -18,8 +19,8 @@ use std::{fmt, ptr, slice};
 
 /// Longest text in a table.
 const LONGEST_TEXT: usize = 1 << 20;
-/// Size in bytes of a stage's table in the first minor version.
-const FIRST_STAGE: usize = size_of::<ConefieldStage>();
+/// Size in bytes of a stage's table in the first minor version, which ended with `basis`.
+const FIRST_STAGE: usize = offset_of!(ConefieldStage, basis) + size_of::<*const ConefieldBasis>();
 /// Maximum number of stages in a library.
 const MOST_STAGES: usize = 1024;
 
@@ -70,70 +71,48 @@ unsafe impl Send for Type {}
 // SAFETY: as above; nothing here is mutated.
 unsafe impl Sync for Type {}
 
-/// Makes the functions of a stage, and their checks, from the list of the contract.
+/// The table of functions of one kind, such as a [`ConefieldMap`].
+pub(crate) type Functions = Box<dyn Any + Send + Sync>;
+
+/// Reads the functions of a stage as the list of the contract has them.
 macro_rules! tables {
-    ($($table:ident $field:ident: $($kind:ident $code:ident),+;)*) => {
-        /// The functions of a stage.
-        #[derive(Clone, Copy)]
-        #[allow(non_camel_case_types)]
-        pub(crate) enum Functions {
-            $($field($table),)*
-        }
-
-        $(impl FunctionsOf for $table {
-            fn of(functions: Functions) -> Option<Self> {
-                match functions {
-                    Functions::$field(table) => Some(table),
-                    _ => None,
-                }
+    ($($table:ident $field:ident: $($kind:ident $name:ident $code:ident $spec:ident $place:literal),+;)*) => {
+        /// The kind of the stage `t` and its functions; `at` describes the stage in words.
+        unsafe fn functions(t: &ConefieldStage, place: &str, at: &str) -> Result<(Kind, Functions)> {
+            match t.kind {
+                $($($code)|+ => {
+                    let kind = [$(($code, Kind::$kind)),+].into_iter().find(|(code, _)| *code == t.kind);
+                    let (what, least) = (format!("{at}: functions"), $table::FIRST_SIZE);
+                    // SAFETY: see the top of this file.
+                    let table = unsafe { sized(t.$field, place, &what, least)? };
+                    if let Some(missing) = table.missing() {
+                        return Err(Error::invalid(place, at, format!("no function {missing}"), "one"));
+                    }
+                    kind.map(|(_, kind)| (kind, Box::new(table) as Functions))
+                })*
+                _ => None,
             }
-        })*
-
-        impl Functions {
-            /// The kind of the stage `t` and its functions; `at` describes the stage in words.
-            unsafe fn read(t: &ConefieldStage, place: &str, at: &str) -> Result<(Kind, Self)> {
-                match t.kind {
-                    $($($code)|+ => {
-                        let kind = [$(($code, Kind::$kind)),+].into_iter().find(|(code, _)| *code == t.kind);
-                        // A later minor version that adds functions needs the size of this one here.
-                        let least = size_of::<$table>();
-                        // SAFETY: see the top of this file.
-                        let table = unsafe { sized(t.$field, place, &format!("{at}: functions"), least)? };
-                        if let Some(missing) = table.missing() {
-                            return Err(Error::invalid(place, at, format!("no function {missing}"), "one"));
-                        }
-                        kind.map(|(_, kind)| (kind, Self::$field(table)))
-                    })*
-                    _ => None,
-                }
-                .ok_or_else(|| {
-                    let known = [$($($code),+),*].len() - 1;
-                    Error::invalid(place, at, format!("kind {}", t.kind), format!("0 to {known}"))
-                })
-            }
+            .ok_or_else(|| {
+                let known = [$($($code),+),*].len() - 1;
+                Error::invalid(place, at, format!("kind {}", t.kind), format!("0 to {known}"))
+            })
         }
     };
 }
 
 conefield_plugin_abi::kinds! { tables }
 
-/// The functions of one kind of stage.
-pub(crate) trait FunctionsOf: Copy {
-    /// These functions, if they are of this kind.
-    fn of(functions: Functions) -> Option<Self>;
-}
-
 /// Checks dependencies between functions, beyond the required ones.
-fn consistent(functions: &Functions) -> Result<(), (&'static str, &'static str)> {
-    match functions {
-        Functions::projector(p) if p.integrate.is_some() != p.adjoint.is_some() => {
-            Err(("one of integrate and adjoint", "both or none"))
-        }
-        Functions::initializer(i) if i.weights.is_some() && i.with_weights.is_none() => {
-            Err(("no function with_weights", "one"))
-        }
-        _ => Ok(()),
+fn consistent(functions: &dyn Any) -> Result<(), (&'static str, &'static str)> {
+    let of_projector = |p: &ConefieldProjector| p.integrate.is_some() != p.adjoint.is_some();
+    if functions.downcast_ref().is_some_and(of_projector) {
+        return Err(("one of integrate and adjoint", "both or none"));
     }
+    let of_initializer = |i: &ConefieldInitializer| i.weights.is_some() && i.with_weights.is_none();
+    if functions.downcast_ref().is_some_and(of_initializer) {
+        return Err(("no function with_weights", "one"));
+    }
+    Ok(())
 }
 
 impl Library {
@@ -281,8 +260,8 @@ impl Type {
         // A setting missing in the schema is a mistake, whether the schema says so or not.
         keys.entry("additionalProperties").or_insert(Value::Bool(false));
         // SAFETY: see the top of this file.
-        let (kind, functions) = unsafe { Functions::read(t, place, &at)? };
-        consistent(&functions).map_err(|(found, expected)| Error::invalid(place, &at, found, expected))?;
+        let (kind, functions) = unsafe { functions(t, place, &at)? };
+        consistent(functions.as_ref()).map_err(|(found, expected)| Error::invalid(place, &at, found, expected))?;
         let missing = |what: &str| Error::invalid(place, &at, format!("no function {what}"), "one");
         Ok(Self {
             kind,
@@ -366,14 +345,18 @@ impl Drop for Handle {
 }
 
 impl Handle {
-    /// The stage's own description.
-    pub fn describe(&self) -> String {
+    /// The stage's own description; its type if it has none. A panic is an error, as in every function.
+    pub fn describe(&self) -> Result<String> {
         let mut text = Text::new();
         // SAFETY: the stage is alive.
         let status = unsafe { (self.ty.describe)(self.stage, text.room()) };
         let text = text.text();
-        let line = if status == CONEFIELD_OK { text.lines().next().unwrap_or_default() } else { &self.ty.name };
-        if line.starts_with(&self.ty.name) { line.into() } else { format!("{}: {line}", self.ty.name) }
+        let line = match status {
+            CONEFIELD_OK => text.lines().next().unwrap_or_default(),
+            CONEFIELD_PANICKED => return Err(self.ty.failed("describe", status, &text)),
+            _ => &self.ty.name,
+        };
+        Ok(if line.starts_with(&self.ty.name) { line.into() } else { format!("{}: {line}", self.ty.name) })
     }
 }
 

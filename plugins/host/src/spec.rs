@@ -1,15 +1,8 @@
 //! Types of a library as settings in a spec.
 
-use crate::library::{Library, Type};
-use crate::stage::basis::BasisStage;
-use crate::stage::data_term::DataTermStage;
-use crate::stage::loss::LossStage;
-use crate::stage::map::MapStage;
-use crate::stage::prior::PriorStage;
-use crate::stage::projector::ProjectorStage;
-use crate::stage::regularizer::RegularizerStage;
-use crate::stage::{build, initializer};
-use conefield_core::prelude::*;
+use crate::library::{Handle, Library, Type};
+use crate::{stage, trial};
+use conefield_core::error::Result;
 use conefield_core::registry::{self, Kind, Make, Registered, StageType};
 use serde_json::Value;
 use std::sync::Arc;
@@ -18,14 +11,14 @@ use std::sync::Arc;
 pub fn register(library: &Library) -> Result<()> {
     let new = |t: &Arc<Type>| {
         let (name, doc, schema) = (t.name.clone(), t.doc.clone(), t.schema.clone());
-        Ok(StageType::loaded(&library.owner(), name, doc, schema, make(t.clone())?))
+        StageType::loaded(&library.owner(), name, doc, schema, make(t.clone()))
     };
-    registry::add(library.types.iter().map(new).collect::<Result<_>>()?)
+    registry::add(library.types.iter().map(new).collect())
 }
 
 /// Settings of a library's stage, with all defaults written out.
-struct Loaded {
-    ty: Arc<Type>,
+pub(crate) struct Loaded {
+    pub ty: Arc<Type>,
     /// The type's name, with static lifetime.
     name: &'static str,
     settings: Value,
@@ -56,45 +49,48 @@ impl Registered for Loaded {
     }
 }
 
-/// Implements the settings traits of all kinds.
-macro_rules! kinds {
-    ($($kind:ident $spec:ident ($self:ident $(, $argument:ident: $type:ty)?) -> $stage:ty { $build:expr })*) => {
-        fn make(ty: Arc<Type>) -> Result<Make> {
-            let name: &'static str = ty.name.clone().leak();
-            let kind = ty.kind;
-            let settings =
-                move |written: Value| Loaded { settings: with_defaults(&ty.schema, written), name, ty: ty.clone() };
-            Ok(match kind {
-                $(Kind::$kind => Make::new::<dyn $spec>(Box::new(move |v| Ok(Box::new(settings(v))))),)*
-                other => return Err(Error::unsupported(name, format!("a {other} cannot come from a plugin"))),
-            })
-        }
-
-        $(impl $spec for Loaded {
-            fn build(&$self $(, $argument: $type)?) -> Result<Box<$stage>> {
-                Ok(Box::new($build?))
-            }
-        })*
-    };
-}
-
-kinds! {
-    Encoder EncoderSpec(self) -> dyn Encoder { self.map(3) }
-    Normalizer NormalizerSpec(self, width: usize) -> dyn Normalizer { self.map(width) }
-    Field FieldSpec(self, width: usize) -> dyn Field { self.map(width) }
-    Projector ProjectorSpec(self) -> dyn Projector { build(&self.ty, &self.settings, 0, ProjectorStage::tried) }
-    Loss LossSpec(self) -> dyn Loss { build(&self.ty, &self.settings, 0, LossStage::tried) }
-    Prior PriorSpec(self) -> dyn Prior { build(&self.ty, &self.settings, 0, PriorStage::tried) }
-    Regularizer RegularizerSpec(self) -> dyn Regularizer { build(&self.ty, &self.settings, 0, RegularizerStage::tried) }
-    DataTerm DataTermSpec(self) -> dyn DataTerm { build(&self.ty, &self.settings, 0, DataTermStage::tried) }
-    Basis BasisSpec(self) -> dyn Basis { build(&self.ty, &self.settings, 0, BasisStage::tried) }
-    Initializer InitializerSpec(self, weights: &dyn Fn(&str) -> Result<Weights>) -> dyn Initializer {
-        initializer::build(&self.ty, &self.settings, weights)
-    }
-}
+/// Makes settings from what a spec says.
+pub(crate) type Written = Box<dyn Fn(Value) -> Loaded + Send + Sync>;
 
 impl Loaded {
-    fn map(&self, width: usize) -> Result<MapStage> {
-        build(&self.ty, &self.settings, width, move |handle| MapStage::tried(handle, width))
+    /// Creates and tries a stage for `width` input channels, both within the time limit.
+    pub(crate) fn build<T: Send + 'static>(
+        &self,
+        width: usize,
+        tried: impl FnOnce(Handle) -> Result<T> + Send + 'static,
+    ) -> Result<Box<T>> {
+        let (own, settings) = (self.ty.clone(), self.settings.clone());
+        trial::timed(&self.ty, move || tried(own.create(&settings, width)?)).map(Box::new)
     }
+}
+
+/// Implements the settings traits of kinds, each with the function that makes settings for the registry.
+macro_rules! settings {
+    ($($name:ident $spec:ident ($self:ident $(, $argument:ident: $type:ty)?) -> $stage:ty { $build:expr })*) => {$(
+        pub(crate) fn $name(of: crate::spec::Written) -> conefield_core::registry::Make {
+            conefield_core::registry::Make::new::<dyn $spec>(Box::new(move |written| Ok(Box::new(of(written)))))
+        }
+
+        impl $spec for crate::spec::Loaded {
+            fn build(&$self $(, $argument: $type)?) -> Result<Box<$stage>> {
+                Ok($build?)
+            }
+        }
+    )*};
+}
+pub(crate) use settings;
+
+/// What makes settings of type `ty` for the registry.
+fn make(ty: Arc<Type>) -> Make {
+    let (kind, name): (_, &'static str) = (ty.kind, ty.name.clone().leak());
+    let settings = move |written| Loaded { settings: with_defaults(&ty.schema, written), name, ty: ty.clone() };
+    macro_rules! made {
+        ($($table:ident $field:ident: $($kind:ident $name:ident $code:ident $spec:ident $place:literal),+;)*) => {
+            match kind {
+                $($(Kind::$kind => stage::$field::$name(Box::new(settings)),)+)*
+                other => unreachable!("a {other} cannot come from a plugin"),
+            }
+        };
+    }
+    conefield_plugin_abi::kinds! { made }
 }

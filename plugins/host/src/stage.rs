@@ -11,16 +11,19 @@ pub mod prior;
 pub mod projector;
 pub mod regularizer;
 
-use crate::library::{FunctionsOf, Handle, Text, Type, whole_text};
-use crate::trial;
+// The adapters begin with these imports, too.
+use crate::library::{Handle, Text, Type, text, whole_text};
+use crate::spec::settings;
+use crate::trial::{GUARD, Guarded, Marked, below_zero, drawn, settled, timed};
 use conefield_core::prelude::*;
 use conefield_core::wgsl::FOREIGN;
 use conefield_plugin_abi::*;
-use serde_json::Value;
+use ndarray::Array3;
+use std::collections::BTreeSet;
 use std::ffi::c_void;
-use std::ptr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::{ptr, slice};
 
 /// Bytes that no stage holds: a larger number, such as that of a panic, counts as this one.
 const MOST_BYTES: u64 = 1 << 60;
@@ -55,22 +58,11 @@ pub(crate) struct Foreign<F> {
     fault: Fault,
 }
 
-/// Creates and tries a stage, both within the time limit.
-pub(crate) fn build<T: Send + 'static>(
-    ty: &Arc<Type>,
-    settings: &Value,
-    width: usize,
-    tried: impl FnOnce(Handle) -> Result<T> + Send + 'static,
-) -> Result<T> {
-    let (own, settings) = (ty.clone(), settings.clone());
-    trial::timed(ty, move || tried(own.create(&settings, width)?))
-}
-
-impl<F: FunctionsOf> Foreign<F> {
+impl<F: Copy + 'static> Foreign<F> {
     fn new(handle: Handle) -> Result<Self> {
         let another = || handle.ty.failed("create", CONEFIELD_FAILED, "it is of another kind");
-        let functions = F::of(handle.ty.functions).ok_or_else(another)?;
-        let describe = handle.describe();
+        let functions = *handle.ty.functions.downcast_ref().ok_or_else(another)?;
+        let describe = handle.describe()?;
         Ok(Self { handle, functions, describe, fault: Fault::default() })
     }
 
@@ -82,6 +74,11 @@ impl<F: FunctionsOf> Foreign<F> {
     /// The error for a wrong result of `call`.
     fn wrong(&self, call: &str, what: &str) -> Error {
         Error::unsupported(self.ty().words(), format!("{call}: {what}"))
+    }
+
+    /// Refuses a wrong result of `call`.
+    fn require(&self, holds: bool, call: &str, what: impl FnOnce() -> String) -> Result<()> {
+        if holds { Ok(()) } else { Err(self.wrong(call, &what())) }
     }
 
     /// Calls `f` with the stage and a buffer for the reason. Errors name `call`.
@@ -102,6 +99,11 @@ impl<F: FunctionsOf> Foreign<F> {
             if known { status } else { CONEFIELD_OK }
         })?;
         Ok(known)
+    }
+
+    /// Refuses the stage with the complaint of its trial, if there is one.
+    fn settled(&self, complaint: Option<String>) -> Result<()> {
+        settled(self.ty(), complaint)
     }
 
     /// The value of a call that cannot return an error: records the error as a fault and returns `instead`.

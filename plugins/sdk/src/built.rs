@@ -1,80 +1,59 @@
-//! The stage behind the pointer that the host holds.
+//! What is behind a pointer that the host holds.
 
 use conefield_core::prelude::*;
-use conefield_core::registry::{Kind, Settings, StageType, read};
+use conefield_core::registry::{Settings, read};
 use conefield_core::settings::KnownVolume;
 use conefield_plugin_abi::*;
 use serde_json::Value;
-use std::any::{Any, type_name};
+use std::any::Any;
 use std::cell::RefCell;
 use std::ops::Range;
 
-/// A stage held by the host.
-pub struct Built {
-    /// A box of what the functions of its table take, such as a `Box<dyn Loss>` or a `Box<Map>`.
-    stage: Box<dyn Any>,
-    pub describe: String,
+/// A stage, or what a stage makes for a grid or a scan, in a box of what the functions of its table take.
+pub trait Part: Any {
+    /// A one-line description.
+    fn describe(&self) -> String;
 }
 
-/// The settings of a stage.
-fn settings<T: Settings + ?Sized + 'static>(settings: Value) -> Result<Box<T>> {
-    read(settings).map_err(|e| Error::invalid("spec", "", e, "settings of this type"))
+/// What functions of tables take.
+pub trait Named: 'static {
+    /// Its name, for errors.
+    const NAME: &str;
 }
 
-impl Built {
-    /// The stage of type `t` with `keys`, its settings without their type; some need the number of input channels.
-    pub fn new(t: &StageType, mut keys: Value, width: usize) -> Result<Self> {
-        let Some(table) = keys.as_object_mut() else {
-            return Err(Error::invalid("spec", "", &keys, "a table of settings"));
-        };
-        table.insert("type".into(), t.name.into());
-        macro_rules! built {
-            ($spec:ident) => {{
-                let stage = settings::<dyn $spec>(keys)?.build()?;
-                let describe = stage.describe();
-                Self::of(stage, describe)
-            }};
-        }
-        Ok(match t.kind {
-            Kind::Encoder => Map::of(Rows::Encoder(settings::<dyn EncoderSpec>(keys)?.build()?)).built(),
-            Kind::Normalizer => Map::of(Rows::Normalizer(settings::<dyn NormalizerSpec>(keys)?.build(width)?)).built(),
-            Kind::Field => Map::of(Rows::Field(settings::<dyn FieldSpec>(keys)?.build(width)?)).built(),
-            Kind::Projector => built!(ProjectorSpec),
-            Kind::Loss => built!(LossSpec),
-            Kind::Prior => built!(PriorSpec),
-            Kind::Regularizer => built!(RegularizerSpec),
-            Kind::DataTerm => built!(DataTermSpec),
-            Kind::Basis => built!(BasisSpec),
-            Kind::Initializer => Waiting::build(settings::<dyn InitializerSpec>(keys)?)?,
-            other => return Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
-        })
-    }
-
-    /// The host's object for `stage`.
-    pub fn of<T: ?Sized + 'static>(stage: Box<T>, describe: String) -> Self {
-        Self { stage: Box::new(stage), describe }
-    }
-
-    /// The stage as what a function takes.
-    pub fn get<T: ?Sized + 'static>(&self) -> Result<&T> {
-        self.stage.downcast_ref::<Box<T>>().map(|stage| &**stage).ok_or_else(is_no::<T>)
+impl dyn Part {
+    /// The part as what a function takes.
+    pub fn get<T: Named + ?Sized>(&self) -> Result<&T> {
+        (self as &dyn Any).downcast_ref::<Box<T>>().map(|part| &**part).ok_or_else(|| is_no(T::NAME))
     }
 
     /// As [`Self::get`], mutable.
-    pub fn get_mut<T: ?Sized + 'static>(&mut self) -> Result<&mut T> {
-        self.stage.downcast_mut::<Box<T>>().map(|stage| &mut **stage).ok_or_else(is_no::<T>)
+    pub fn get_mut<T: Named + ?Sized>(&mut self) -> Result<&mut T> {
+        (self as &mut dyn Any).downcast_mut::<Box<T>>().map(|part| &mut **part).ok_or_else(|| is_no(T::NAME))
     }
 }
 
-/// The error for a stage of a different kind than requested.
-fn is_no<T: ?Sized>() -> Error {
-    Error::unsupported("this stage", format!("it is no {}", type_name::<T>()))
+/// The error for a function that does not take this stage.
+fn is_no(name: &str) -> Error {
+    Error::unsupported("this stage", format!("it is no {name}"))
+}
+
+/// The settings of a stage, from all keys of its table.
+pub fn settings<T: Settings + ?Sized + 'static>(keys: Value) -> Result<Box<T>> {
+    read(keys).map_err(|e| Error::invalid("spec", "", e, "settings of this type"))
 }
 
 /// What a stage made for one grid, with the grid's shape.
 pub struct OnGrid<T: ?Sized> {
     pub shape: [usize; 3],
     pub part: Box<T>,
+}
+
+impl<T: ?Sized> OnGrid<T> {
+    /// The host describes the stage instead.
+    pub fn describe(&self) -> String {
+        String::new()
+    }
 }
 
 /// An initializer, with its known volume.
@@ -84,9 +63,12 @@ pub struct Filling {
 }
 
 impl Filling {
-    pub fn built(initializer: Box<dyn Initializer>) -> Built {
-        let (volume, describe) = (initializer.volume(), initializer.describe());
-        Built::of(Box::new(Self { initializer, volume }), describe)
+    fn of(initializer: Box<dyn Initializer>) -> Box<Self> {
+        Box::new(Self { volume: initializer.volume(), initializer })
+    }
+
+    pub fn describe(&self) -> String {
+        self.initializer.describe()
     }
 }
 
@@ -98,28 +80,29 @@ pub struct Waiting {
 
 impl Waiting {
     /// Builds the initializer, or returns the settings if it needs a weights file.
-    fn build(spec: Box<dyn InitializerSpec>) -> Result<Built> {
+    pub fn build(spec: Box<dyn InitializerSpec>) -> Result<Box<dyn Part>> {
         let asked = RefCell::new(None);
         let built = spec.build(&|path| {
             asked.replace(Some(path.to_owned()));
             Err(Error::unsupported(path, "it is not read yet"))
         });
-        match asked.into_inner() {
-            Some(path) => {
-                let describe = format!("waits for {path}");
-                Ok(Built::of(Box::new(Self { spec, path }), describe))
-            }
-            None => built.map(Filling::built),
-        }
+        Ok(match asked.into_inner() {
+            Some(path) => Box::new(Box::new(Self { spec, path })),
+            None => Box::new(Filling::of(built?)),
+        })
     }
 
     /// The initializer with these weights.
-    pub fn with(&self, weights: &Weights) -> Result<Built> {
+    pub fn with(&self, weights: &Weights) -> Result<Box<Filling>> {
         let only = |path: &str| {
             let why = || Error::unsupported(path, "an initializer from a plugin has one weights file");
             (path == self.path).then(|| weights.clone()).ok_or_else(why)
         };
-        self.spec.build(&only).map(Filling::built)
+        self.spec.build(&only).map(Filling::of)
+    }
+
+    pub fn describe(&self) -> String {
+        format!("waits for {}", self.path)
     }
 }
 
@@ -152,19 +135,18 @@ impl Map {
         Self { rows, info, blocks, partition, kept: (vec![], vec![]) }
     }
 
-    pub fn built(self) -> Built {
-        let describe = self.stage().describe();
-        Built::of(Box::new(self), describe)
-    }
-
     pub fn stage(&self) -> &dyn Stage {
         self.rows.stage()
+    }
+
+    pub fn describe(&self) -> String {
+        self.stage().describe()
     }
 
     pub fn encoder(&self) -> Result<&dyn Encoder> {
         match &self.rows {
             Rows::Encoder(encoder) => Ok(encoder.as_ref()),
-            _ => Err(is_no::<dyn Encoder>()),
+            _ => Err(is_no("encoder")),
         }
     }
 

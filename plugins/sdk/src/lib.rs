@@ -23,7 +23,8 @@ pub use conefield_core::{
     settings, simd, space, stage, stage_type, wgsl,
 };
 pub use conefield_plugin_abi as abi;
-pub use export::Plugin;
+#[doc(hidden)]
+pub use export::table;
 
 /// Exports every stage type that this crate registers. Call it once, at the root of the crate.
 #[macro_export]
@@ -33,9 +34,8 @@ macro_rules! export {
         #[allow(unsafe_code)]
         #[unsafe(no_mangle)]
         pub extern "C" fn conefield_plugin() -> *const $crate::abi::ConefieldPlugin {
-            static PLUGIN: $crate::Plugin =
-                $crate::Plugin::new(env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION"), env!("CARGO_PKG_LICENSE"));
-            PLUGIN.table()
+            static TABLE: ::std::sync::OnceLock<usize> = ::std::sync::OnceLock::new();
+            $crate::table(&TABLE, [env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION"), env!("CARGO_PKG_LICENSE")])
         }
     };
 }

@@ -1,8 +1,8 @@
 //! Properties of a basis: a linear map without negative entries, and its exact adjoint.
 
-use crate::call::{differing, no_fault, on_threads, settle};
+use crate::call::{differing, no_fault, on_threads, require, settle, skipped};
 use crate::gradients::no_double;
-use crate::voxels::{above, apart, dot, flat, noise};
+use crate::voxels::{apart, flat, mismatch, noise, nonlinear};
 use crate::{Outcome, Report};
 use conefield_core::basis::{Basis, BasisOperator, Expansion};
 use conefield_core::geometry::VoxelGrid;
@@ -17,18 +17,18 @@ const SINGLE: f64 = 1e-5;
 /// Checks all properties of a basis.
 pub fn check_basis(basis: &dyn Basis) -> Report {
     let mut report = Report::of(basis.describe());
-    report.add("builds", || builds(basis));
+    report.holds("builds", "for every grid", || builds(basis));
     let made: Result<Vec<_>, _> = grids().iter().map(|grid| basis.on(grid).map(|b| (*grid, b))).collect();
     let Ok(all) = made else { return report };
     let double = all.iter().all(|(_, basis)| basis.reference().is_some());
     report.add("adjoint: double precision", || if double { adjoint(&all, reference, ADJOINT[0]) } else { no_double() });
     report.add("adjoint: single precision", || adjoint(&all, |b| b.operator(), ADJOINT[1]));
     report.add("single precision", || if double { single_precision(&all) } else { no_double() });
-    report.add("linear", || linear(&all, if double { 1e-12 } else { SINGLE }));
-    report.add("overwrites", || overwrites(&all));
+    report.holds("linear", "sums and multiples go through", || linear(&all, if double { 1e-12 } else { SINGLE }));
+    report.holds("overwrites", "over NaN as over 0", || all.iter().find_map(overwrites));
     report.add("no negative entries", || no_negative_entries(&all));
     report.add("samples", || samples(&all, if double { 1e-6 } else { SINGLE }));
-    report.add("threads", || threads(&all));
+    report.holds("threads", "1 and 3 threads", || threads(&all));
     report.add("no fault", || no_fault(all.iter().try_for_each(|(_, basis)| basis.fault())));
     report
 }
@@ -60,8 +60,8 @@ fn grids() -> Vec<VoxelGrid> {
 }
 
 /// The basis exists for every grid, and the number of coefficients depends on the grid's shape only.
-fn builds(basis: &dyn Basis) -> Outcome {
-    let complaint = grids().into_iter().find_map(|grid| {
+fn builds(basis: &dyn Basis) -> Option<String> {
+    grids().into_iter().find_map(|grid| {
         let made = match basis.on(&grid) {
             Ok(made) => made.coefficients(),
             Err(e) => return Some(format!("for {grid:?}: {e}")),
@@ -71,8 +71,7 @@ fn builds(basis: &dyn Basis) -> Outcome {
         let shape = basis.on(&other).map(|b| b.coefficients().shape).ok();
         (!positive || shape != Some(made.shape))
             .then(|| format!("for {grid:?}: {made:?}, with larger voxels {shape:?}"))
-    });
-    settle(complaint, "for every grid")
+    })
 }
 
 fn expand<R: Real>(of: &dyn BasisOperator<R>, voxels: [usize; 3], x: &Array3<R>) -> Array3<R> {
@@ -89,18 +88,15 @@ fn back<R: Real>(of: &dyn BasisOperator<R>, coefficients: [usize; 3], y: &Array3
 
 fn adjoint<R: Real>(all: &Made, of: impl Fn(&dyn Expansion) -> &dyn BasisOperator<R>, most: f64) -> Outcome {
     let mut worst = 0.0f64;
-    let mut complaint = None;
     for (grid, basis) in all {
         let (op, shape) = (of(basis.as_ref()), basis.coefficients().shape);
         let (x, y) = (noise::<R>(shape, 7), noise::<R>(grid.shape, 107));
         let (bx, bty) = (expand(op, grid.shape, &x), back(op, shape, &y));
-        let off = (dot(&bx, &y) - dot(&x, &bty)).abs() / (dot(&bx, &bx) * dot(&y, &y)).sqrt();
+        let off = mismatch([&x, &bty], [&bx, &y]);
+        require(off <= most, || format!("{:?}: <Bx, y> and <x, Bᵀy> differ by {off:.1e}", grid.shape))?;
         worst = worst.max(off);
-        if above(off, most) {
-            complaint = complaint.or(Some(format!("{:?}: <Bx, y> and <x, Bᵀy> differ by {off:.1e}", grid.shape)));
-        }
     }
-    settle(complaint, &format!("off by {worst:.1e} at most"))
+    Ok(format!("off by {worst:.1e} at most"))
 }
 
 fn single_precision(all: &Made) -> Outcome {
@@ -117,36 +113,29 @@ fn single_precision(all: &Made) -> Outcome {
     settle(complaint, &format!("within {SINGLE:.0e} of double precision"))
 }
 
-fn linear(all: &Made, close: f64) -> Outcome {
-    let mixed = |a: &Array3<f64>, b: &Array3<f64>| 2.5 * a - 0.75 * b;
-    let complaint = all.iter().find_map(|(grid, basis)| {
-        let shape = basis.coefficients().shape;
-        let [x, y] = [1, 2].map(|s| noise::<f64>(shape, s));
-        let [a, b, both] = [&x, &y, &mixed(&x, &y)].map(|c| exact(basis.as_ref(), grid.shape, c));
-        apart("voxels of a sum", &both, &mixed(&a, &b), close)
-    });
-    settle(complaint, "sums and multiples go through")
+fn linear(all: &Made, close: f64) -> Option<String> {
+    all.iter().find_map(|(grid, basis)| {
+        let voxels = |x: &_| exact(basis.as_ref(), grid.shape, x);
+        nonlinear("voxels of a sum", voxels, basis.coefficients().shape, [1, 2], close)
+    })
 }
 
 /// Both directions overwrite their output, whether it holds NaN or 0.
-fn overwrites(all: &Made) -> Outcome {
-    let complaint = all.iter().find_map(|(grid, basis)| {
-        let (op, shape) = (basis.operator(), basis.coefficients().shape);
-        let (x, y) = (noise::<f32>(shape, 5), noise::<f32>(grid.shape, 6));
-        let mut voxels = Array3::from_elem(grid.shape, f32::NAN);
-        op.expand(x.view(), voxels.view_mut());
-        let mut coefficients = Array3::from_elem(shape, f32::NAN);
-        op.adjoint(y.view(), coefficients.view_mut());
-        differing("voxel", &flat(&voxels), &flat(&expand(op, grid.shape, &x)))
-            .or_else(|| differing("coefficient", &flat(&coefficients), &flat(&back(op, shape, &y))))
-    });
-    settle(complaint, "over NaN as over 0")
+fn overwrites((grid, basis): &(VoxelGrid, Box<dyn Expansion>)) -> Option<String> {
+    let (op, shape) = (basis.operator(), basis.coefficients().shape);
+    let (x, y) = (noise::<f32>(shape, 5), noise::<f32>(grid.shape, 6));
+    let mut voxels = Array3::from_elem(grid.shape, f32::NAN);
+    op.expand(x.view(), voxels.view_mut());
+    let mut coefficients = Array3::from_elem(shape, f32::NAN);
+    op.adjoint(y.view(), coefficients.view_mut());
+    differing("voxel", &flat(&voxels), &flat(&expand(op, grid.shape, &x)))
+        .or_else(|| differing("coefficient", &flat(&coefficients), &flat(&back(op, shape, &y))))
 }
 
 fn no_negative_entries(all: &Made) -> Outcome {
     let mut coefficients = 0;
     if all.iter().any(|(_, basis)| basis.are_samples()) {
-        return Outcome::Skipped("coefficients are samples".into());
+        return skipped("coefficients are samples");
     }
     let complaint = all.iter().find_map(|(grid, basis)| {
         let shape = basis.coefficients().shape;
@@ -168,7 +157,7 @@ fn no_negative_entries(all: &Made) -> Outcome {
 /// Coefficients that are samples fill the same box, preserve constants, and change nothing if the grids are equal.
 fn samples(all: &Made, close: f64) -> Outcome {
     if !all.iter().any(|(_, basis)| basis.are_samples()) {
-        return Outcome::Skipped("coefficients are none".into());
+        return skipped("coefficients are none");
     }
     let complaint = all.iter().find_map(|(grid, basis)| {
         let at = basis.coefficients();
@@ -187,7 +176,7 @@ fn samples(all: &Made, close: f64) -> Outcome {
     settle(complaint, "coefficients are values of the volume")
 }
 
-fn threads(all: &Made) -> Outcome {
+fn threads(all: &Made) -> Option<String> {
     let both = || -> Vec<f32> {
         let of = |(grid, basis): &(VoxelGrid, Box<dyn Expansion>)| {
             let shape = basis.coefficients().shape;
@@ -196,6 +185,5 @@ fn threads(all: &Made) -> Outcome {
         };
         all.iter().flat_map(of).collect()
     };
-    let complaint = on_threads(both, |n, a, b| differing(&format!("{n}, number"), a, b));
-    settle(complaint, "1 and 3 threads")
+    on_threads(both, |n, a, b| differing(&format!("{n}, number"), a, b))
 }

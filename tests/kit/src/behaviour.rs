@@ -1,6 +1,8 @@
 //! Behaviour of a stage with its inputs: sizes, buffers, threads, extreme numbers.
 
-use crate::call::{Before, Guarded, Loaded, Subject, differing, error, rows_of, settle, within};
+use crate::call::{
+    Before, Guarded, Loaded, Subject, differing, error, none, require, rows_of, settle, skipped, within,
+};
 use crate::{Options, Outcome};
 use conefield_core::arena::{Block, Layout, Weights};
 use conefield_core::stage::{Backward, GradKind, Grads, Tile, TileMut};
@@ -12,42 +14,34 @@ const ROWS: usize = 301;
 /// Counts and kinds are consistent, and an identity stage is one.
 pub fn info(of: &Subject<'_>) -> Outcome {
     let info = of.stage.info();
-    let complaint = if info.input == 0 || info.output == 0 {
-        Some(format!("{} channels in, {} out", info.input, info.output))
-    } else if (info.params == 0) != (info.grads == GradKind::None) {
-        Some(format!("{} parameters with gradients {:?}", info.params, info.grads))
-    } else if info.grads == GradKind::Scatter && info.tape > 0 {
-        Some(format!("scattered gradients and a tape of {}", info.tape))
-    } else if info.identity {
+    let channels = info.input > 0 && info.output > 0;
+    require(channels, || format!("{} channels in, {} out", info.input, info.output))?;
+    let right = (info.params == 0) == (info.grads == GradKind::None);
+    require(right, || format!("{} parameters with gradients {:?}", info.params, info.grads))?;
+    let right = info.grads != GradKind::Scatter || info.tape == 0;
+    require(right, || format!("scattered gradients and a tape of {}", info.tape))?;
+    if info.identity {
         let (x, _) = of.single().data(9);
         let [y, _] = of.single().forward(&x, 9);
-        differing("an identity's output", &y, &x)
-    } else {
-        None
-    };
-    settle(complaint, &format!("{} to {} channels, {} parameters", info.input, info.output, info.params))
+        none(differing("an identity's output", &y, &x))?;
+    }
+    Ok(format!("{} to {} channels, {} parameters", info.input, info.output, info.params))
 }
 
 /// Blocks are consecutive, cover all parameters and have unique names.
 pub fn parameters(of: &Subject<'_>) -> Outcome {
     let mut names = BTreeSet::new();
     let mut end = 0;
-    let mut complaint = None;
     for p in of.stage.parameters() {
         let r = p.range();
-        if r.start != end {
-            complaint = complaint.or(Some(format!("{} starts at {}, the block before ends at {end}", p.name, r.start)));
-        }
-        if p.name.is_empty() || !names.insert(p.name.clone()) {
-            complaint = complaint.or(Some(format!("a block is called {:?} as another one", p.name)));
-        }
+        require(r.start == end, || format!("{} starts at {}, the block before ends at {end}", p.name, r.start))?;
+        let fresh = !p.name.is_empty() && names.insert(p.name.clone());
+        require(fresh, || format!("a block is called {:?} as another one", p.name))?;
         end = r.end;
     }
     let total = of.stage.info().params;
-    if end != total {
-        complaint = complaint.or(Some(format!("blocks hold {end} parameters, info says {total}")));
-    }
-    settle(complaint, &format!("{} blocks", names.len()))
+    require(end == total, || format!("blocks hold {end} parameters, info says {total}"))?;
+    Ok(format!("{} blocks", names.len()))
 }
 
 /// Initial parameters are finite, complete and repeatable.
@@ -70,21 +64,18 @@ pub fn tile_outputs(of: &Subject<'_>) -> Outcome {
             let n = size.min(ROWS - at);
             let (x, dy) = (rows_of(&x, ROWS, at, n), rows_of(&dy, ROWS, at, n));
             let [part, _, part_dx] = s.pass(&x, &dy, n);
-            let what = format!("tiles of {size}, from row {at}: ");
-            let complaint = differing(&(what.clone() + "output"), &part, &rows_of(&y, ROWS, at, n))
-                .or_else(|| differing(&(what + "input gradient"), &part_dx, &rows_of(&dx, ROWS, at, n)));
-            if complaint.is_some() {
-                return settle(complaint, "");
-            }
+            let what = |of: &str| format!("tiles of {size}, from row {at}: {of}");
+            none(differing(&what("output"), &part, &rows_of(&y, ROWS, at, n)))?;
+            none(differing(&what("input gradient"), &part_dx, &rows_of(&dx, ROWS, at, n)))?;
         }
     }
-    Outcome::Passed("1, 7, 64 and 256 rows give the bits of one tile".into())
+    Ok("1, 7, 64 and 256 rows give the bits of one tile".into())
 }
 
 /// The kernel for points off any ray treats each row as a ray of one sample.
 pub fn points(of: &Subject<'_>) -> Outcome {
     let s = of.single();
-    let Some(kernel) = s.kernel.points() else { return Outcome::Skipped("none".into()) };
+    let Some(kernel) = s.kernel.points() else { return skipped("none") };
     let n = 37;
     let (x, dy) = s.data(n);
     let [y, grads, dx] = Loaded { kernel, ..s.clone() }.pass(&x, &dy, n);
@@ -92,11 +83,8 @@ pub fn points(of: &Subject<'_>) -> Outcome {
     for i in 0..n {
         let (x, dy) = (rows_of(&x, n, i, 1), rows_of(&dy, n, i, 1));
         let [one, one_grads, one_dx] = s.pass(&x, &dy, 1);
-        let complaint = differing(&format!("row {i}: output"), &rows_of(&y, n, i, 1), &one)
-            .or_else(|| differing(&format!("row {i}: input gradient"), &rows_of(&dx, n, i, 1), &one_dx));
-        if complaint.is_some() {
-            return settle(complaint, "");
-        }
+        none(differing(&format!("row {i}: output"), &rows_of(&y, n, i, 1), &one))?;
+        none(differing(&format!("row {i}: input gradient"), &rows_of(&dx, n, i, 1), &one_dx))?;
         sum.iter_mut().zip(one_grads).for_each(|(s, g)| *s += f64::from(g));
     }
     within("rows give the bits of single ones; sums of gradients", error(&grads, &sum), 1e-5)
@@ -108,11 +96,9 @@ pub fn passes(of: &Subject<'_>) -> Outcome {
     let n = 37;
     let (x, _) = s.data(n);
     let (whole, parts) = (s.forward(&x, n), s.forward_in_passes(&x, n));
-    let complaint = differing("in passes, output", &parts[0], &whole[0]);
-    settle(
-        complaint.or_else(|| differing("in passes, tape", &parts[1], &whole[1])),
-        &format!("{}, together the bits of forward", s.kernel.passes()),
-    )
+    none(differing("in passes, output", &parts[0], &whole[0]))?;
+    none(differing("in passes, tape", &parts[1], &whole[1]))?;
+    Ok(format!("{}, together the bits of forward", s.kernel.passes()))
 }
 
 /// Gradients do not depend on the split into tiles, except for rounding.
@@ -152,9 +138,7 @@ pub fn gradients_add(of: &Subject<'_>) -> Outcome {
     let run = |grads, dx| s.backward(&x, &dy, n, 0..s.info.params, Before { grads, dx });
     let [_, plain, _] = run(0.0, Some(0.0));
     let [_, alone, _] = run(0.0, None);
-    if let Some(complaint) = differing("without an input gradient, gradient", &alone, &plain) {
-        return Outcome::Failed(complaint);
-    }
+    none(differing("without an input gradient, gradient", &alone, &plain))?;
     let start = plain.iter().fold(1.0f32, |m, g| m.max(g.abs()));
     let [_, added, _] = run(start, Some(0.0));
     let want: Vec<f64> = plain.iter().map(|&g| f64::from(start) + f64::from(g)).collect();
@@ -169,8 +153,9 @@ pub fn input_gradient_overwrites(of: &Subject<'_>) -> Outcome {
     let run = |dx| s.backward(&x, &dy, n, 0..s.info.params, Before { grads: 0.0, dx: Some(dx) });
     let [[.., clean], [.., seven], [.., nan]] = [0.0, 7.0, f32::NAN].map(run);
     let hole = nan.iter().position(|v| v.is_nan()).map(|i| format!("input gradient {i} was not written"));
-    let complaint = hole.or_else(|| differing("over 7, input gradient", &seven, &clean));
-    settle(complaint.or_else(|| differing("over NaN, input gradient", &nan, &clean)), "nothing of before is left")
+    none(hole)?;
+    none(differing("over 7, input gradient", &seven, &clean))?;
+    settle(differing("over NaN, input gradient", &nan, &clean), "nothing of before is left")
 }
 
 /// Ranges are disjoint and cover every parameter.
@@ -180,13 +165,11 @@ pub fn partition(of: &Subject<'_>) -> Outcome {
     ranges.sort_by_key(|r| r.start);
     let mut end = 0;
     for r in &ranges {
-        if r.start != end || r.end <= r.start {
-            return Outcome::Failed(format!("{r:?} follows on {end}"));
-        }
+        require(r.start == end && r.end > r.start, || format!("{r:?} follows on {end}"))?;
         end = r.end;
     }
-    let complaint = (end != params).then(|| format!("ranges end at {end} of {params}"));
-    settle(complaint, &format!("{} ranges", ranges.len()))
+    require(end == params, || format!("ranges end at {end} of {params}"))?;
+    Ok(format!("{} ranges", ranges.len()))
 }
 
 /// A range's gradients are bit-identical to that part of all gradients.
@@ -198,11 +181,9 @@ pub fn partition_gradients(of: &Subject<'_>) -> Outcome {
     for r in &ranges {
         let before = Before { grads: 0.0, dx: None };
         let [_, part, _] = s.backward(&x, &dy, ROWS, r.clone(), before);
-        if let Some(complaint) = differing(&format!("range {r:?}, gradient"), &part, &all[r.clone()]) {
-            return Outcome::Failed(complaint);
-        }
+        none(differing(&format!("range {r:?}, gradient"), &part, &all[r.clone()]))?;
     }
-    Outcome::Passed(format!("{} ranges", ranges.len()))
+    Ok(format!("{} ranges", ranges.len()))
 }
 
 /// Nothing outside the buffers is written, and inputs stay unchanged.
@@ -231,18 +212,14 @@ pub fn guards(of: &Subject<'_>) -> Outcome {
                 .or_else(|| tape.broken("tape"))
                 .or_else(|| grads.broken("gradients"))
                 .or_else(|| dx.broken("input gradient"));
-            if let Some(complaint) = complaint {
-                return Outcome::Failed(format!("{n} rows, {complaint}"));
-            }
+            none(complaint.map(|complaint| format!("{n} rows, {complaint}")))?;
         }
         let changed = differing("changed: parameter", &s.params, &p1)
             .or_else(|| differing("changed: input", &x, &x1))
             .or_else(|| differing("changed: output gradient", &dy, &dy1));
-        if let Some(changed) = changed {
-            return Outcome::Failed(format!("{n} rows, {changed}"));
-        }
+        none(changed.map(|changed| format!("{n} rows, {changed}")))?;
     }
-    Outcome::Passed("on either side of every buffer".into())
+    Ok("on either side of every buffer".into())
 }
 
 /// Concurrent calls from several threads are bit-identical to a single call.
@@ -336,11 +313,8 @@ pub fn poison(of: &Subject<'_>) -> Outcome {
         [keep(y), keep(dx)]
     };
     let ([y, dx], [y0, dx0]) = (pure(&x), pure(&clean));
-    let complaint = differing("beside a poisoned row, output", &y, &y0);
-    settle(
-        complaint.or_else(|| differing("beside a poisoned row, input gradient", &dx, &dx0)),
-        "NaN and infinities stay in their rows",
-    )
+    none(differing("beside a poisoned row, output", &y, &y0))?;
+    settle(differing("beside a poisoned row, input gradient", &dx, &dx0), "NaN and infinities stay in their rows")
 }
 
 /// Parameters are restored by name.
@@ -354,11 +328,7 @@ pub fn save_and_load(of: &Subject<'_>) -> Outcome {
     let layout = Layout { blocks: of.stage.parameters().into_iter().map(block).collect() };
     let saved = Weights::from_arena(&layout, p, |_| true);
     let mut back = vec![f32::NAN; p.len()];
-    match saved.load("conformance", &layout, &mut back, |_| true) {
-        Err(e) => Outcome::Failed(e.to_string()),
-        Ok(report) => {
-            let unused = report.unused.first().map(|u| format!("{} was not loaded", u.0));
-            settle(unused.or_else(|| differing("parameter", &back, p)), &format!("{} tensors", report.loaded.len()))
-        }
-    }
+    let report = saved.load("conformance", &layout, &mut back, |_| true)?;
+    none(report.unused.first().map(|u| format!("{} was not loaded", u.0)))?;
+    settle(differing("parameter", &back, p), &format!("{} tensors", report.loaded.len()))
 }

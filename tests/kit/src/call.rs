@@ -1,7 +1,6 @@
 //! Calls of a stage's kernels on random data, and comparisons.
 
-use crate::{Options, Outcome};
-use conefield_core::error::Result;
+use crate::{Options, Outcome, Unmet};
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Backward, Grads, Info, Kernel, Stage, Tile, TileMut};
@@ -227,13 +226,37 @@ pub fn error<A: Real, B: Real>(a: &[A], b: &[B]) -> f64 {
 
 /// The outcome of a comparison.
 pub fn within(what: &str, found: f64, limit: f64) -> Outcome {
-    let text = format!("{what}: error {found:.1e}, limit {limit:.0e}");
-    if found <= limit { Outcome::Passed(text) } else { Outcome::Failed(text) }
+    held(found <= limit, format!("{what}: error {found:.1e}, limit {limit:.0e}"))
+}
+
+/// Passed or failed with this text.
+pub fn held(holds: bool, text: String) -> Outcome {
+    if holds { Ok(text) } else { failed(text) }
+}
+
+/// Failed, with the finding.
+pub fn failed<T>(what: impl Into<String>) -> Result<T, Unmet> {
+    Err(Unmet::Failed(what.into()))
+}
+
+/// Not applicable, with the reason.
+pub fn skipped(why: impl Into<String>) -> Outcome {
+    Err(Unmet::Skipped(why.into()))
+}
+
+/// Fails with the complaint, if there is one.
+pub fn none(complaint: Option<String>) -> Result<(), Unmet> {
+    complaint.map_or(Ok(()), failed)
 }
 
 /// Failed with the complaint, or passed without one.
 pub fn settle(complaint: Option<String>, fine: &str) -> Outcome {
-    complaint.map_or_else(|| Outcome::Passed(fine.into()), Outcome::Failed)
+    none(complaint).map(|()| fine.into())
+}
+
+/// Fails unless it holds.
+pub fn require(holds: bool, why: impl FnOnce() -> String) -> Result<(), Unmet> {
+    none((!holds).then(why))
 }
 
 /// The first difference between the results of `run` on one and on three threads and here; `differ` gets a word of where,
@@ -252,6 +275,6 @@ pub fn on_threads<T: Send>(
 }
 
 /// Passed if no function reported a fault.
-pub fn no_fault(fault: Result<()>) -> Outcome {
+pub fn no_fault(fault: conefield_core::Result<()>) -> Outcome {
     settle(fault.err().map(|e| e.to_string()), "none was reported")
 }

@@ -1,13 +1,16 @@
 //! Stages reduced to some of their channels.
 
-use crate::call::{Loaded, channels_of, differing, error};
-use crate::{Options, Outcome, check};
-use conefield_core::error::{Error, Result};
-use conefield_core::stage::{Encoder, Field, Normalizer, Stage};
+use crate::call::{Loaded, channels_of, differing, error, none, require, skipped};
+use crate::{Options, Outcome, Unmet, check};
+use conefield_core::error::Error;
+use conefield_core::stage::{Encoder, Field, Normalizer, Reduced, Stage};
 use std::collections::BTreeSet;
 use std::ops::Range;
 
 const ROWS: usize = 37;
+
+/// Nothing, or what is wrong.
+type Checked = Result<(), Unmet>;
 
 /// Some channels of `n`: all, all but the last, the first, the last, every second one.
 fn choices(n: usize) -> Vec<Vec<usize>> {
@@ -31,23 +34,20 @@ fn gather(ranges: &[Range<usize>], params: &[f32]) -> Vec<f32> {
 }
 
 /// Properties of every reduced stage: its counts are consistent, and its names are unchanged.
-fn counts(full: &dyn Stage, small: &dyn Stage, params: &[Range<usize>], input: usize, output: usize) -> Option<String> {
+fn counts(full: &dyn Stage, small: &dyn Stage, params: &[Range<usize>], input: usize, output: usize) -> Checked {
     let (info, params) = (small.info(), params.iter().map(Range::len).sum::<usize>());
     let names: BTreeSet<String> = full.parameters().into_iter().map(|p| p.name).collect();
     let new = small.parameters().into_iter().find(|p| !names.contains(&p.name));
-    if info.input != input || info.output != output {
-        Some(format!("{} to {} channels instead of {input} to {output}", info.input, info.output))
-    } else if info.params != params {
-        Some(format!("{} parameters, {params} were kept", info.params))
-    } else {
-        new.map(|p| format!("a block has the new name {}", p.name))
-    }
+    let channels = || format!("{} to {} channels instead of {input} to {output}", info.input, info.output);
+    require(info.input == input && info.output == output, channels)?;
+    require(info.params == params, || format!("{} parameters, {params} were kept", info.params))?;
+    none(new.map(|p| format!("a block has the new name {}", p.name)))
 }
 
 /// Runs the kit on a reduced stage.
-fn whole(stage: &dyn Stage, options: &Options) -> Option<String> {
+fn whole(stage: &dyn Stage, options: &Options) -> Checked {
     let report = check(stage, options);
-    (!report.passed()).then(|| format!("the smaller stage fails {:?}:\n{report}", report.failed()))
+    require(report.passed(), || format!("the smaller stage fails {:?}:\n{report}", report.failed()))
 }
 
 /// A stage with its parameters, and the smaller one with those `ranges` of them.
@@ -70,10 +70,8 @@ fn same_outputs(
     inputs: &[usize],
     keep: &[usize],
     options: &Options,
-) -> Option<String> {
-    if let Some(complaint) = counts(full, small, ranges, inputs.len(), keep.len()) {
-        return Some(complaint);
-    }
+) -> Checked {
+    counts(full, small, ranges, inputs.len(), keep.len())?;
     let (full, small) = pair(full, small, ranges, options);
     let (x, mut dy) = full.data(ROWS);
     for c in (0..full.info.output).filter(|c| !keep.contains(c)) {
@@ -81,101 +79,90 @@ fn same_outputs(
     }
     let (x1, dy1) = (channels_of(&x, ROWS, inputs), channels_of(&dy, ROWS, keep));
     let ([y, g, dx], [y1, g1, dx1]) = (full.pass(&x, &dy, ROWS), small.pass(&x1, &dy1, ROWS));
-    if let Some(complaint) = differing("output", &y1, &channels_of(&y, ROWS, keep)) {
-        return Some(complaint);
-    }
+    none(differing("output", &y1, &channels_of(&y, ROWS, keep)))?;
     let e = error(&g1, &gather(ranges, &g)).max(error(&dx1, &channels_of(&dx, ROWS, inputs)));
-    (e > ROUNDING).then(|| format!("gradients are off by {e:.1e}"))
+    require(e <= ROUNDING, || format!("gradients are off by {e:.1e}"))
 }
 
-fn each(n: usize, mut one: impl FnMut(&[usize]) -> Result<Option<String>>) -> Outcome {
+/// Calls `one` with each choice of `n` channels.
+fn each(n: usize, mut one: impl FnMut(&[usize]) -> Checked) -> Outcome {
     let all = choices(n);
     for keep in &all {
-        match one(keep) {
-            Ok(None) => {}
-            Ok(Some(complaint)) => return Outcome::Failed(format!("keeping {keep:?}: {complaint}")),
-            Err(e) if e.to_string().is_empty() => return Outcome::Failed("refused with an empty message".into()),
-            Err(e @ Error::Unsupported { .. }) => return Outcome::Skipped(e.to_string()),
-            Err(e) => return Outcome::Failed(format!("keeping {keep:?}: {e}")),
-        }
+        one(keep).map_err(|unmet| unmet.at(format!("keeping {keep:?}")))?;
     }
-    Outcome::Passed(format!("{} choices", all.len()))
+    Ok(format!("{} choices", all.len()))
+}
+
+/// The reduced stage. One that cannot be reduced has no such property, and says so.
+fn reduced<S: ?Sized>(found: Result<Reduced<S>, Error>) -> Result<Reduced<S>, Unmet> {
+    found.map_err(|e| match (e.to_string(), e) {
+        (why, _) if why.is_empty() => Unmet::Failed("refused with an empty message".into()),
+        (why, Error::Unsupported { .. }) => Unmet::Skipped(why),
+        (why, _) => Unmet::Failed(why),
+    })
 }
 
 /// An encoder with fewer outputs.
 pub fn encoder_outputs(stage: &dyn Encoder, options: &Options) -> Outcome {
     let n = stage.info().output;
     each(n, |keep| {
-        let r = stage.keep_outputs(keep)?;
-        let mut complaint = same_outputs(stage, r.stage.as_ref(), &r.params, &r.channels, keep, options);
+        let r = reduced(stage.keep_outputs(keep))?;
+        let first = r.stage.as_ref();
+        same_outputs(stage, first, &r.params, &r.channels, keep, options)?;
         // Removing channels in two steps equals removing them at once.
-        if complaint.is_none() && keep.len() > 1 {
-            let again: Vec<usize> = (0..keep.len()).skip(1).step_by(2).collect();
-            let second = r.stage.keep_outputs(&again)?;
-            complaint = same_outputs(
-                r.stage.as_ref(),
-                second.stage.as_ref(),
-                &second.params,
-                &second.channels,
-                &again,
-                options,
-            )
-            .or_else(|| whole(second.stage.as_ref(), options))
-            .map(|c| format!("then {again:?}: {c}"));
+        let again: Vec<usize> = (0..keep.len()).skip(1).step_by(2).collect();
+        if again.is_empty() {
+            return Ok(());
         }
-        Ok(complaint)
+        let r = reduced(first.keep_outputs(&again))?;
+        let second = r.stage.as_ref();
+        let same = same_outputs(first, second, &r.params, &r.channels, &again, options);
+        same.and_then(|()| whole(second, options)).map_err(|unmet| unmet.at(format!("then {again:?}")))
     })
 }
 
 /// Resolutions of channels: one number each, the same for that channel in a reduced encoder.
 pub fn resolutions(stage: &dyn Encoder) -> Outcome {
     let Some(cells) = stage.resolutions() else {
-        return Outcome::Skipped("it does not say how fine its channels are".into());
+        return skipped("it does not say how fine its channels are");
     };
     let n = stage.info().output;
-    if cells.len() != n {
-        return Outcome::Failed(format!("{} numbers for {n} channels", cells.len()));
-    }
-    if let Some(c) = cells.iter().position(|v| !(v.is_finite() && *v > 0.0)) {
-        return Outcome::Failed(format!("channel {c} resolves {} cells", cells[c]));
-    }
-    if stage.coarse_to_fine() && !cells.is_sorted() {
-        return Outcome::Failed(format!("channels stand from coarse to fine, their cells do not: {cells:?}"));
-    }
+    require(cells.len() == n, || format!("{} numbers for {n} channels", cells.len()))?;
+    let wrong = cells.iter().position(|v| !(v.is_finite() && *v > 0.0));
+    none(wrong.map(|c| format!("channel {c} resolves {} cells", cells[c])))?;
+    let ordered = !stage.coarse_to_fine() || cells.is_sorted();
+    require(ordered, || format!("channels stand from coarse to fine, their cells do not: {cells:?}"))?;
     for keep in choices(n) {
         // Whether it can remove channels is a separate property.
         let Ok(smaller) = stage.keep_outputs(&keep) else { continue };
         let want: Vec<f64> = keep.iter().map(|&c| cells[c]).collect();
         let found = smaller.stage.resolutions();
-        if found.as_ref() != Some(&want) {
-            return Outcome::Failed(format!("keeping {keep:?}: {found:?} instead of {want:?}"));
-        }
+        require(found.as_ref() == Some(&want), || format!("keeping {keep:?}: {found:?} instead of {want:?}"))?;
     }
     let range = [f64::INFINITY, 0.0];
     let [low, high] = cells.iter().fold(range, |[a, b], &v| [a.min(v), b.max(v)]);
-    Outcome::Passed(format!("{low} to {high} cells along the cube's side"))
+    Ok(format!("{low} to {high} cells along the cube's side"))
 }
 
 /// Runs the kit on a stage with some of `n` inputs. With all of them its outputs are compared, and the kit is not run again.
-fn some(n: usize, stage: &dyn Stage, options: &Options) -> Option<String> {
-    if stage.info().input < n { whole(stage, options) } else { None }
+fn some(n: usize, stage: &dyn Stage, options: &Options) -> Checked {
+    if stage.info().input < n { whole(stage, options) } else { Ok(()) }
 }
 
 /// A normalizer with fewer inputs is a reduced stage of the same kind.
 pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
     let info = stage.info();
     each(info.input, |keep| {
-        let r = stage.keep_inputs(keep)?;
+        let r = reduced(stage.keep_inputs(keep))?;
         let small: &dyn Stage = r.stage.as_ref();
         let outputs = &r.channels;
-        if !outputs.is_sorted_by(|a, b| a < b) || outputs.last().is_some_and(|&c| c >= info.output) {
-            return Ok(Some(format!("outputs {outputs:?} of {}", info.output)));
+        let rising = outputs.is_sorted_by(|a, b| a < b) && outputs.last().is_none_or(|&c| c < info.output);
+        require(rising, || format!("outputs {outputs:?} of {}", info.output))?;
+        counts(stage, small, &r.params, keep.len(), outputs.len())?;
+        if keep.len() == info.input {
+            same_outputs(stage, small, &r.params, keep, outputs, options)?;
         }
-        let mut complaint = counts(stage, small, &r.params, keep.len(), outputs.len());
-        if complaint.is_none() && keep.len() == info.input {
-            complaint = same_outputs(stage, small, &r.params, keep, outputs, options);
-        }
-        Ok(complaint.or_else(|| some(info.input, small, options)))
+        some(info.input, small, options)
     })
 }
 
@@ -183,11 +170,9 @@ pub fn normalizer_inputs(stage: &dyn Normalizer, options: &Options) -> Outcome {
 pub fn field_inputs(stage: &dyn Field, options: &Options) -> Outcome {
     let info = stage.info();
     each(info.input, |keep| {
-        let r = stage.keep_inputs(keep)?;
+        let r = reduced(stage.keep_inputs(keep))?;
         let small: &dyn Stage = r.stage.as_ref();
-        if let Some(c) = counts(stage, small, &r.params, keep.len(), info.output) {
-            return Ok(Some(c));
-        }
+        counts(stage, small, &r.params, keep.len(), info.output)?;
         let (full, less) = pair(stage, small, &r.params, options);
         let (mut x, dy) = full.data(ROWS);
         for c in (0..info.input).filter(|c| !keep.contains(c)) {
@@ -196,6 +181,7 @@ pub fn field_inputs(stage: &dyn Field, options: &Options) -> Outcome {
         let x1 = channels_of(&x, ROWS, keep);
         let ([y, g, dx], [y1, g1, dx1]) = (full.pass(&x, &dy, ROWS), less.pass(&x1, &dy, ROWS));
         let e = error(&y1, &y).max(error(&g1, &gather(&r.params, &g))).max(error(&dx1, &channels_of(&dx, ROWS, keep)));
-        Ok((e > ROUNDING).then(|| format!("off by {e:.1e}")).or_else(|| some(info.input, small, options)))
+        require(e <= ROUNDING, || format!("off by {e:.1e}"))?;
+        some(info.input, small, options)
     })
 }

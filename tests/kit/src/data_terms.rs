@@ -22,21 +22,20 @@ pub fn check_data_term(term: &dyn DataTerm) -> Report {
     let mut report = Report::of(term.describe());
     let scan = scan();
     let of = match term.of(scan.view()) {
-        Ok(of) => On { of, measured: scan },
+        Ok(of) => &On { of, measured: scan },
         Err(e) => {
-            report.add("learns from a scan", || Outcome::Failed(e.to_string()));
+            report.add("learns from a scan", || Err(e.into()));
             return report;
         }
     };
-    let of = &of;
     report.add("finite differences", || differences(of));
     report.add("curvature", || curvature(of));
     report.add("least where nothing is left", || least(of));
-    report.add("views stand alone", || views_stand_alone(of));
+    report.holds("views stand alone", "alone, together, turned round and repeated", || views_stand_alone(of));
     report.add("noise", || sigma(of));
     report.add("spread of noise", || spread(of));
-    report.add("finite", || finite(term));
-    report.add("threads", || threads(of));
+    report.holds("finite", "nothing, a pixel, large values", || finite(term));
+    report.holds("threads", "1 and 3 threads", || threads(of));
     report.add("no fault", || no_fault(of.of.fault()));
     report
 }
@@ -171,9 +170,9 @@ fn least(of: &On) -> Outcome {
     settle(steep.or(complaint), "no residuals, least value")
 }
 
-fn views_stand_alone(of: &On) -> Outcome {
+fn views_stand_alone(of: &On) -> Option<String> {
     let r = noise::<f32>([3, 24, 40], 5);
-    let complaint = [vec![2, 0], vec![1], vec![0, 1, 2], vec![1, 1]].into_iter().find_map(|views| {
+    [vec![2, 0], vec![1], vec![0, 1, 2], vec![1, 1]].into_iter().find_map(|views| {
         let (value, all) = at(of, &views, &r.select(Axis(0), &views));
         let mut sum = 0.0;
         let wrong = views.iter().enumerate().find_map(|(i, &v)| {
@@ -185,8 +184,7 @@ fn views_stand_alone(of: &On) -> Outcome {
         });
         let apart = (value - sum).abs() > 1e-9 * sum.abs();
         wrong.or_else(|| apart.then(|| format!("views {views:?}: {value} together, {sum} one by one")))
-    });
-    settle(complaint, "alone, together, turned round and repeated")
+    })
 }
 
 /// The noise is found, either of line integrals near 0 or on average over all of them.
@@ -209,8 +207,8 @@ fn spread(of: &On) -> Outcome {
 }
 
 /// Scans without noise, empty scans, and scans of a single pixel.
-fn finite(term: &dyn DataTerm) -> Outcome {
-    let complaint = [0.0f32, 1e-30, 1.0, 1e4].into_iter().find_map(|value| {
+fn finite(term: &dyn DataTerm) -> Option<String> {
+    [0.0f32, 1e-30, 1.0, 1e4].into_iter().find_map(|value| {
         [[24, 40], [1, 1], [1, 7], [7, 1]].into_iter().find_map(|[rows, columns]| {
             let measured = Array3::from_elem((3, rows, columns), value);
             let of = match term.of(measured.view()) {
@@ -224,15 +222,13 @@ fn finite(term: &dyn DataTerm) -> Outcome {
                 found.is_finite() && of.of.noise().is_finite() && numbers.iter().flatten().all(|x| x.is_finite());
             (!fine).then(|| format!("{rows} x {columns} pixels of {value:e}"))
         })
-    });
-    settle(complaint, "nothing, a pixel, large values")
+    })
 }
 
-fn threads(of: &On) -> Outcome {
+fn threads(of: &On) -> Option<String> {
     let run = || at(of, &ALL, &noise([3, 24, 40], 6));
-    let complaint = on_threads(run, |n, (value, found), (want, wanted)| {
+    on_threads(run, |n, (value, found), (want, wanted)| {
         let other = (value != want).then(|| format!("{n}: {value} instead of {want}"));
         other.or_else(|| differing(&format!("{n}, pixel"), &flat(found), &flat(wanted)))
-    });
-    settle(complaint, "1 and 3 threads")
+    })
 }

@@ -1,7 +1,7 @@
 //! Backward against differences of forward, and single against double precision.
 
-use crate::call::{Draw, Loaded, Subject, error, within};
-use crate::{Options, Outcome};
+use crate::call::{Draw, Loaded, Subject, error, failed, require, skipped, within};
+use crate::{Options, Outcome, Unmet};
 use conefield_core::simd::Real;
 use conefield_core::stage::Scope;
 
@@ -86,13 +86,12 @@ pub fn parameters(of: &Subject<'_>) -> Outcome {
 }
 
 /// The outcome of a stage whose differences are in single precision.
-fn coarse(outcome: Outcome) -> Outcome {
-    match outcome {
-        Outcome::Failed(what) => Outcome::Failed(format!(
-            "{what}, in single precision: a kink or a high frequency may cause this; kernels in double precision settle it"
-        )),
-        other => other,
-    }
+fn coarse(found: Outcome) -> Outcome {
+    let may = "a kink or a high frequency may cause this; kernels in double precision settle it";
+    found.map_err(|unmet| match unmet {
+        Unmet::Failed(what) => Unmet::Failed(format!("{what}, in single precision: {may}")),
+        skipped => skipped,
+    })
 }
 
 fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
@@ -124,9 +123,7 @@ fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
         moved.params[i] = keep;
         let scale = g[i].f64().abs().max(want.abs()) + 1e-2 * largest + 1e-9;
         let e = (g[i].f64() - want).abs() / scale;
-        if e.is_nan() || e > tolerance {
-            return Outcome::Failed(format!("parameter {i}: gradient {:e}, differences {want:e}", g[i].f64()));
-        }
+        require(e <= tolerance, || format!("parameter {i}: gradient {:e}, differences {want:e}", g[i].f64()))?;
         worst = worst.max(e);
     }
     for direction in 0..DIRECTIONS {
@@ -143,13 +140,11 @@ fn parameters_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
         let found: f64 = g.iter().zip(&v).map(|(g, v)| g.f64() * v).sum();
         let norm = g.iter().map(|g| g.f64() * g.f64()).sum::<f64>().sqrt();
         let e = (found - want).abs() / (found.abs().max(want.abs()) + 1e-2 * norm + 1e-9);
-        if e.is_nan() || e > tolerance {
-            return Outcome::Failed(format!("direction {direction}: gradient {found:e}, differences {want:e}"));
-        }
+        require(e <= tolerance, || format!("direction {direction}: gradient {found:e}, differences {want:e}"))?;
         worst = worst.max(e);
     }
     let n = chosen.len();
-    Outcome::Passed(format!("{n} of {} and {DIRECTIONS} directions, worst error {worst:.1e}", info.params))
+    Ok(format!("{n} of {} and {DIRECTIONS} directions, worst error {worst:.1e}", info.params))
 }
 
 /// The gradient of every input.
@@ -179,22 +174,17 @@ fn inputs_in<R: Real>(of: &Loaded<'_, R>) -> Outcome {
         let scale = dx[i].f64().abs().max(want.abs()) + 1e-2 * largest + 1e-9;
         let difference = (dx[i].f64() - want).abs();
         let e = if difference <= rounding { 0.0 } else { difference / scale };
-        if e.is_nan() || e > tolerance {
-            let (c, r) = (i / rows, i % rows);
-            return Outcome::Failed(format!(
-                "channel {c} of row {r}: gradient {:e}, differences {want:e}",
-                dx[i].f64()
-            ));
-        }
+        let (c, row, found) = (i / rows, i % rows, dx[i].f64());
+        require(e <= tolerance, || format!("channel {c} of row {row}: gradient {found:e}, differences {want:e}"))?;
         worst = worst.max(e);
     }
-    Outcome::Passed(format!("{} inputs, worst error {worst:.1e}", x.len().div_ceil(stride)))
+    Ok(format!("{} inputs, worst error {worst:.1e}", x.len().div_ceil(stride)))
 }
 
 pub fn no_rows<R: Real>() -> Outcome {
     let shortest = steps::<R>(&Options::encoder()).all.last().copied().unwrap_or_default();
     let text = format!("{NO_ROWS} over steps of {shortest:.0e}");
-    if size_of::<R>() == 8 { Outcome::Failed(text) } else { Outcome::Skipped(text) }
+    if size_of::<R>() == 8 { failed(text) } else { skipped(text) }
 }
 
 /// Inputs at which both precisions select the same cells and sides of kinks, and output gradients.
@@ -211,8 +201,7 @@ pub fn narrow(v: &[f64]) -> Vec<f32> {
 /// The outcome of a check that needs double precision, for a stage without. A plugin in C may have the functions and not
 /// declare them, and would see no other sign.
 pub fn no_double() -> Outcome {
-    let text = "no double precision (in C, info leaves double_precision 0: functions ending in _f64 are not called)";
-    Outcome::Skipped(text.into())
+    skipped("no double precision (in C, info leaves double_precision 0: functions ending in _f64 are not called)")
 }
 
 /// Calls `compare` with the reference, inputs and output gradients.

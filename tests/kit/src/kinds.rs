@@ -2,7 +2,7 @@
 
 use crate::losses::ready;
 use crate::{
-    Options, Outcome, Report, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
+    Options, Report, Unmet, check_basis, check_data_term, check_encoder, check_field, check_initializer, check_loss,
     check_loss_wgsl, check_normalizer, check_prior, check_prior_wgsl, check_projector, check_projector_wgsl,
     check_regularizer, check_voxel_projector, check_wgsl,
 };
@@ -26,7 +26,7 @@ pub struct With<'a> {
 impl With<'_> {
     /// Adds the check of a stage's WGSL to its report.
     fn on_device(&self, mut report: Report, has_wgsl: bool, check: impl FnOnce(&dyn Runner) -> Report) -> Report {
-        let skipped = |why: String| vec![("WGSL parity", Outcome::Skipped(why))];
+        let skipped = |why: String| vec![("WGSL parity", Err(Unmet::Skipped(why)))];
         report.entries.extend(match has_wgsl.then(|| (self.device)()) {
             None => skipped("the stage offers none".into()),
             Some(Err(why)) => skipped(why),
@@ -81,14 +81,19 @@ impl With<'static> {
 /// Numbers of input channels at which normalizers and fields are checked by default.
 pub const WIDTHS: [usize; 4] = [1, 3, 8, 20];
 
-/// Checks every stage type that the crate `package` registers, with the settings of its registration, for the tests of
-/// a plugin.
+/// Checks every stage type that the crate `package` registers, for the tests of a plugin: with the settings of its
+/// registration, and with the `examples` of its schema.
 pub fn check_package(package: &str) -> Result<Vec<Report>> {
     let mut reports = vec![];
     for t in stage_types() {
         if matches!(t.origin, Origin::Linked { package: own, .. } if own == package) {
-            let found = check_type(t.kind, &t.example(), &With::ON_THE_HOST)?;
-            reports.extend(found.into_iter().map(|(_, report)| report));
+            let mut tries = vec![t.example()];
+            tries.extend(t.schema()["examples"].as_array().into_iter().flatten().cloned());
+            for mut settings in tries {
+                settings["type"] = t.name.into();
+                let found = check_type(t.kind, &settings, &With::ON_THE_HOST)?;
+                reports.extend(found.into_iter().map(|(_, report)| report));
+            }
         }
     }
     ensure(!reports.is_empty(), package, "stages", "none", "at least one registered stage type")?;

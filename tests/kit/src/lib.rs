@@ -21,8 +21,11 @@ mod voxels;
 mod weights;
 mod wgsl;
 
-use call::Subject;
+use call::{Subject, failed, settle};
+use conefield_core::error::Error;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Scope, Stage};
+use serde::ser::{Serialize, SerializeStruct, Serializer};
+use serde_json::json;
 use std::fmt;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -69,15 +72,32 @@ impl Options {
     }
 }
 
-/// The outcome of a property check.
+/// The outcome of a property check: the evidence that it holds, or why it is not met.
+pub type Outcome = Result<String, Unmet>;
+
+/// Why a property is not met.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Outcome {
-    /// It holds, with the evidence.
-    Passed(String),
+pub enum Unmet {
     /// It does not hold, with the finding.
     Failed(String),
     /// It does not apply, with the reason.
     Skipped(String),
+}
+
+impl Unmet {
+    /// The same, with where or when before the finding.
+    fn at(self, place: String) -> Self {
+        match self {
+            Self::Failed(what) => Self::Failed(format!("{place}: {what}")),
+            skipped => skipped,
+        }
+    }
+}
+
+impl From<Error> for Unmet {
+    fn from(e: Error) -> Self {
+        Self::Failed(e.to_string())
+    }
 }
 
 /// The outcomes of all property checks of a stage, in order.
@@ -96,7 +116,7 @@ impl Report {
 
     /// Names of the violated properties.
     pub fn failed(&self) -> Vec<&'static str> {
-        self.entries.iter().filter(|(_, o)| matches!(o, Outcome::Failed(_))).map(|(n, _)| *n).collect()
+        self.entries.iter().filter(|(_, o)| matches!(o, Err(Unmet::Failed(_)))).map(|(n, _)| *n).collect()
     }
 
     /// Whether every property that applies holds.
@@ -104,25 +124,46 @@ impl Report {
         self.failed().is_empty()
     }
 
+    /// Each property with its outcome in a word, and the evidence, finding or reason.
+    pub fn properties(&self) -> impl Iterator<Item = (&'static str, &'static str, &str)> {
+        self.entries.iter().map(|(name, outcome)| match outcome {
+            Ok(text) => (*name, "passed", text.as_str()),
+            Err(Unmet::Failed(text)) => (*name, "failed", text.as_str()),
+            Err(Unmet::Skipped(text)) => (*name, "skipped", text.as_str()),
+        })
+    }
+
     fn add(&mut self, name: &'static str, property: impl FnOnce() -> Outcome) {
         let outcome = catch_unwind(AssertUnwindSafe(property)).unwrap_or_else(|panic| {
             let text = panic.downcast_ref::<String>().cloned();
             let text = text.or_else(|| panic.downcast_ref::<&str>().map(|s| s.to_string()));
-            Outcome::Failed(format!("panicked: {}", text.unwrap_or_default()))
+            failed(format!("panicked: {}", text.unwrap_or_default()))
         });
         self.entries.push((name, outcome));
+    }
+
+    /// Adds a property that holds without a complaint; `fine` is the evidence.
+    fn holds(&mut self, name: &'static str, fine: &str, complaint: impl FnOnce() -> Option<String>) {
+        self.add(name, || settle(complaint(), fine));
+    }
+}
+
+impl Serialize for Report {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        let property = |(name, outcome, text)| json!({ "name": name, "outcome": outcome, "text": text });
+        let mut table = to.serialize_struct("Report", 3)?;
+        table.serialize_field("stage", &self.stage)?;
+        table.serialize_field("properties", &self.properties().map(property).collect::<Vec<_>>())?;
+        table.serialize_field("passed", &self.passed())?;
+        table.end()
     }
 }
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}", self.stage)?;
-        for (name, outcome) in &self.entries {
-            let (word, text) = match outcome {
-                Outcome::Passed(t) => ("ok", t),
-                Outcome::Failed(t) => ("FAILED", t),
-                Outcome::Skipped(t) => ("skipped", t),
-            };
+        for (name, outcome, text) in self.properties() {
+            let word = if outcome == "failed" { "FAILED" } else { outcome };
             writeln!(f, "  {word:<8} {name:<34} {text}")?;
         }
         Ok(())
@@ -181,7 +222,7 @@ pub fn check(stage: &dyn Stage, options: &Options) -> Report {
     let of = Subject::new(stage, options);
     for (name, skipped, property) in PROPERTIES {
         report.add(name, || match skipped(&stage.info()) {
-            Some(why) => Outcome::Skipped(why.into()),
+            Some(why) => Err(Unmet::Skipped(why.into())),
             None => property(&of),
         });
     }

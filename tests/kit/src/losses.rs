@@ -1,6 +1,6 @@
 //! Properties of a loss: a correct derivative, a minimum where both values agree, behaviour for extreme numbers.
 
-use crate::call::{Draw, no_fault, settle, within};
+use crate::call::{Draw, no_fault, require, settle, skipped, within};
 use crate::gradients::slope;
 use crate::{Outcome, Report};
 use conefield_core::loss::{Loss, NoiseModel};
@@ -20,7 +20,7 @@ pub fn check_loss(loss: &dyn Loss) -> Report {
     report.add("poison", || poison(loss));
     report.add("repeatable", || {
         let changed = pairs().into_iter().find(|&[p, m]| bits(loss.at(p, m)) != bits(loss.at(p, m)));
-        settle(changed.map(|[p, m]| format!("predicted {p}, measured {m}: another value")), "the same bits twice")
+        settle(changed.map(|[p, m]| format!("{}: another value", words(p, m))), "the same bits twice")
     });
     report.add("learns from a scan", || learns(loss));
     report.add("no fault", || no_fault(loss.fault()));
@@ -55,6 +55,10 @@ fn pairs() -> Vec<[f64; 2]> {
     pairs
 }
 
+fn words(predicted: f64, measured: f64) -> String {
+    format!("predicted {predicted}, measured {measured}")
+}
+
 fn bits((a, b): (f64, f64)) -> [u64; 2] {
     [a.to_bits(), b.to_bits()]
 }
@@ -73,44 +77,36 @@ fn derivative(loss: &dyn Loss) -> Outcome {
         let (found, want) = (loss.at(predicted, measured).1, slope(h, at));
         // Differences of nearly zero losses are dominated by rounding.
         let e = (found - want).abs() / (found.abs().max(want.abs()) + 1e-4);
-        if e.is_nan() || e > TOLERANCE {
-            let at = format!("predicted {predicted}, measured {measured}");
-            return Outcome::Failed(format!("{at}: derivative {found:e}, differences {want:e}"));
-        }
+        let what = || format!("{}: derivative {found:e}, differences {want:e}", words(predicted, measured));
+        require(e <= TOLERANCE, what)?;
         worst = worst.max(e);
     }
-    if seen < 100 {
-        Outcome::Failed(format!("smooth at {seen} of 200 places"))
-    } else {
-        within("derivative", worst, TOLERANCE)
-    }
+    require(seen >= 100, || format!("smooth at {seen} of 200 places"))?;
+    within("derivative", worst, TOLERANCE)
 }
 
 fn least(loss: &dyn Loss) -> Outcome {
     for [predicted, measured] in pairs() {
         let (none, slope) = loss.at(measured, measured);
-        if none != 0.0 || slope != 0.0 {
-            return Outcome::Failed(format!("{none:e} and the derivative {slope:e} where both are {measured}"));
-        }
+        let what = || format!("{none:e} and the derivative {slope:e} where both are {measured}");
+        require(none == 0.0 && slope == 0.0, what)?;
         let (value, slope) = loss.at(predicted, measured);
-        let d = predicted - measured;
-        if value < 0.0 || value.is_nan() || slope * d < 0.0 || slope.is_nan() {
-            let what = format!("predicted {predicted}, measured {measured}");
-            return Outcome::Failed(format!("{what}: loss {value:e}, derivative {slope:e}"));
-        }
+        let downhill = slope.is_nan() || slope * (predicted - measured) < 0.0;
+        require(value >= 0.0 && !downhill, || {
+            format!("{}: loss {value:e}, derivative {slope:e}", words(predicted, measured))
+        })?;
     }
-    Outcome::Passed("0 there, and nowhere a way down that leads away".into())
+    Ok("0 there, and nowhere a way down that leads away".into())
 }
 
 fn extremes(loss: &dyn Loss) -> Outcome {
     let values = [0.0, -0.0, 1e-40, -1e-40, 1.0, -1.0, 1e30, -1e30];
     for [p, m] in values.into_iter().flat_map(|p| values.map(|m| [p, m])) {
         let (value, slope) = loss.at(p, m);
-        if !(value.is_finite() && slope.is_finite()) {
-            return Outcome::Failed(format!("predicted {p:e}, measured {m:e}: loss {value}, derivative {slope}"));
-        }
+        let what = || format!("predicted {p:e}, measured {m:e}: loss {value}, derivative {slope}");
+        require(value.is_finite() && slope.is_finite(), what)?;
     }
-    Outcome::Passed("0, denormal, ±1e30 give finite numbers".into())
+    Ok("0, denormal, ±1e30 give finite numbers".into())
 }
 
 /// Runs are monitored by their loss: NaN must propagate to it.
@@ -122,19 +118,12 @@ fn poison(loss: &dyn Loss) -> Outcome {
 /// An adaptive loss gives a loss with all other properties and of the same order.
 fn learns(loss: &dyn Loss) -> Outcome {
     let Some(fitted) = ready(loss) else {
-        return if loss.needs_scan() {
-            Outcome::Failed("it needs a scan, and learns nothing from one".into())
-        } else {
-            Outcome::Skipped("it learns nothing".into())
-        };
+        require(!loss.needs_scan(), || "it needs a scan, and learns nothing from one".into())?;
+        return skipped("it learns nothing");
     };
-    if !loss.needs_scan() {
-        return Outcome::Failed("it learns from a scan and does not say that it needs one".into());
-    }
+    require(loss.needs_scan(), || "it learns from a scan and does not say that it needs one".into())?;
     for property in [derivative, least, extremes, poison] {
-        if let Outcome::Failed(what) = property(fitted.as_ref()) {
-            return Outcome::Failed(format!("after it learned: {what}"));
-        }
+        property(fitted.as_ref()).map_err(|unmet| unmet.at("after it learned".into()))?;
     }
     let mean = |l: &dyn Loss| SHOWN.measured.iter().map(|&m| l.at(m + 0.1, m).1).sum::<f64>();
     let ratio = mean(fitted.as_ref()) / mean(loss);
@@ -146,10 +135,7 @@ fn learns(loss: &dyn Loss) -> Outcome {
 
 fn parity(loss: &dyn Loss, device: &dyn Runner) -> Outcome {
     let pairs: Vec<[f32; 2]> = pairs().into_iter().map(|p| p.map(|v| v as f32)).collect();
-    let found = match device.losses(loss, &pairs) {
-        Ok(found) => found,
-        Err(e) => return Outcome::Failed(e.to_string()),
-    };
+    let found = device.losses(loss, &pairs)?;
     let mut worst = 0.0f64;
     for (&[p, m], found) in pairs.iter().zip(&found) {
         let (value, slope) = loss.at(f64::from(p), f64::from(m));

@@ -1,6 +1,6 @@
 //! Properties of a prior of a field: a correct gradient, additive sums, behaviour for extreme numbers.
 
-use crate::call::{Draw, Guarded, error, no_fault, settle, within};
+use crate::call::{Draw, Guarded, error, no_fault, require, settle, within};
 use crate::gradients::slope;
 use crate::{Outcome, Report};
 use conefield_core::prior::Prior;
@@ -60,9 +60,7 @@ fn run(prior: &dyn Prior, values: &[f64], scale: f64) -> (f64, Vec<f64>) {
 fn gradient(prior: &dyn Prior) -> Outcome {
     let mut values = drawn(prior);
     let (value, found) = run(prior, &values, 1.0);
-    if value < 0.0 || !value.is_finite() {
-        return Outcome::Failed(format!("the penalty is {value}"));
-    }
+    require(value >= 0.0 && value.is_finite(), || format!("the penalty is {value}"))?;
     let largest = found.iter().fold(1e-9, |m: f64, g| m.max(g.abs()));
     let mut worst = 0.0f64;
     for i in (0..values.len()).step_by(values.len().div_ceil(SINGLES)) {
@@ -73,9 +71,7 @@ fn gradient(prior: &dyn Prior) -> Outcome {
         });
         values[i] = keep;
         let e = (found[i] - want).abs() / largest;
-        if e.is_nan() || e > TOLERANCE {
-            return Outcome::Failed(format!("point {i}: gradient {:e}, differences {want:e}", found[i]));
-        }
+        require(e <= TOLERANCE, || format!("point {i}: gradient {:e}, differences {want:e}", found[i]))?;
         worst = worst.max(e);
     }
     within("gradient", worst, TOLERANCE)
@@ -112,12 +108,11 @@ fn extremes(prior: &dyn Prior) -> Outcome {
         let mixed: Vec<f64> = values.iter().enumerate().map(|(i, x)| if i % 3 == 0 { v } else { *x }).collect();
         for block in [flat, mixed] {
             let (value, slopes) = run(prior, &block, 1.0);
-            if !value.is_finite() || slopes.iter().any(|g| !g.is_finite()) {
-                return Outcome::Failed(format!("values of {v:e}: penalty {value}, or a derivative, is not finite"));
-            }
+            let finite = value.is_finite() && slopes.iter().all(|g| g.is_finite());
+            require(finite, || format!("values of {v:e}: penalty {value}, or a derivative, is not finite"))?;
         }
     }
-    Outcome::Passed("0, denormal, ±1e30 give finite numbers".into())
+    Ok("0, denormal, ±1e30 give finite numbers".into())
 }
 
 /// Runs are monitored by their sums: NaN must propagate to them.
@@ -133,11 +128,6 @@ fn parity(prior: &dyn Prior, device: &dyn Runner) -> Outcome {
     let values = drawn(prior);
     let (value, slopes) = run(prior, &values, 1.0);
     let single: Vec<f32> = values.iter().map(|&v| v as f32).collect();
-    match device.penalty(prior, &single) {
-        Ok((found, found_slopes)) => {
-            let e = error(&[found], &[value]).max(error(&found_slopes, &slopes));
-            within("penalty and derivatives", e, SINGLE)
-        }
-        Err(e) => Outcome::Failed(e.to_string()),
-    }
+    let (found, found_slopes) = device.penalty(prior, &single)?;
+    within("penalty and derivatives", error(&[found], &[value]).max(error(&found_slopes, &slopes)), SINGLE)
 }

@@ -1,7 +1,7 @@
 //! Properties of a stage's settings: they are unchanged after writing and reading.
 
-use crate::Report;
-use crate::call::settle;
+use crate::call::{failed, require, settle};
+use crate::{Report, Unmet};
 use conefield_core::registry::{Settings, read};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -12,30 +12,24 @@ where
     T: Settings + Serialize + ?Sized + 'static,
 {
     let mut report = Report::of(format!("settings of {} {name:?}", T::KIND));
-    let written = |value: Value| -> Result<Value, String> {
-        let settings: Box<T> = read(value)?;
-        serde_json::to_value(&settings).map_err(|e| e.to_string())
+    let written = |value: Value| -> Result<Value, Unmet> {
+        let settings: Box<T> = read(value).or_else(failed)?;
+        serde_json::to_value(&settings).or_else(|e| failed(e.to_string()))
     };
     report.add("save and load", || {
         let mut table = settings.clone();
         table["type"] = json!(name);
-        let twice = written(table.clone()).and_then(|once| Ok((once.clone(), written(once)?)));
-        let complaint = match twice {
-            Err(e) => Some(e),
-            Ok((once, twice)) if once != twice => Some(format!("{once}, read again {twice}")),
-            Ok((once, _)) => {
-                let lost = table.as_object().into_iter().flatten().find(|(key, value)| once[key.as_str()] != **value);
-                lost.map(|(key, value)| format!("{key} = {value} is written as {}", once[key.as_str()]))
-            }
-        };
+        let once = written(table.clone())?;
+        let twice = written(once.clone())?;
+        require(once == twice, || format!("{once}, read again {twice}"))?;
+        let lost = table.as_object().into_iter().flatten().find(|(key, value)| once[key.as_str()] != **value);
+        let complaint = lost.map(|(key, value)| format!("{key} = {value} is written as {}", once[key.as_str()]));
         settle(complaint, "what was set is written and read again")
     });
     report.add("a name alone", || {
-        let complaint = match (written(json!(name)), written(json!({ "type": name }))) {
-            (Ok(a), Ok(b)) if a == b => None,
-            (a, b) => Some(format!("{a:?} against {b:?}")),
-        };
-        settle(complaint, "stands for the default settings")
+        let (a, b) = (written(json!(name))?, written(json!({ "type": name }))?);
+        require(a == b, || format!("{a} against {b}"))?;
+        Ok("stands for the default settings".into())
     });
     report
 }

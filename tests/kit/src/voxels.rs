@@ -1,6 +1,6 @@
 //! Properties of a voxel projector: a linear operator that measures lengths, and its exact adjoint.
 
-use crate::call::{differing, error, on_threads, settle};
+use crate::call::{differing, error, none, on_threads, require, settle};
 use crate::{Outcome, Report};
 use conefield_core::geometry::{Geometry, Millimetres, Radians, Ray, Vec3, View, VoxelGrid};
 use conefield_core::random::{mix, unit};
@@ -27,11 +27,13 @@ pub fn check_voxel_projector(projector: &dyn VoxelProjector) -> Report {
     report.add("adjoint: single precision", || adjoint(single, ADJOINT[1]));
     report.add("single precision", || single_precision(projector));
     report.add("closed form", || closed_form(single));
-    report.add("linear", || linear(double));
+    report.holds("linear", "sums and multiples go through", || linear(double));
     report.add("views stand alone", || views_stand_alone(projector));
-    report.add("projections overwrite", || projections_overwrite(single));
-    report.add("adjoint adds", || adjoint_adds(double));
-    report.add("threads", || threads(single));
+    report.holds("projections overwrite", "over NaN as over 0", || {
+        geometries().iter().find_map(|g| projections_overwrite(single, g))
+    });
+    report.holds("adjoint adds", "to what is there", || geometries().iter().find_map(|g| adjoint_adds(double, g)));
+    report.holds("threads", "1 and 3 threads, 3 callers", || threads(single));
     report.add("rays that miss", || rays_that_miss(projector));
     report.add("finite", || finite(single));
     report
@@ -110,8 +112,13 @@ fn back<R: Real>(op: &dyn VoxelOperator<R>, g: &Geometry, views: &[usize], y: &A
     out
 }
 
-pub(crate) fn dot<R: Real>(a: &Array3<R>, b: &Array3<R>) -> f64 {
+fn dot<R: Real>(a: &Array3<R>, b: &Array3<R>) -> f64 {
     Zip::from(a).and(b).fold(0.0, |sum, x, y| sum + x.f64() * y.f64())
+}
+
+/// The difference of `<Ax, y>` and `<x, Aᵀy>` relative to `‖Ax‖·‖y‖`.
+pub(crate) fn mismatch<R: Real>([x, aty]: [&Array3<R>; 2], [ax, y]: [&Array3<R>; 2]) -> f64 {
+    (dot(ax, y) - dot(x, aty)).abs() / (dot(ax, ax) * dot(y, y)).sqrt()
 }
 
 pub(crate) fn flat<R: Real>(x: &Array3<R>) -> Vec<R> {
@@ -131,21 +138,17 @@ pub(crate) fn apart<A: Real, B: Real>(what: &str, a: &Array3<A>, b: &Array3<B>, 
 
 fn adjoint<R: Real>(op: &dyn VoxelOperator<R>, most: f64) -> Outcome {
     let mut worst = 0.0f64;
-    let mut complaint = None;
     for (i, g) in geometries().iter().enumerate() {
         let views = all_views(g);
         for seed in [7, 8] {
             let (x, y) = (noise::<R>(g.volume.shape, seed), noise::<R>(pixels(g, views.len()), seed + 100));
             let (ax, aty) = (forward(op, g, &views, &x), back(op, g, &views, &y));
-            let norm = (dot(&ax, &ax) * dot(&y, &y)).sqrt();
-            let off = (dot(&ax, &y) - dot(&x, &aty)).abs() / norm;
+            let off = mismatch([&x, &aty], [&ax, &y]);
+            require(off <= most, || format!("geometry {i}: <Ax, y> and <x, Aᵀy> differ by {off:.1e}"))?;
             worst = worst.max(off);
-            if above(off, most) {
-                complaint = complaint.or(Some(format!("geometry {i}: <Ax, y> and <x, Aᵀy> differ by {off:.1e}")));
-            }
         }
     }
-    settle(complaint, &format!("off by {worst:.1e} at most"))
+    Ok(format!("off by {worst:.1e} at most"))
 }
 
 fn single_precision(p: &dyn VoxelProjector) -> Outcome {
@@ -204,33 +207,35 @@ fn closed_form(op: &dyn VoxelOperator<f32>) -> Outcome {
         ((square * exact.len() as f64).sqrt() / sum(&exact), sum(&found) / sum(&exact))
     };
     let [(coarse, _), (fine, sum)] = [of(20), of(40)];
-    let complaint = if above(fine, CLOSED_FORM) {
-        Some(format!("off by {fine:.3} of the mean, at most {CLOSED_FORM}"))
-    } else if above((sum - 1.0).abs(), 0.01) {
-        Some(format!("all line integrals together are {sum:.4} of what they should be"))
-    } else if fine * REFINED > coarse {
-        Some(format!("off by {coarse:.3} on coarse voxels and still by {fine:.3} on voxels of half the size"))
-    } else {
-        None
-    };
-    settle(complaint, &format!("off by {coarse:.3} and {fine:.3} of the mean, in sum {sum:.4}"))
+    require(fine <= CLOSED_FORM, || format!("off by {fine:.3} of the mean, at most {CLOSED_FORM}"))?;
+    let whole = (sum - 1.0).abs() <= 0.01;
+    require(whole, || format!("all line integrals together are {sum:.4} of what they should be"))?;
+    let still = || format!("off by {coarse:.3} on coarse voxels and still by {fine:.3} on voxels of half the size");
+    require(fine * REFINED <= coarse, still)?;
+    Ok(format!("off by {coarse:.3} and {fine:.3} of the mean, in sum {sum:.4}"))
 }
 
-fn linear(op: &dyn VoxelOperator<f64>) -> Outcome {
+/// A complaint about a map of arrays of `shape`, called `what`, that is not linear.
+pub(crate) fn nonlinear(
+    what: &str,
+    of: impl Fn(&Array3<f64>) -> Array3<f64>,
+    shape: [usize; 3],
+    seeds: [u64; 2],
+    most: f64,
+) -> Option<String> {
+    let mixed = |a: &Array3<f64>, b: &Array3<f64>| 2.5 * a - 0.75 * b;
+    let [x, y] = seeds.map(|seed| noise::<f64>(shape, seed));
+    let [a, b, both] = [&x, &y, &mixed(&x, &y)].map(of);
+    apart(what, &both, &mixed(&a, &b), most)
+}
+
+fn linear(op: &dyn VoxelOperator<f64>) -> Option<String> {
     let g = crooked(false);
     let views = all_views(&g);
-    let mixed = |a: &Array3<f64>, b: &Array3<f64>| 2.5 * a - 0.75 * b;
-    let [x, y] = [1, 2].map(|s| noise::<f64>(g.volume.shape, s));
-    let [p, q] = [3, 4].map(|s| noise::<f64>(pixels(&g, views.len()), s));
-    let complaint = {
-        let [a, b, both] = [&x, &y, &mixed(&x, &y)].map(|v| forward(op, &g, &views, v));
-        apart("line integrals of a sum", &both, &mixed(&a, &b), 1e-12)
-    };
-    let complaint = complaint.or_else(|| {
-        let [a, b, both] = [&p, &q, &mixed(&p, &q)].map(|v| back(op, &g, &views, v));
-        apart("voxels from a sum", &both, &mixed(&a, &b), 1e-12)
-    });
-    settle(complaint, "sums and multiples go through")
+    let lines = |x: &_| forward(op, &g, &views, x);
+    let voxels = |y: &_| back(op, &g, &views, y);
+    nonlinear("line integrals of a sum", lines, g.volume.shape, [1, 2], 1e-12)
+        .or_else(|| nonlinear("voxels from a sum", voxels, pixels(&g, views.len()), [3, 4], 1e-12))
 }
 
 /// A view's line integrals are bit-identical whatever other views are requested, in any order and number; and the
@@ -239,13 +244,11 @@ fn views_stand_alone(p: &dyn VoxelProjector) -> Outcome {
     let g = crooked(false);
     let x = noise::<f32>(g.volume.shape, 5);
     let alone: Vec<Array3<f32>> = all_views(&g).iter().map(|&v| forward(p.operator(), &g, &[v], &x)).collect();
-    let mut complaint = None;
     for views in [vec![0, 1, 2, 3, 4, 5], vec![5, 2, 0], vec![1, 1, 4, 1], vec![3, 4]] {
         let all = forward(p.operator(), &g, &views, &x);
         for (i, &v) in views.iter().enumerate() {
             let found: Vec<f32> = all.index_axis(Axis(0), i).iter().copied().collect();
-            let what = format!("view {v} among {views:?}, pixel");
-            complaint = complaint.or_else(|| differing(&what, &found, &flat(&alone[v])));
+            none(differing(&format!("view {v} among {views:?}, pixel"), &found, &flat(&alone[v])))?;
         }
         let y = noise::<f64>(pixels(&g, views.len()), 6);
         let mut sum = Array3::zeros(g.volume.shape);
@@ -253,38 +256,32 @@ fn views_stand_alone(p: &dyn VoxelProjector) -> Outcome {
             sum += &back(p.reference(), &g, &[v], &image.insert_axis(Axis(0)).to_owned());
         }
         let together = back(p.reference(), &g, &views, &y);
-        complaint = complaint.or_else(|| apart(&format!("voxels from views {views:?}"), &together, &sum, 1e-12));
+        none(apart(&format!("voxels from views {views:?}"), &together, &sum, 1e-12))?;
     }
-    let none = forward(p.operator(), &g, &[], &x);
-    complaint = complaint.or_else(|| (!none.is_empty()).then(|| "no views gave something".into()));
-    settle(complaint, "alone, together, turned round and repeated")
+    let nothing = forward(p.operator(), &g, &[], &x).is_empty();
+    require(nothing, || "no views gave something".into())?;
+    Ok("alone, together, turned round and repeated".into())
 }
 
-fn projections_overwrite(op: &dyn VoxelOperator<f32>) -> Outcome {
-    let complaint = geometries().iter().find_map(|g| {
-        let views = all_views(g);
-        let x = noise::<f32>(g.volume.shape, 5);
-        let clean = forward(op, g, &views, &x);
-        let mut over = Array3::from_elem(clean.dim(), f32::NAN);
-        op.forward(g, &views, x.view(), over.view_mut());
-        differing("pixel", &flat(&over), &flat(&clean))
-    });
-    settle(complaint, "over NaN as over 0")
+fn projections_overwrite(op: &dyn VoxelOperator<f32>, g: &Geometry) -> Option<String> {
+    let views = all_views(g);
+    let x = noise::<f32>(g.volume.shape, 5);
+    let clean = forward(op, g, &views, &x);
+    let mut over = Array3::from_elem(clean.dim(), f32::NAN);
+    op.forward(g, &views, x.view(), over.view_mut());
+    differing("pixel", &flat(&over), &flat(&clean))
 }
 
-fn adjoint_adds(op: &dyn VoxelOperator<f64>) -> Outcome {
-    let complaint = geometries().iter().find_map(|g| {
-        let views = all_views(g);
-        let (before, y) = (noise::<f64>(g.volume.shape, 5), noise::<f64>(pixels(g, views.len()), 6));
-        let mut after = before.clone();
-        op.adjoint(g, &views, y.view(), after.view_mut());
-        apart("what was there is not kept", &after, &(&before + &back(op, g, &views, &y)), 1e-12)
-    });
-    settle(complaint, "to what is there")
+fn adjoint_adds(op: &dyn VoxelOperator<f64>, g: &Geometry) -> Option<String> {
+    let views = all_views(g);
+    let (before, y) = (noise::<f64>(g.volume.shape, 5), noise::<f64>(pixels(g, views.len()), 6));
+    let mut after = before.clone();
+    op.adjoint(g, &views, y.view(), after.view_mut());
+    apart("what was there is not kept", &after, &(&before + &back(op, g, &views, &y)), 1e-12)
 }
 
 /// Results are bit-identical on pools of one and three threads, and from concurrent callers.
-fn threads(op: &dyn VoxelOperator<f32>) -> Outcome {
+fn threads(op: &dyn VoxelOperator<f32>) -> Option<String> {
     let g = crooked(false);
     let views = all_views(&g);
     let (x, y) = (noise::<f32>(g.volume.shape, 1), noise::<f32>(pixels(&g, views.len()), 2));
@@ -294,10 +291,9 @@ fn threads(op: &dyn VoxelOperator<f32>) -> Outcome {
         let started: Vec<_> = (0..3).map(|_| scope.spawn(both)).collect();
         started.into_iter().filter_map(|t| t.join().ok()).collect()
     });
-    let missing = (found.len() != 3).then(|| "a caller panicked".to_string());
-    let complaint = on_threads(both, |n, a, b| differing(&format!("{n}, number"), a, b)).or(missing);
-    let complaint = complaint.or_else(|| found.iter().find_map(|f| differing("several callers, number", f, &want)));
-    settle(complaint, "1 and 3 threads, 3 callers")
+    on_threads(both, |n, a, b| differing(&format!("{n}, number"), a, b))
+        .or_else(|| (found.len() != 3).then(|| "a caller panicked".to_string()))
+        .or_else(|| found.iter().find_map(|f| differing("several callers, number", f, &want)))
 }
 
 /// Rays that miss the voxels give exactly 0 and contribute nothing to the adjoint; empty input gives empty output.
@@ -315,22 +311,18 @@ fn rays_that_miss(p: &dyn VoxelProjector) -> Outcome {
     let hit = Array3::from_shape_fn(pixels(&g, views.len()), |(v, r, c)| g.ray(v, r, c).clip(around).is_some());
     let misses = hit.iter().filter(|h| !**h).count();
     let lines = forward(p.operator(), &g, &views, &Array3::ones(g.volume.shape));
-    let mut complaint = (misses == 0 || misses == hit.len()).then(|| "no ray misses".to_string());
-    for (found, h) in lines.iter().zip(&hit) {
-        if !h && *found != 0.0 {
-            complaint = complaint.or(Some(format!("a ray that misses gives {found:e}")));
-        }
-    }
-    complaint = complaint.or_else(|| lines.iter().all(|x| *x == 0.0).then(|| "rays that meet voxels give 0".into()));
+    require(misses != 0 && misses != hit.len(), || "no ray misses".into())?;
+    let wrong = lines.iter().zip(&hit).find(|(found, hit)| !**hit && **found != 0.0);
+    none(wrong.map(|(found, _)| format!("a ray that misses gives {found:e}")))?;
+    require(lines.iter().any(|x| *x != 0.0), || "rays that meet voxels give 0".into())?;
     let outside = hit.mapv(|h| if h { 0.0 } else { 1.0 });
     let zero =
-        |what: &str, x: &Array3<f64>| x.iter().find(|v| **v != 0.0).map(|v| format!("{what}: {v:e} instead of 0"));
+        |what: &str, x: Array3<f64>| none(x.iter().find(|v| **v != 0.0).map(|v| format!("{what}: {v:e} instead of 0")));
     let op = p.reference();
-    let complaint = complaint
-        .or_else(|| zero("voxels from rays that miss", &back(op, &g, &views, &outside)))
-        .or_else(|| zero("line integrals of nothing", &forward(op, &g, &views, &Array3::zeros(g.volume.shape))))
-        .or_else(|| zero("voxels from nothing", &back(op, &g, &views, &Array3::zeros(pixels(&g, views.len())))));
-    settle(complaint, &format!("{misses} of {} rays miss", hit.len()))
+    zero("voxels from rays that miss", back(op, &g, &views, &outside))?;
+    zero("line integrals of nothing", forward(op, &g, &views, &Array3::zeros(g.volume.shape)))?;
+    zero("voxels from nothing", back(op, &g, &views, &Array3::zeros(pixels(&g, views.len()))))?;
+    Ok(format!("{misses} of {} rays miss", hit.len()))
 }
 
 /// Rays along axes, on faces between voxels and through corners, large and tiny numbers: never NaN or infinity.
@@ -350,15 +342,14 @@ fn finite(op: &dyn VoxelOperator<f32>) -> Outcome {
     near.views.iter_mut().for_each(|v| v.source = v.source.map(|x| x * 6.0 / 40.0));
     all.push(near);
     all.extend(geometries());
-    let mut complaint = None;
     for (i, g) in all.iter().enumerate() {
         let views = all_views(g);
         for value in [1.0f32, -1e30, 1e-40, f32::MIN_POSITIVE] {
             let lines = forward(op, g, &views, &Array3::from_elem(g.volume.shape, value));
             let voxels = back(op, g, &views, &Array3::from_elem(pixels(g, views.len()), value));
             let bad = lines.iter().chain(&voxels).find(|x| !x.is_finite());
-            complaint = complaint.or_else(|| bad.map(|x| format!("geometry {i} of {value:e}: {x}")));
+            none(bad.map(|x| format!("geometry {i} of {value:e}: {x}")))?;
         }
     }
-    settle(complaint, &format!("{} geometries", all.len()))
+    Ok(format!("{} geometries", all.len()))
 }

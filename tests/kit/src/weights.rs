@@ -1,7 +1,7 @@
 //! Properties of an initializer: it fills what it reports, with finite numbers, reproducibly, and nothing else.
 
 use crate::Report;
-use crate::call::{Draw, differing, settle};
+use crate::call::{Draw, differing, require, settle};
 use conefield_core::arena::{Arena, Block, InitReport, Layout};
 use conefield_core::error::Result;
 use conefield_core::settings::Initializer;
@@ -10,32 +10,24 @@ use conefield_core::settings::Initializer;
 pub fn check_initializer(initializer: &dyn Initializer) -> Report {
     let mut report = Report::of(initializer.describe());
     let layout = layout();
-    report.add("applies", || match run(initializer, &layout) {
-        Ok((_, found)) => {
-            let n = layout.blocks.len();
-            let reported = found.loaded.len() + found.fresh.len();
-            let complaint = (reported != n).then(|| format!("it reports {reported} of {n} blocks"));
-            settle(complaint, &format!("{} of {n} blocks filled", found.loaded.len()))
-        }
-        Err(e) => settle(Some(e.to_string()), ""),
+    report.add("applies", || {
+        let (n, (_, found)) = (layout.blocks.len(), run(initializer, &layout)?);
+        let reported = found.loaded.len() + found.fresh.len();
+        require(reported == n, || format!("it reports {reported} of {n} blocks"))?;
+        Ok(format!("{} of {n} blocks filled", found.loaded.len()))
     });
     report.add("finite", || {
-        let bad = run(initializer, &layout).ok().and_then(|(p, _)| p.iter().position(|v| !v.is_finite()));
+        let bad = run(initializer, &layout)?.0.iter().position(|v| !v.is_finite());
         settle(bad.map(|i| format!("parameter {i}")), "every parameter")
     });
     report.add("repeatable", || {
-        let complaint = match (run(initializer, &layout), run(initializer, &layout)) {
-            (Ok((a, _)), Ok((b, _))) => differing("parameter", &a, &b),
-            _ => None,
-        };
-        settle(complaint, "the same bits twice")
+        let ((a, _), (b, _)) = (run(initializer, &layout)?, run(initializer, &layout)?);
+        settle(differing("parameter", &a, &b), "the same bits twice")
     });
     report.add("leaves the rest alone", || {
-        let complaint = run(initializer, &layout).ok().and_then(|(p, found)| {
-            let before = start(&layout);
-            let mut rest = layout.blocks.iter().filter(|b| !found.loaded.contains(&b.name));
-            rest.find_map(|b| differing(&b.name, &p[b.range.clone()], &before[b.range.clone()]))
-        });
+        let ((p, found), before) = (run(initializer, &layout)?, start(&layout));
+        let mut rest = layout.blocks.iter().filter(|b| !found.loaded.contains(&b.name));
+        let complaint = rest.find_map(|b| differing(&b.name, &p[b.range.clone()], &before[b.range.clone()]));
         settle(complaint, "blocks that it does not report keep their bits")
     });
     report

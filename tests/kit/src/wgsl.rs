@@ -1,6 +1,6 @@
 //! A stage's WGSL on a device against its Rust code: double precision, single precision and the device side by side.
 
-use crate::call::{Draw, Subject, error, within};
+use crate::call::{Draw, Subject, error, held, none, require, within};
 use crate::gradients::{narrow, no_rows, shared};
 use crate::rays::{rays, samples};
 use crate::{Options, Outcome, Report};
@@ -41,10 +41,7 @@ fn parity(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
     let [y64, g64, dx64] = double.pass(&x, &dy64, rows);
     let x = narrow(&x);
     let [y32, g32, dx32] = single.pass(&x, &dy, rows);
-    let [y, g, dx] = match device.pass(stage, &single.params, &x, &dy, rows) {
-        Ok(found) => found,
-        Err(e) => return Outcome::Failed(e.to_string()),
-    };
+    let [y, g, dx] = device.pass(stage, &single.params, &x, &dy, rows)?;
     let mut words = vec![];
     let mut fine = true;
     for (what, found, cpu, exact, limit) in [
@@ -59,8 +56,7 @@ fn parity(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
         fine &= e <= limit;
         words.push(format!("{what} {e:.1e} (CPU {on_cpu:.1e}, limit {limit:.0e})"));
     }
-    let words = words.join(", ");
-    if fine { Outcome::Passed(words) } else { Outcome::Failed(words) }
+    held(fine, words.join(", "))
 }
 
 /// Against single precision on the CPU, if there is no double precision.
@@ -68,13 +64,9 @@ fn single_only(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
     let (single, rows) = (of.single(), ROUNDS * of.options.rows);
     let (x, dy) = single.data(rows);
     let [y32, g32, dx32] = single.pass(&x, &dy, rows);
-    match device.pass(of.stage, &single.params, &x, &dy, rows) {
-        Err(e) => Outcome::Failed(e.to_string()),
-        Ok([y, g, dx]) => {
-            let e = error(&y, &y32).max(error(&g, &g32) / 4.0).max(error(&dx, &dx32) / 4.0);
-            within("against single precision on the CPU", e, 2.0 * of.options.single)
-        }
-    }
+    let [y, g, dx] = device.pass(of.stage, &single.params, &x, &dy, rows)?;
+    let e = error(&y, &y32).max(error(&g, &g32) / 4.0).max(error(&dx, &dx32) / 4.0);
+    within("against single precision on the CPU", e, 2.0 * of.options.single)
 }
 
 /// The device gives finite numbers wherever the CPU does: for zeros, denormals (which it may flush to zero) and huge
@@ -88,21 +80,14 @@ fn extremes(of: &Subject<'_>, device: &dyn Runner) -> Outcome {
         x.iter_mut().step_by(3).for_each(|v| *v = value);
         let dy: Vec<f32> = draw.many(&(-1.0..1.0), single.info.output * rows);
         let [y32, g32, dx32] = single.pass(&x, &dy, rows);
-        let [y, g, dx] = match device.pass(of.stage, &single.params, &x, &dy, rows) {
-            Ok(found) => found,
-            Err(e) => return Outcome::Failed(e.to_string()),
-        };
+        let [y, g, dx] = device.pass(of.stage, &single.params, &x, &dy, rows)?;
         for (what, found, cpu) in [("outputs", y, y32), ("gradients", g, g32), ("input gradients", dx, dx32)] {
             let lost = |(a, b): (&f32, &f32)| b.is_finite() && b.abs() < 1e35 && !a.is_finite();
-            if let Some(i) = found.iter().zip(&cpu).position(lost) {
-                return Outcome::Failed(format!(
-                    "inputs of {value:e}: {what} {i} is {}, on the CPU {}",
-                    found[i], cpu[i]
-                ));
-            }
+            let at = found.iter().zip(&cpu).position(lost);
+            none(at.map(|i| format!("inputs of {value:e}: {what} {i} is {}, on the CPU {}", found[i], cpu[i])))?;
         }
     }
-    Outcome::Passed("finite wherever the CPU is".into())
+    Ok("finite wherever the CPU is".into())
 }
 
 /// Checks all properties of a projector's WGSL, which it must have.
@@ -118,21 +103,18 @@ const PLACES: f32 = 2e-6;
 fn same_samples(projector: &dyn Projector, device: &dyn Runner) -> Outcome {
     let seeds = [None, Some(5), Some(0xfedc_ba98_7654_3210)];
     let all: Vec<_> = rays().into_iter().flat_map(|r| seeds.map(|s| (r, s))).collect();
-    let found = match device.samples(projector, &all) {
-        Ok(found) => found,
-        Err(e) => return Outcome::Failed(e.to_string()),
-    };
+    let found = device.samples(projector, &all)?;
     let mut worst = 0.0f32;
     for (i, ((ray, seed), found)) in all.iter().zip(&found).enumerate() {
-        let want = samples(projector, ray, *seed);
-        if found.points.len() < want.points.len() || found.weights[want.weights.len()..].iter().any(|w| *w != 0.0) {
-            return Outcome::Failed(format!("ray {i}: {} samples against {}", found.points.len(), want.points.len()));
-        }
+        let want = &samples(projector, ray, *seed);
+        let [n, most] = [want, found].map(|samples| samples.points.len());
+        let enough = most >= n && found.weights[n..].iter().all(|w| *w == 0.0);
+        require(enough, || format!("ray {i}: {most} samples against {n}"))?;
         for ((a, b), (v, w)) in found.points.iter().zip(&want.points).zip(found.weights.iter().zip(&want.weights)) {
             let place = (0..3).map(|k| (a[k] - b[k]).abs()).fold((v - w).abs(), f32::max);
             worst = if place.is_nan() { f32::INFINITY } else { worst.max(place) };
         }
     }
     let text = format!("{} rays, largest difference {worst:.1e} cube sides, limit {PLACES:.0e}", all.len());
-    if worst <= PLACES { Outcome::Passed(text) } else { Outcome::Failed(text) }
+    held(worst <= PLACES, text)
 }

@@ -4,10 +4,10 @@ use crate::{out, program};
 use clap::Args;
 use conefield::{parse, plugins};
 use conefield_backend_wgpu::Wgpu;
-use conefield_conformance::{Options, Outcome, Report, WIDTHS, With, check_type};
+use conefield_conformance::{Options, Report, WIDTHS, With, check_type};
+use conefield_core::error::{Error, Result, ensure};
+use conefield_core::registry::Kind;
 use conefield_core::runner::Runner;
-use conefield_core::{Error, Result};
-use conefield_plugins::library::Type;
 use conefield_plugins::spec::with_defaults;
 use conefield_plugins::{Library, Place};
 use serde::Serialize;
@@ -72,22 +72,14 @@ struct Checked {
 /// One stage with one set of settings.
 #[derive(Serialize)]
 struct StageReport {
-    kind: String,
+    kind: Kind,
     #[serde(rename = "type")]
     name: String,
     settings: Value,
     #[serde(skip_serializing_if = "Option::is_none")]
     width: Option<usize>,
-    stage: String,
-    properties: Vec<Property>,
-    passed: bool,
-}
-
-#[derive(Serialize)]
-struct Property {
-    name: &'static str,
-    outcome: &'static str,
-    text: String,
+    #[serde(flatten)]
+    report: Report,
 }
 
 impl Check {
@@ -143,13 +135,8 @@ impl Check {
         } else {
             out::say(&text(&report))?
         }
-        let failed: Vec<String> = report
-            .stages
-            .iter()
-            .flat_map(|s| {
-                s.properties.iter().filter(|p| p.outcome == FAILED).map(|p| format!("{}: {}", s.name, p.name))
-            })
-            .collect();
+        let of = |s: &StageReport| s.report.failed().into_iter().map(|name| format!("{}: {name}", s.name)).collect();
+        let failed: Vec<String> = report.stages.iter().flat_map::<Vec<_>, _>(of).collect();
         if failed.is_empty() {
             return Ok(());
         }
@@ -162,9 +149,21 @@ impl Check {
         Err(Error::unsupported(self.library.display().to_string(), why))
     }
 
+    /// Checks each stage type with each of its settings, at all sensible widths.
     fn report(&self, library: &Library) -> Result<Checked> {
+        // The device for WGSL, opened when the first stage provides WGSL.
+        let opened = OnceLock::new();
+        let device = || {
+            let opened = opened.get_or_init(|| Wgpu::open(None).map_err(|e| e.to_string()));
+            opened.as_ref().map(|device| device as &dyn Runner).map_err(String::clone)
+        };
+        let widths: Vec<usize> = self.width.iter().map(|&width| width.into()).collect();
+        let with = With {
+            widths: if widths.is_empty() { &WIDTHS } else { &widths },
+            options: &|options| Options { single: self.single, ..options },
+            device: &device,
+        };
         let mut stages = vec![];
-        let device = Device::default();
         for t in library.types.iter().filter(|t| self.name.as_ref().is_none_or(|n| *n == t.name)) {
             let mut tries: Vec<Value> = self.settings.clone();
             if tries.is_empty() {
@@ -172,97 +171,43 @@ impl Check {
                 tries.extend((!needed).then(|| serde_json::json!({})));
                 tries.extend(t.schema["examples"].as_array().into_iter().flatten().cloned());
             }
-            if tries.is_empty() {
-                let expected = "--settings, or examples in its schema: it has settings without a default";
-                return Err(Error::invalid(library.owner(), &t.name, "no settings to check", expected));
-            }
+            let expected = "--settings, or examples in its schema: it has settings without a default";
+            ensure(!tries.is_empty(), &library.owner(), &t.name, "no settings to check", expected)?;
             for settings in tries {
-                self.stage(t, &with_defaults(&t.schema, settings), &device, &mut stages)?;
+                let settings = with_defaults(&t.schema, settings);
+                let mut table = settings.clone();
+                table["type"] = t.name.clone().into();
+                for (width, report) in check_type(t.kind, &table, &with)? {
+                    let (name, settings) = (t.name.clone(), settings.clone());
+                    stages.push(StageReport { kind: t.kind, name, settings, width, report });
+                }
             }
         }
-        if stages.is_empty() {
-            let known: Vec<&str> = library.types.iter().map(|t| &t.name[..]).collect();
-            let expected = format!("one of {}", known.join(", "));
-            return Err(Error::invalid(library.owner(), "--type", self.name.clone().unwrap_or_default(), expected));
-        }
+        let known: Vec<&str> = library.types.iter().map(|t| &t.name[..]).collect();
+        let (name, expected) = (self.name.as_deref().unwrap_or_default(), format!("one of {}", known.join(", ")));
+        ensure(!stages.is_empty(), &library.owner(), "--type", name, expected)?;
         Ok(Checked {
             plugin: library.name.clone(),
             version: library.version.clone(),
             licence: library.licence.clone(),
             abi: format!("{}.{}", library.abi.0, library.abi.1),
             path: library.path.display().to_string(),
-            passed: stages.iter().all(|s| s.passed),
+            passed: stages.iter().all(|s| s.report.passed()),
             stages,
         })
-    }
-
-    /// Checks one stage type with one set of settings, at all sensible widths.
-    fn stage(&self, t: &Type, settings: &Value, device: &Device, all: &mut Vec<StageReport>) -> Result<()> {
-        let mut table = settings.clone();
-        table["type"] = t.name.clone().into();
-        let with = With {
-            widths: &self.widths(),
-            options: &|options| Options { single: self.single, ..options },
-            device: &|| device.runner(),
-        };
-        let found = check_type(t.kind, &table, &with)?;
-        all.extend(found.into_iter().map(|(width, report)| StageReport::of(t, settings, width, report)));
-        Ok(())
-    }
-
-    fn widths(&self) -> Vec<usize> {
-        if self.width.is_empty() { WIDTHS.to_vec() } else { self.width.iter().map(|&w| w.into()).collect() }
-    }
-}
-
-const FAILED: &str = "failed";
-
-/// The device for WGSL, opened when the first stage provides WGSL.
-#[derive(Default)]
-struct Device(OnceLock<Result<Wgpu, String>>);
-
-impl Device {
-    fn runner(&self) -> Result<&dyn Runner, String> {
-        let opened = self.0.get_or_init(|| Wgpu::open(None).map_err(|e| e.to_string()));
-        opened.as_ref().map(|device| device as &dyn Runner).map_err(String::clone)
-    }
-}
-
-impl StageReport {
-    fn of(t: &Type, settings: &Value, width: Option<usize>, report: Report) -> Self {
-        let passed = report.passed();
-        let property = |(name, outcome)| {
-            let (outcome, text) = match outcome {
-                Outcome::Passed(text) => ("passed", text),
-                Outcome::Failed(text) => (FAILED, text),
-                Outcome::Skipped(text) => ("skipped", text),
-            };
-            Property { name, outcome, text }
-        };
-        Self {
-            kind: t.kind.to_string(),
-            name: t.name.clone(),
-            settings: settings.clone(),
-            width,
-            stage: report.stage,
-            properties: report.entries.into_iter().map(property).collect(),
-            passed,
-        }
     }
 }
 
 fn text(r: &Checked) -> String {
     let mut lines = vec![format!("{} {}, {}, ABI {}: {}", r.plugin, r.version, r.licence, r.abi, r.path)];
-    for s in &r.stages {
-        let width = s.width.map_or(String::new(), |w| format!(", {w} channels in"));
-        lines.push(format!("\n{} {} {}{width}\n  {}", s.kind, s.name, s.settings, s.stage));
-        for p in &s.properties {
-            let outcome = if p.outcome == FAILED { "FAILED" } else { p.outcome };
-            lines.push(format!("  {outcome:<8} {:<34} {}", p.name, p.text));
-        }
+    for StageReport { kind, name, settings, width, report } in &r.stages {
+        let width = width.map_or(String::new(), |w| format!(", {w} channels in"));
+        lines.push(format!("\n{kind} {name} {settings}{width}\n  {}", report.to_string().trim_end()));
     }
-    let count = |o: &str| r.stages.iter().flat_map(|s| &s.properties).filter(|p| p.outcome == o).count();
-    lines.push(format!("\n{} passed, {} skipped, {} failed", count("passed"), count("skipped"), count(FAILED)));
+    let all = || r.stages.iter().flat_map(|s| s.report.properties());
+    let [passed, skipped, failed] =
+        ["passed", "skipped", "failed"].map(|word| all().filter(|(_, outcome, _)| *outcome == word).count());
+    lines.push(format!("\n{passed} passed, {skipped} skipped, {failed} failed"));
     lines.join("\n")
 }
 

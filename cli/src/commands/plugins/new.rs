@@ -1,9 +1,10 @@
 //! `conefield plugins new`
 
 use crate::out;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
+use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::{self, Kind};
-use conefield_core::{Error, Result};
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
@@ -13,8 +14,8 @@ pub struct New {
     /// The name of plugin, folder and stage type: lower-case letters, digits and hyphens.
     name: String,
     /// The kind of stage.
-    #[arg(long)]
-    kind: StageKind,
+    #[arg(long, value_parser = kinds())]
+    kind: Template,
     /// The language.
     #[arg(long, default_value = "rust")]
     lang: Language,
@@ -58,57 +59,44 @@ struct Start {
     build: &'static str,
 }
 
-/// Makes a function from the list of the contract.
-macro_rules! tables {
-    ($($table:ident $field:ident: $($kind:ident $code:ident),+;)*) => {
-        /// Where a stage of this kind has its functions in C, and the kind's code.
-        fn tables(kind: Kind) -> (&'static str, &'static str) {
-            match kind {
-                $($(Kind::$kind => (stringify!($field), stringify!($code)),)+)*
-                other => unreachable!("a {other} cannot come from a plugin"),
-            }
-        }
+/// A kind of stage that a plugin can be made for.
+#[derive(Debug, Clone, Copy)]
+struct Template {
+    kind: Kind,
+    /// The stage in C and in Rust, without what all kinds have in common.
+    c: &'static str,
+    rust: &'static str,
+    /// The type of its functions in C, the place of these, and the kind's code.
+    functions: &'static str,
+    table: &'static str,
+    code: &'static str,
+    /// A small spec, and the place of the stage there.
+    spec: &'static str,
+    place: &'static str,
+}
+
+/// Makes the templates from the list of the contract.
+macro_rules! templates {
+    ($($table:ident $field:ident: $($kind:ident $name:ident $code:ident $spec:ident $place:literal),+;)*) => {
+        const TEMPLATES: &[Template] = &[$($(Template {
+            kind: Kind::$kind,
+            c: template!(concat!("c/", stringify!($name), ".c")),
+            rust: template!(concat!("rust/", stringify!($name), ".rs")),
+            functions: stringify!($table),
+            table: stringify!($field),
+            code: stringify!($code),
+            spec: stringify!($spec),
+            place: $place,
+        },)+)*];
     };
 }
 
-conefield_plugin_abi::kinds! { tables }
+conefield_plugin_abi::kinds! { templates }
 
-/// Kinds of stages and their templates: the stage in C, without its tables, and in Rust.
-macro_rules! kinds {
-    ($($kind:ident $file:literal,)*) => {
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-        enum StageKind {
-            $($kind,)*
-        }
-
-        impl StageKind {
-            fn kind(self) -> Kind {
-                match self {
-                    $(Self::$kind => Kind::$kind,)*
-                }
-            }
-
-            fn template(self, language: Language) -> &'static str {
-                match (self, language) {
-                    $((Self::$kind, Language::C) => template!(concat!("c/", $file, ".c")),)*
-                    $((Self::$kind, Language::Rust) => template!(concat!("rust/", $file, ".rs")),)*
-                }
-            }
-        }
-    };
-}
-
-kinds! {
-    Encoder "encoder",
-    Normalizer "normalizer",
-    Field "field",
-    Projector "projector",
-    Initializer "initializer",
-    Loss "loss",
-    Prior "prior",
-    Regularizer "regularizer",
-    DataTerm "data_term",
-    Basis "basis",
+/// The template of the kind that an argument names.
+fn kinds() -> impl TypedValueParser<Value = Template> {
+    let of = |name: String| TEMPLATES.iter().copied().find(|t| t.kind.name() == name).ok_or("no such kind");
+    PossibleValuesParser::new(TEMPLATES.iter().map(|t| t.kind.name())).try_map(of)
 }
 
 impl New {
@@ -118,23 +106,18 @@ impl New {
             && self.name.chars().all(plain)
             && (2..=40).contains(&self.name.len())
             && !self.name.ends_with('-');
-        if !good {
-            let expected = "2 to 40 lower-case letters, digits and hyphens, a letter first";
-            return Err(Error::invalid("plugins new", "NAME", format!("{:?}", self.name), expected));
-        }
-        if RESERVED.contains(&&self.name[..]) {
-            let expected = "a name that is not a Rust keyword or crate";
-            return Err(Error::invalid("plugins new", "NAME", format!("{:?}", self.name), expected));
-        }
-        if let Some(taken) = registry::find(self.kind.kind(), &self.name) {
-            let found = format!("{:?}, the {} of {}", self.name, taken.kind, taken.owner());
+        let own = format!("{:?}", self.name);
+        let expected = "2 to 40 lower-case letters, digits and hyphens, a letter first";
+        ensure(good, "plugins new", "NAME", &own, expected)?;
+        let free = !RESERVED.contains(&&self.name[..]);
+        ensure(free, "plugins new", "NAME", &own, "a name that is not a Rust keyword or crate")?;
+        if let Some(taken) = registry::find(self.kind.kind, &self.name) {
+            let found = format!("{own}, the {} of {}", taken.kind, taken.owner());
             return Err(Error::invalid("plugins new", "NAME", found, "an unused name"));
         }
         let folder = self.into.join(&self.name);
-        if folder.exists() {
-            let expected = "the name of a new folder";
-            return Err(Error::invalid(folder.display().to_string(), "NAME", "an existing file or folder", expected));
-        }
+        let (place, expected) = (folder.display().to_string(), "the name of a new folder");
+        ensure(!folder.exists(), &place, "NAME", "an existing file or folder", expected)?;
         let Start { files, library, build } = match self.lang {
             Language::Rust => self.rust()?,
             Language::C => self.c(),
@@ -146,11 +129,9 @@ impl New {
             conefield_io::write_text_atomic(&path, text)?;
         }
         out::say(&format!(
-            "{}: {} files. Next:\n  cd {}\n  {build}\n  conefield plugins check {library}\n  conefield --plugin {library} \
-             reconstruct SCAN --spec spec.toml -o run",
-            folder.display(),
+            "{place}: {} files. Next:\n  cd {place}\n  {build}\n  conefield plugins check {library}\n  conefield --plugin \
+             {library} reconstruct SCAN --spec spec.toml -o run",
             files.len(),
-            folder.display(),
         ))?;
         match self.lang {
             Language::Rust => out::say("The first build and test compile conefield's crates, too: some minutes each."),
@@ -162,7 +143,7 @@ impl New {
         let files = vec![
             ("Cargo.toml".into(), self.fill(template!("rust/manifest.toml"))?),
             (".gitignore".into(), "/target\n".into()),
-            ("src/lib.rs".into(), self.fill(self.kind.template(Language::Rust))?),
+            ("src/lib.rs".into(), self.fill(&self.stage())?),
             ("tests/conformance.rs".into(), self.fill(template!("rust/test.rs"))?),
             ("spec.toml".into(), self.spec()),
         ];
@@ -172,12 +153,47 @@ impl New {
         Ok(Start { files, library, build: "cargo build --release\n  cargo test --release" })
     }
 
+    /// The Rust template of the kind with what all of them have in common; a template lists its settings as
+    /// `pub name: type = default,`.
+    fn stage(&self) -> String {
+        let Template { kind, rust, .. } = self.kind;
+        let (above, rest) = rust.split_once("@stage ").unwrap_or_default();
+        let (doc, rest) = rest.split_once('\n').unwrap_or_default();
+        let (listed, below) = rest.split_once("@\n").unwrap_or_default();
+        let (mut settings, mut defaults) = (vec![], vec![]);
+        for line in listed.lines() {
+            match line.trim().strip_prefix("pub ").and_then(|rest| rest.trim_end_matches(',').split_once(" = ")) {
+                Some((field, default)) => {
+                    let name = field.split(':').next().unwrap_or_default();
+                    defaults.push(format!("{name}: {default}"));
+                    settings.push(format!("    pub {field},"));
+                }
+                None => settings.push(line.into()),
+            }
+        }
+        let stage = template!("rust/stage.rs").replace("@kind@", &format!("{kind:?}")).replace("@doc@", doc);
+        let stage = stage.replace("@settings@", &settings.join("\n")).replace("@defaults@", &defaults.join(", "));
+        format!("{above}{stage}{below}")
+    }
+
+    /// The C template of the kind with its tables; a template ends with the functions that it has, `of` or `curve=as_is`.
+    fn tables(&self) -> String {
+        let Template { c, functions, table, code, .. } = self.kind;
+        let (above, rest) = c.split_once("@plugin ").unwrap_or_default();
+        let entry = |word: &str| {
+            let (name, function) = word.split_once('=').unwrap_or((word, word));
+            format!("    .{name} = {function},")
+        };
+        let entries: Vec<String> = rest.trim_end().trim_end_matches('@').split(' ').map(entry).collect();
+        let tables =
+            template!("c/plugin.c").replace("@functions@", functions).replace("@entries@", &entries.join("\n"));
+        above.to_owned() + &tables.replace("@kind@", code).replace("@table@", table)
+    }
+
     fn c(&self) -> Start {
-        let (table, code) = tables(self.kind.kind());
-        let plugin = template!("c/plugin.c").trim_end().replace("@kind@", code).replace("@table@", table);
-        let named = |text: &str| text.replace("@plugin@", &plugin).replace("@name@", &self.name);
+        let named = |text: &str| text.replace("@name@", &self.name);
         let files = vec![
-            (format!("{}.c", self.name), named(self.kind.template(Language::C))),
+            (format!("{}.c", self.name), named(&self.tables())),
             ("conefield_plugin.h".into(), conefield_plugin_abi::HEADER.into()),
             ("conefield_helpers.h".into(), conefield_plugin_abi::HELPERS.into()),
             ("Makefile".into(), named(template!("c/Makefile"))),
@@ -188,24 +204,15 @@ impl New {
 
     /// A small method that uses the new stage.
     fn spec(&self) -> String {
-        let (name, kind) = (&self.name, self.kind.kind());
-        let about = format!("name = \"{name}\"\ndescription = \"The {kind} of the plugin {name}");
-        let stage = |table: &str| format!("\n{table}\ntype = \"{name}\"\n");
-        let of_fast = |table: &str| {
-            let first = "# The small spec that ships with conefield, with the stage of this plugin.";
-            format!("{first}\nextends = \"fast\"\n{about} in the spec fast.\"\n{}", stage(table))
+        let (name, Template { kind, spec, place, .. }) = (&self.name, self.kind);
+        let (first, base, with) = match spec {
+            "fast" => ("The small spec that ships with conefield, with", "extends", "the spec fast"),
+            _ => ("Ordered-subset FISTA with", "type", spec),
         };
-        let of_fista = |table: &str| {
-            let first = "# Ordered-subset FISTA with the stage of this plugin.";
-            format!("{first}\ntype = \"fista\"\n{about} in fista.\"\n{}", stage(table))
-        };
-        match kind {
-            Kind::Normalizer | Kind::Prior => of_fast(&format!("[[{kind}s]]")),
-            Kind::Regularizer => of_fista("[prior]"),
-            Kind::DataTerm => of_fista("[data]"),
-            Kind::Basis => of_fista("[basis]"),
-            _ => of_fast(&format!("[{kind}]")),
-        }
+        format!(
+            "# {first} the stage of this plugin.\n{base} = \"{spec}\"\nname = \"{name}\"\ndescription = \"The {kind} of the \
+             plugin {name} in {with}.\"\n\n{place}\ntype = \"{name}\"\n"
+        )
     }
 
     /// A Rust template with names and dependencies filled in.

@@ -11,6 +11,8 @@ use conefield_plugin::prelude::*;
 /// Settings of `huber`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
+// The coefficients of the conformance kit are of order one.
+#[schemars(extend("examples" = [{"threshold": 0.2}, {"threshold": 0.05, "inner": 1}]))]
 pub struct Huber {
     /// Strength, as a multiple of the root mean square of back-projected noise.
     pub weight: f64,

@@ -3,7 +3,7 @@
 //! which is never negative.
 
 use conefield_plugin::prelude::*;
-use conefield_plugin::wgsl::{Sum, declare};
+use conefield_plugin::wgsl::{Sum, declare, functions};
 use std::fmt::Write;
 
 stage_type!(FieldSpec, "siren", Siren, "multi-layer perceptron of sines");
@@ -11,6 +11,7 @@ stage_type!(FieldSpec, "siren", Siren, "multi-layer perceptron of sines");
 /// Settings of `siren`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
+#[schemars(extend("examples" = [{"width": 5, "depth": 3, "omega": 1.0}]))]
 pub struct Siren {
     /// Channels of every hidden layer.
     pub width: usize,
@@ -243,27 +244,18 @@ impl Stage for SirenField {
             );
         }
         let omega = self.settings.omega as f32;
-        Some(Fragment::new(&[&declare(keeps, &sums), &format!(
+        let activations = format!(
             "fn stage_sine(x: f32) -> vec2<f32> {{ return vec2<f32>(sin({omega:?} * x), {omega:?} * cos({omega:?} * x)); }}
 
 fn stage_softplus(x: f32) -> vec2<f32> {{
     let e = exp(-min(abs(x), 87.0));
     return vec2<f32>(max(x, 0.0) + log(1.0 + e), select(e, 1.0, x >= 0.0) / (1.0 + e));
 }}
-
-fn stage_forward(x: ptr<function, array<f32, {n}>>, y: ptr<function, array<f32, 1>>) {{
-{layers}    (*y)[0] = h{last}[0];
-}}
-
-fn stage_backward(
-    x: ptr<function, array<f32, {n}>>,
-    dy: ptr<function, array<f32, 1>>,
-    dx: ptr<function, array<f32, {n}>>,
-) {{
-{layers}    s{last}[0] *= (*dy)[0];
-{back}{keep}}}
 "
-        )]))
+        );
+        let forward = format!("{layers}    (*y)[0] = h{last}[0];\n");
+        let backward = format!("{layers}    s{last}[0] *= (*dy)[0];\n{back}{keep}");
+        Some(Fragment::new(&[&declare(keeps, &sums), &activations, &functions(n, 1, &forward, &backward)]))
     }
 
     fn describe(&self) -> String {

@@ -8,6 +8,7 @@ stage_type!(NormalizerSpec, "ray-smooth", RaySmooth, "features smoothed along ea
 /// Settings of `ray-smooth`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
+#[schemars(extend("examples" = [{"strength": 0.0}, {"strength": 0.9}]))]
 pub struct RaySmooth {
     /// Share that a sample takes from its neighbours, from 0 to below 1.
     pub strength: f64,

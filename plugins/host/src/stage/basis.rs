@@ -1,16 +1,13 @@
 //! Bases.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, SMALL, ask, call, make, raw_grid, said};
-use crate::library::Handle;
-use crate::trial;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use ndarray::Array3;
+use super::*;
 
 /// Maximum number of coefficients per voxel.
 const MOST: usize = 64;
+
+settings! {
+    basis BasisSpec(self) -> dyn Basis { self.build(0, BasisStage::tried) }
+}
 
 /// A basis from a library.
 pub struct BasisStage(Foreign<ConefieldBasis>);
@@ -19,7 +16,12 @@ impl BasisStage {
     /// The basis of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let stage = Self(Foreign::new(handle)?);
-        trial::basis(stage.0.ty(), SMALL.shape, &stage.made_on(&SMALL)?)?;
+        let made = stage.made_on(&SMALL)?;
+        let coefficients = made.coefficients.shape;
+        let complaint = try_operator(made.operator(), SMALL.shape, coefficients)
+            .or_else(|| try_operator(made.reference()?, SMALL.shape, coefficients));
+        made.fault()?;
+        stage.0.settled(complaint)?;
         Ok(stage)
     }
 
@@ -33,12 +35,10 @@ impl BasisStage {
         coefficients.validate("coefficients").map_err(|e| own.wrong("info", &e.to_string()))?;
         let voxels: usize = grid.shape.iter().product();
         let count = shape.iter().try_fold(1usize, |n, &k| n.checked_mul(k)).filter(|n| *n <= MOST * voxels.max(64));
-        let many = || own.wrong("info", &format!("{shape:?} coefficients for {:?} voxels", grid.shape));
-        count.ok_or_else(many)?;
+        own.require(count.is_some(), "info", || format!("{shape:?} coefficients for {:?} voxels", grid.shape))?;
         let double = own.functions.expand_f64.is_some() && own.functions.adjoint_f64.is_some();
-        if info.double_precision != 0 && !double {
-            return Err(own.wrong("info", "it declares double precision but has no operators for it"));
-        }
+        let able = info.double_precision == 0 || double;
+        own.require(able, "info", || "it declares double precision but has no operators for it".into())?;
         Ok(ExpansionOn { own, coefficients, info })
     }
 }
@@ -121,3 +121,21 @@ macro_rules! operator {
 
 operator! { f32, expand adjoint }
 operator! { f64, expand_f64 adjoint_f64 }
+
+/// The first complaint about one of the two operators of a basis.
+fn try_operator<R: Marked>(of: &dyn BasisOperator<R>, voxels: [usize; 3], coefficients: [usize; 3]) -> Option<String> {
+    let count = |shape: [usize; 3]| shape.iter().product::<usize>();
+    let try_one = |what: &str, shapes: [[usize; 3]; 2], back: bool| {
+        let [mut from, mut to] = shapes.map(|shape| Guarded::<R>::new(count(shape)));
+        from.inner().iter_mut().zip(drawn(count(shapes[0]))).for_each(|(x, drawn)| *x = R::of(drawn.into()));
+        let x = ArrayView3::from_shape(shapes[0], &*from.inner()).ok()?;
+        let y = ArrayViewMut3::from_shape(shapes[1], to.inner()).ok()?;
+        if back {
+            of.adjoint(x, y)
+        } else {
+            of.expand(x, y)
+        }
+        to.complaint(what).or_else(|| from.broken("input"))
+    };
+    try_one("voxels", [coefficients, voxels], false).or_else(|| try_one("coefficients", [voxels, coefficients], true))
+}

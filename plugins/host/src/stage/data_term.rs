@@ -1,13 +1,11 @@
 //! Data terms.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, MOST_BYTES, call, make, said};
-use crate::library::Handle;
-use crate::trial;
-use conefield_core::prelude::*;
+use super::*;
 use conefield_core::scan::ScanHeader;
-use conefield_plugin_abi::*;
+
+settings! {
+    data_term DataTermSpec(self) -> dyn DataTerm { self.build(0, DataTermStage::tried) }
+}
 
 /// A data term from a library.
 pub struct DataTermStage(Foreign<ConefieldDataTerm>);
@@ -16,7 +14,21 @@ impl DataTermStage {
     /// The data term of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let stage = Self(Foreign::new(handle)?);
-        trial::data_term(stage.0.ty(), |measured| stage.made_of(measured))?;
+        let mut numbers = drawn(2 * 6 * 7).map(|x| 2.0 * x);
+        let scan = Array3::from_shape_simple_fn([2, 6, 7], || numbers.next().unwrap_or_default());
+        let misfit = stage.made_of(scan.view())?;
+        stage.0.settled(below_zero("the noise that it finds", misfit.noise()))?;
+        for (view, measured) in scan.outer_iter().enumerate() {
+            let measured: Vec<f32> = measured.iter().copied().collect();
+            let of = |x| Guarded::of(&vec![x; measured.len()]);
+            let [mut residuals, mut curve, mut spread] = [0.5f32, 1.0, 1.0].map(of);
+            let sum = misfit.differentiate(view, &measured, residuals.inner());
+            misfit.curve(view, &measured, curve.inner());
+            misfit.spread(view, &measured, spread.inner());
+            misfit.fault()?;
+            stage.0.settled(residuals.complaint("derivatives").or_else(|| curve.complaint("curvatures")))?;
+            stage.0.settled(spread.complaint("spread of noise").or_else(|| below_zero("the misfit", sum)))?;
+        }
         Ok(stage)
     }
 

@@ -1,16 +1,9 @@
 //! Initializers.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, call, make, said};
-use crate::library::{self, Handle, Type};
-use crate::trial::{Marked, timed};
+use super::*;
+use crate::spec::Loaded;
 use conefield_core::arena::Block;
-use conefield_core::prelude::*;
 use conefield_core::settings::KnownVolume;
-use conefield_plugin_abi::*;
-use serde_json::Value;
-use std::sync::Arc;
 
 /// An initializer from a library.
 pub struct InitializerStage {
@@ -18,15 +11,16 @@ pub struct InitializerStage {
     volume: Option<KnownVolume>,
 }
 
+settings! {
+    initializer InitializerSpec(self, weights: &dyn Fn(&str) -> Result<Weights>) -> dyn Initializer {
+        build(self, weights).map(Box::new)
+    }
+}
+
 /// Builds an initializer; `weights` reads a file named in its settings.
-pub(crate) fn build(
-    ty: &Arc<Type>,
-    settings: &Value,
-    weights: &dyn Fn(&str) -> Result<Weights>,
-) -> Result<InitializerStage> {
-    let (own, settings) = (ty.clone(), settings.clone());
-    let (own, path) = timed(ty, move || {
-        let own = Foreign::<ConefieldInitializer>::new(own.create(&settings, 0)?)?;
+fn build(loaded: &Loaded, weights: &dyn Fn(&str) -> Result<Weights>) -> Result<InitializerStage> {
+    let (own, path) = *loaded.build(0, |handle| {
+        let own = Foreign::<ConefieldInitializer>::new(handle)?;
         let path = named(&own.handle, "weights", |path| {
             // SAFETY: the stage is alive, `path` is writable.
             own.functions.weights.map(|f| unsafe { f(own.handle.stage, path) })
@@ -34,7 +28,7 @@ pub(crate) fn build(
         Ok((own, path))
     })?;
     let read = path.map(|p| weights(&p)).transpose()?;
-    timed(ty, move || {
+    timed(&loaded.ty, move || {
         let own = match read {
             Some(weights) => with_weights(&own, &weights)?,
             None => own,
@@ -58,7 +52,7 @@ fn named(
     match ask(&mut path) {
         None | Some(CONEFIELD_UNSUPPORTED) => Ok(None),
         // SAFETY: the plugin guarantees that this many bytes are valid while the stage lives.
-        Some(CONEFIELD_OK) => unsafe { library::text(path, &handle.ty.words(), call) }.map(Some),
+        Some(CONEFIELD_OK) => unsafe { text(path, &handle.ty.words(), call) }.map(Some),
         Some(status) => Err(handle.ty.failed(call, status, "")),
     }
 }
@@ -108,9 +102,8 @@ impl Initializer for InitializerStage {
         params.resize(n + GUARD, f32::MARK);
         let mut filled = vec![0u8; blocks.len()];
         call!(self.own, apply(blocks.as_ptr(), blocks.len(), params.as_mut_ptr(), n, filled.as_mut_ptr()))?;
-        if params[n..].iter().any(|v| !v.is_mark()) {
-            return Err(self.own.wrong("apply", "it writes past the parameters"));
-        }
+        let within = params[n..].iter().all(|v| v.is_mark());
+        self.own.require(within, "apply", || "it writes past the parameters".into())?;
         let mut report = InitReport::default();
         for (b, &filled) in layout.blocks.iter().zip(&filled) {
             if filled == 0 {

@@ -1,12 +1,10 @@
 //! Losses.
 
-#![allow(unsafe_code)]
+use super::*;
 
-use super::{Foreign, call, make, said};
-use crate::library::Handle;
-use crate::trial;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
+settings! {
+    loss LossSpec(self) -> dyn Loss { self.build(0, LossStage::tried) }
+}
 
 /// A loss from a library.
 pub struct LossStage {
@@ -20,13 +18,23 @@ impl LossStage {
         let own = Foreign::<ConefieldLoss>::new(handle)?;
         // SAFETY: the stage is alive.
         let needs_scan = own.functions.needs_scan.is_some_and(|f| unsafe { f(own.handle.stage) } != 0);
-        if needs_scan && own.functions.fitted.is_none() {
-            return Err(own.wrong("needs_scan", "it needs a scan with no function fitted"));
-        }
+        let able = !needs_scan || own.functions.fitted.is_some();
+        own.require(able, "needs_scan", || "it needs a scan with no function fitted".into())?;
         let stage = Self { own, needs_scan };
-        trial::loss(stage.own.ty(), |predicted, measured, [loss, slope]| {
-            stage.compare(predicted, measured, loss.as_mut_ptr(), slope.as_mut_ptr())
-        })?;
+        let values: Vec<f64> = (0..16).map(|i| 0.25 * f64::from(i) - 0.5).collect();
+        for shift in [0.0, 0.25, -1.0] {
+            let predicted: Vec<f64> = values.iter().map(|v| v + shift).collect();
+            let [mut loss, mut slope] = [0; 2].map(|_| Guarded::<f64>::new(values.len()));
+            stage.compare(&predicted, &values, loss.inner().as_mut_ptr(), slope.inner().as_mut_ptr())?;
+            stage.own.settled(loss.broken("losses").or_else(|| slope.broken("slopes")))?;
+            for (i, (loss, slope)) in loss.inner().iter().zip(slope.inner()).enumerate() {
+                let pair = format!("predicted {}, measured {}", predicted[i], values[i]);
+                let unwritten = loss.is_mark() || slope.is_mark();
+                stage.own.settled(unwritten.then(|| format!("{pair}: a number is left unwritten")))?;
+                let good = loss.is_finite() && *loss >= 0.0 && slope.is_finite();
+                stage.own.settled((!good).then(|| format!("{pair}: loss {loss}, slope {slope}")))?;
+            }
+        }
         Ok(stage)
     }
 
@@ -43,7 +51,7 @@ impl LossStage {
         let NoiseModel { sigma, growth, measured } = *noise;
         let noise = ConefieldNoise { sigma, growth, measured: measured.as_ptr(), count: measured.len() };
         let Some(handle) = make!(self.own, fitted(&noise))? else { return Ok(None) };
-        Ok(Some(Box::new(trial::timed(self.own.ty(), move || Self::tried(handle))?)))
+        Ok(Some(Box::new(timed(self.own.ty(), move || Self::tried(handle))?)))
     }
 }
 

@@ -1,16 +1,9 @@
 //! Encoders, normalizers and fields.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, ask, call, said};
-use crate::library::Handle;
-use crate::trial::{self, GUARD, Marked};
-use conefield_core::prelude::*;
+use super::*;
 use conefield_core::registry::Kind;
-use conefield_plugin_abi::*;
-use std::collections::BTreeSet;
+use conefield_core::stage::TILE_ROWS;
 use std::ops::Range;
-use std::{ptr, slice};
 
 /// Upper bound of the numbers of parameters, channels, … of a stage: more would overflow computations of hosts.
 const MOST: usize = 1 << 40;
@@ -20,6 +13,14 @@ const WIDEST: usize = 1 << 20;
 
 /// Maximum number of forward passes: a host does some work for each.
 const MOST_PASSES: usize = 1 << 16;
+
+settings! {
+    encoder EncoderSpec(self) -> dyn Encoder { self.build(3, |handle| MapStage::tried(handle, 3)) }
+    normalizer NormalizerSpec(self, width: usize) -> dyn Normalizer {
+        self.build(width, move |handle| MapStage::tried(handle, width))
+    }
+    field FieldSpec(self, width: usize) -> dyn Field { self.build(width, move |handle| MapStage::tried(handle, width)) }
+}
 
 /// An encoder, normalizer or field from a library.
 pub struct MapStage {
@@ -39,7 +40,7 @@ impl MapStage {
         let stage = Self::of(Foreign::new(handle)?)?;
         let found = format!("{width} channels for a stage that takes {}", stage.info.input);
         ensure(stage.info.input == width, "spec", "", found, "as many as it was made for")?;
-        trial::map(stage.own.ty(), &stage)?;
+        try_map(stage.own.ty(), &stage)?;
         Ok(stage)
     }
 
@@ -47,10 +48,15 @@ impl MapStage {
         let mut said = ConefieldInfo::default();
         ask!(own, info(&mut said))?;
         let info = sound(&said).map_err(|what| own.wrong("info", &what))?;
-        able(&own, &said).map_err(|what| own.wrong("info", what))?;
+        // The functions that these properties need.
+        let f = &own.functions;
+        let init = said.params == 0 || f.init.is_some();
+        own.require(init, "info", || "there are parameters and no function init".into())?;
+        let double = said.double_precision == 0 || (f.forward_f64.is_some() && f.backward_f64.is_some());
+        own.require(double, "info", || "it declares double-precision kernels but has none".into())?;
         let parameters = parameters(&own, &said)?;
         let partition = partition(&own, &said)?;
-        let passes = passes(&own).map_err(|what| own.wrong("info", &what))?;
+        let passes = passes(&own)?;
         let resolutions = resolutions(&own, info.output)?;
         Ok(Self { own, info, said, passes, resolutions, parameters, partition })
     }
@@ -71,14 +77,13 @@ impl MapStage {
             status
         })?;
         let derived = self.own.derived("reduce", made)?;
-        let smaller = trial::timed(self.own.ty(), move || {
+        let smaller = timed(self.own.ty(), move || {
             let smaller = Self::of(derived)?;
-            trial::map(smaller.own.ty(), &smaller)?;
+            try_map(smaller.own.ty(), &smaller)?;
             Ok(smaller)
         })?;
-        if r.params_count > info.params || r.channels_count > info.input.max(info.output) {
-            return Err(self.own.wrong("reduce", "it keeps more than there is"));
-        }
+        let fewer = r.params_count <= info.params && r.channels_count <= info.input.max(info.output);
+        self.own.require(fewer, "reduce", || "it keeps more than there is".into())?;
         // SAFETY: the plugin guarantees that this many items are valid while the reduced stage lives.
         let (ranges, channels) = unsafe { (many(r.params, r.params_count), many(r.channels, r.channels_count)) };
         let params: Vec<Range<usize>> = ranges.iter().map(|r| r.start..r.end).collect();
@@ -136,33 +141,19 @@ fn sound(i: &ConefieldInfo) -> Result<Info, String> {
     Ok(Info { input, output, params, tape, scope, grads, macs, identity: i.identity != 0 })
 }
 
-/// Checks that the functions needed for the reported properties exist.
-fn able(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<(), &'static str> {
-    let f = &own.functions;
-    let all = [
-        (i.params == 0 || f.init.is_some(), "there are parameters and no function init"),
-        (
-            i.double_precision == 0 || (f.forward_f64.is_some() && f.backward_f64.is_some()),
-            "it declares double-precision kernels but has none",
-        ),
-    ];
-    all.into_iter().find(|(holds, _)| !holds).map_or(Ok(()), |(_, what)| Err(what))
-}
-
 /// Number of forward passes.
-fn passes(own: &Foreign<ConefieldMap>) -> Result<usize, String> {
+fn passes(own: &Foreign<ConefieldMap>) -> Result<usize> {
     let f = &own.functions;
     // SAFETY: the stage is alive.
     let passes = f.passes.map_or(1, |f| unsafe { f(own.handle.stage) });
-    if passes == 0 || passes > MOST_PASSES || (passes > 1 && f.forward_pass.is_none()) {
-        let there = if f.forward_pass.is_some() { "a" } else { "no" };
-        return Err(format!("it goes forward in {passes} passes with {there} function forward_pass"));
-    }
+    let able = passes == 1 || (2..=MOST_PASSES).contains(&passes) && f.forward_pass.is_some();
+    let there = if f.forward_pass.is_some() { "a" } else { "no" };
+    own.require(able, "info", || format!("it goes forward in {passes} passes with {there} function forward_pass"))?;
     Ok(passes)
 }
 
 fn parameters(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Parameter>> {
-    let wrong = |what: String| own.wrong("parameter", &what);
+    let require = |holds: bool, what: &dyn Fn() -> String| own.require(holds, "parameter", what);
     let mut all: Vec<Parameter> = vec![];
     let mut names = BTreeSet::new();
     let mut start = 0usize;
@@ -171,32 +162,23 @@ fn parameters(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Para
         // SAFETY: the stage is alive, `p` is writable.
         let status =
             own.functions.parameter.map_or(CONEFIELD_FAILED, |f| unsafe { f(own.handle.stage, index, &mut p) });
-        if status != CONEFIELD_OK {
-            return Err(wrong(format!("block {index} of {} is missing", i.blocks)));
-        }
-        if p.name.length == 0 || p.name.length > 256 || p.dimensions > 8 || p.name.data.is_null() {
-            return Err(wrong(format!(
-                "block {index} has a name of {} bytes, {} dimensions",
-                p.name.length, p.dimensions
-            )));
-        }
+        require(status == CONEFIELD_OK, &|| format!("block {index} of {} is missing", i.blocks))?;
+        let (bytes, dimensions) = (p.name.length, p.dimensions);
+        let sane = (1..=256).contains(&bytes) && dimensions <= 8 && !p.name.data.is_null();
+        require(sane, &|| format!("block {index} has a name of {bytes} bytes, {dimensions} dimensions"))?;
         // SAFETY: the plugin guarantees that this many items are valid while the stage lives.
         let (name, shape) = unsafe { (many(p.name.data, p.name.length), many(p.shape, p.dimensions)) };
         let name = String::from_utf8_lossy(name).into_owned();
         let count = shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d)).filter(|&n| n <= i.params);
-        let Some(count) = count else { return Err(wrong(format!("block {name:?} has shape {shape:?}"))) };
-        if !names.insert(name.clone()) {
-            return Err(wrong(format!("two blocks are called {name:?}")));
-        }
+        require(count.is_some(), &|| format!("block {name:?} has shape {shape:?}"))?;
+        require(names.insert(name.clone()), &|| format!("two blocks are called {name:?}"))?;
         all.push(Parameter { name, shape: shape.to_vec(), start });
-        start += count;
+        start += count.unwrap_or_default();
         if start > i.params {
             break;
         }
     }
-    if start != i.params {
-        return Err(wrong(format!("blocks of {start} parameters in all, where there are {}", i.params)));
-    }
+    require(start == i.params, &|| format!("blocks of {start} parameters in all, where there are {}", i.params))?;
     Ok(all)
 }
 
@@ -204,20 +186,20 @@ fn partition(own: &Foreign<ConefieldMap>, i: &ConefieldInfo) -> Result<Vec<Range
     let parts = i.grads == CONEFIELD_GRADS_SCATTER && i.partitions > 1;
     let whole = 0..i.params;
     let Some(f) = own.functions.partition.filter(|_| parts) else { return Ok(vec![whole]) };
-    let wrong = |what: String| own.wrong("partition", &what);
     let mut all = vec![];
     let mut end = 0;
     for index in 0..i.partitions {
         let mut r = ConefieldRange::default();
         // SAFETY: the stage is alive, `r` is writable.
         let status = unsafe { f(own.handle.stage, index, &mut r) };
-        if status != CONEFIELD_OK || r.start != end || r.end <= r.start || r.end > i.params {
-            return Err(wrong(format!("range {index} is {}..{} after {end} of {}", r.start, r.end, i.params)));
-        }
+        let next = status == CONEFIELD_OK && r.start == end && r.end > r.start && r.end <= i.params;
+        let what = || format!("range {index} is {}..{} after {end} of {}", r.start, r.end, i.params);
+        own.require(next, "partition", what)?;
         all.push(r.start..r.end);
         end = r.end;
     }
-    if end == i.params { Ok(all) } else { Err(wrong(format!("ranges end at {end} of {}", i.params))) }
+    own.require(end == i.params, "partition", || format!("ranges end at {end} of {}", i.params))?;
+    Ok(all)
 }
 
 /// Resolution of each of `count` channels in cells, if the encoder reports it.
@@ -228,16 +210,15 @@ fn resolutions(own: &Foreign<ConefieldMap>, count: usize) -> Result<Option<Vec<f
     if !own.asked("resolutions", |stage, error| unsafe { f(stage, cells.as_mut_ptr(), count, error) })? {
         return Ok(None);
     }
-    let wrong = |what: String| Err(own.wrong("resolutions", &what));
-    if !cells[count..].iter().all(|v| v.is_mark()) {
-        return wrong(format!("it writes past the {count} channels that there are"));
-    }
+    let within = cells[count..].iter().all(|v| v.is_mark());
+    own.require(within, "resolutions", || format!("it writes past the {count} channels that there are"))?;
     cells.truncate(count);
-    match cells.iter().position(|v| !(v.is_finite() && *v > 0.0)) {
-        Some(c) if cells[c].is_mark() => wrong(format!("channel {c} of {count} is left unwritten")),
-        Some(c) => wrong(format!("channel {c} of {count} resolves {} cells", cells[c])),
-        None => Ok(Some(cells)),
+    for (c, cells) in cells.iter().enumerate() {
+        own.require(!cells.is_mark(), "resolutions", || format!("channel {c} of {count} is left unwritten"))?;
+        let sound = cells.is_finite() && *cells > 0.0;
+        own.require(sound, "resolutions", || format!("channel {c} of {count} resolves {cells} cells"))?;
     }
+    Ok(Some(cells))
 }
 
 /// Channel-major rows in the format of the ABI.
@@ -370,4 +351,67 @@ impl Normalizer for MapStage {
     fn keep_inputs(&self, keep: &[usize]) -> Result<Reduced<dyn Normalizer>> {
         self.reduce(CONEFIELD_INPUTS, keep, |stage| Box::new(stage))
     }
+}
+
+/// Stages with more parameters are not initialized for their trial: it takes long, and the run does it anyway.
+const MANY: usize = 1 << 20;
+
+/// Tries an encoder, normalizer or field of type `ty`.
+fn try_map(ty: &Type, stage: &dyn Stage) -> Result<()> {
+    let info = stage.info();
+    let mut params = Guarded::zeroed(info.params);
+    if info.params <= MANY {
+        stage.init(1, params.inner());
+        stage.fault()?;
+        settled(ty, params.broken("parameters").or_else(|| params.unsound("initial parameters")))?;
+    }
+    for rows in [1, 3, TILE_ROWS] {
+        try_tile(ty, stage, &mut params, rows)?;
+    }
+    Ok(())
+}
+
+/// Tries the kernel of a stage on a tile.
+fn try_tile(ty: &Type, stage: &dyn Stage, params: &mut Guarded<f32>, rows: usize) -> Result<()> {
+    let (info, kernel) = (stage.info(), stage.kernel());
+    let range: Range<usize> = match info.grads {
+        GradKind::Scatter => stage.partition().into_iter().min_by_key(Range::len).unwrap_or(0..info.params),
+        _ => 0..info.params,
+    };
+    let mut x = Guarded::new(info.input * rows);
+    for (i, x) in x.inner().iter_mut().enumerate() {
+        *x = unit(mix(7, i as u64));
+    }
+    let [mut y, mut tape, mut dx] = [info.output, info.tape, info.input].map(|c| Guarded::new(c * rows));
+    let (to, left) = (TileMut::new(y.inner(), rows), TileMut::new(tape.inner(), rows));
+    kernel.forward(params.inner(), Tile::new(x.inner(), rows), to, left);
+    stage.fault()?;
+    settled(ty, y.broken("output").or_else(|| tape.broken("tape")).or_else(|| y.unsound("output")))?;
+    let changed = info.identity && y.inner() != x.inner();
+    settled(ty, changed.then(|| "an identity must return its input unchanged".into()))?;
+    if kernel.passes() > 1 {
+        let [mut again, mut left] = [info.output, info.tape].map(|c| Guarded::new(c * rows));
+        for pass in 0..kernel.passes() {
+            let (y, tape) = (TileMut::new(again.inner(), rows), TileMut::new(left.inner(), rows));
+            kernel.forward_pass(pass, params.inner(), Tile::new(x.inner(), rows), y, tape);
+        }
+        stage.fault()?;
+        settled(ty, again.broken("output in passes").or_else(|| left.broken("tape in passes")))?;
+        let same = again.inner() == y.inner() && left.inner() == tape.inner();
+        settled(ty, (!same).then(|| "its passes together are not its forward".into()))?;
+    }
+    let dy = vec![1.0; info.output * rows];
+    let mut grads = Guarded::zeroed(range.len());
+    kernel.backward(Backward {
+        params: params.inner(),
+        x: Tile::new(x.inner(), rows),
+        tape: TileMut::new(tape.inner(), rows),
+        dy: Tile::new(&dy, rows),
+        grads: Grads { values: grads.inner(), range },
+        dx: Some(TileMut::new(dx.inner(), rows)),
+    });
+    stage.fault()?;
+    settled(ty, grads.broken("gradients").or_else(|| dx.broken("input gradient")))?;
+    settled(ty, tape.broken("tape").or_else(|| x.broken("input")).or_else(|| params.broken("parameters")))?;
+    settled(ty, grads.unsound("gradients").or_else(|| dx.unsound("input gradient")))
 }

@@ -1,12 +1,10 @@
 //! Priors of a field.
 
-#![allow(unsafe_code)]
+use super::*;
 
-use super::{Foreign, ask, call, said};
-use crate::library::Handle;
-use crate::trial;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
+settings! {
+    prior PriorSpec(self) -> dyn Prior { self.build(0, PriorStage::tried) }
+}
 
 /// A prior from a library.
 pub struct PriorStage {
@@ -23,9 +21,11 @@ impl PriorStage {
         let blocks = Blocks { edge: b.edge, count: b.count, spacing: b.spacing, weight: b.weight };
         blocks.validate().map_err(|e| own.wrong("blocks", &e.to_string()))?;
         let stage = Self { own, blocks };
-        trial::prior(stage.own.ty(), blocks.points(), |values, gradient| {
-            stage.penalty(values, 1.0, gradient.as_mut_ptr())
-        })?;
+        let values: Vec<f64> = drawn(blocks.points()).map(f64::from).collect();
+        let mut gradient = Guarded::zeroed(values.len());
+        let penalty = stage.penalty(&values, 1.0, gradient.inner().as_mut_ptr())?;
+        stage.own.settled(gradient.broken("gradient").or_else(|| below_zero("the penalty of a block", penalty)))?;
+        stage.own.settled(gradient.unsound("gradient"))?;
         Ok(stage)
     }
 

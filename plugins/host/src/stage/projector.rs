@@ -1,17 +1,14 @@
 //! Projectors.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, call, make, raw_ray, said};
-use crate::library::Handle;
-use crate::trial::{self, Marked};
-use conefield_core::prelude::*;
+use super::*;
 use conefield_core::stage::Lengths;
-use conefield_plugin_abi::*;
-use std::ptr;
 
 /// Maximum number of samples per ray: more than any detector resolves.
 const MOST: usize = 1 << 24;
+
+settings! {
+    projector ProjectorSpec(self) -> dyn Projector { self.build(0, ProjectorStage::tried) }
+}
 
 /// A projector from a library.
 pub struct ProjectorStage(Foreign<ConefieldProjector>);
@@ -20,12 +17,15 @@ impl ProjectorStage {
     /// The projector of `handle`, after a trial.
     pub(crate) fn tried(handle: Handle) -> Result<Self> {
         let stage = Self(Foreign::new(handle)?);
-        trial::projector(stage.0.ty(), |ray, seed, guard| {
+        for (ray, seed) in rays().into_iter().flat_map(|ray| [(ray, None), (ray, Some(3))]) {
             let mut samples = Samples::default();
-            stage.sample_guarded(ray, seed, guard, &mut samples)?;
-            trial::derivatives(stage.0.ty(), samples.weights.len(), |dmu| stage.derive(&samples.weights, 1.0, dmu))?;
-            Ok(stage.integrate(&samples.weights, &vec![1.0; samples.weights.len()]))
-        })?;
+            stage.sample_guarded(&ray, seed, GUARD, &mut samples)?;
+            let mut dmu = Guarded::<f64>::new(samples.weights.len());
+            stage.derive(&samples.weights, 1.0, dmu.inner());
+            stage.0.settled(dmu.complaint("derivatives"))?;
+            let line = stage.integrate(&samples.weights, &vec![1.0; samples.weights.len()]);
+            stage.0.settled((!line.is_finite()).then(|| format!("the line integral of ones is {line}")))?;
+        }
         Ok(stage)
     }
 
@@ -66,20 +66,19 @@ impl ProjectorStage {
         points: &mut [[f32; 3]],
         weights: &mut [f32],
     ) -> Result<usize> {
-        let failed = |what: &str| Err(self.0.wrong("sample", what));
         let (ray, seed) = (raw_ray(ray), seed.as_ref().map_or(ptr::null(), ptr::from_ref));
         let mut count = 0;
         let (to, by) = (points.as_mut_ptr().cast(), weights.as_mut_ptr());
         call!(self.0, sample(&ray, seed, to, by, capacity, &mut count))?;
-        if count > capacity {
-            return failed(&format!("{count} samples, more than its maximum of {capacity}"));
-        }
-        if points[capacity..].iter().flatten().chain(&weights[capacity..]).any(|v| !v.is_mark()) {
-            return failed(&format!("it writes past the {capacity} samples that there is room for"));
-        }
+        let require = |holds, what: &dyn Fn() -> String| self.0.require(holds, "sample", what);
+        require(count <= capacity, &|| format!("{count} samples, more than its maximum of {capacity}"))?;
+        let within = points[capacity..].iter().flatten().chain(&weights[capacity..]).all(|v| v.is_mark());
+        require(within, &|| format!("it writes past the {capacity} samples that there is room for"))?;
         let bad = |i: &usize| !points[*i].iter().chain([&weights[*i]]).all(|v| v.is_finite());
         match (0..count).find(bad) {
-            Some(i) => failed(&format!("sample {i} is at {:?} with weight {}", points[i], weights[i])),
+            Some(i) => {
+                Err(self.0.wrong("sample", &format!("sample {i} is at {:?} with weight {}", points[i], weights[i])))
+            }
             None => Ok(count),
         }
     }
@@ -89,12 +88,8 @@ impl Projector for ProjectorStage {
     fn max_samples(&self, ray: &UnitRay) -> usize {
         // SAFETY: the stage is alive, the ray lives during the call.
         let most = self.0.functions.max_samples.map_or(0, |f| unsafe { f(self.0.handle.stage, &raw_ray(ray)) });
-        let few = if most > MOST {
-            Err(self.0.wrong("max_samples", &format!("{most} samples for one ray")))
-        } else {
-            Ok(most)
-        };
-        self.0.noted(few, 0)
+        let few = self.0.require(most <= MOST, "max_samples", || format!("{most} samples for one ray"));
+        self.0.noted(few.map(|()| most), 0)
     }
 
     fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples) {
@@ -122,8 +117,26 @@ impl Projector for ProjectorStage {
         let Lengths { voxel_mm, cell_mm } = lengths;
         let lengths = ConefieldLengths { voxel_mm, cell_mm: cell_mm.unwrap_or(0.0) };
         let Some(handle) = make!(self.0, fitted(&lengths))? else { return Ok(None) };
-        Ok(Some(Box::new(trial::timed(self.0.ty(), move || Self::tried(handle))?)))
+        Ok(Some(Box::new(timed(self.0.ty(), move || Self::tried(handle))?)))
     }
 
     said! { 0: describe fault wgsl }
+}
+
+/// Rays along an axis, across the cube, in the opposite direction, and past the cube.
+fn rays() -> [UnitRay; 4] {
+    let ray = |origin, direction: [f32; 3], inside| UnitRay {
+        origin,
+        direction,
+        inside,
+        published: [0.5, 3.0],
+        per_mm: 0.01,
+    };
+    let third = (1.0f32 / 3.0).sqrt();
+    [
+        ray([-1.0, 0.5, 0.5], [1.0, 0.0, 0.0], [1.0, 2.0]),
+        ray([-third; 3], [third; 3], [1.0, 1.0 + 1.0 / third]),
+        ray([0.5, 2.0, 0.25], [0.0, -1.0, 0.0], [1.0, 2.0]),
+        ray([-1.0, 5.0, 0.5], [1.0, 0.0, 0.0], [0.0, 0.0]),
+    ]
 }

@@ -1,19 +1,14 @@
 //! Regularizers.
 
-#![allow(unsafe_code)]
-
-use super::{Foreign, MOST_BYTES, SMALL, call, make, raw_grid, said};
-use crate::library::{Handle, text};
-use crate::trial;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::collections::BTreeSet;
-use std::ffi::c_void;
+use super::*;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::{ptr, slice};
 
 /// Maximum number of state values per coefficient.
 const MOST_STATE: usize = 64;
+
+settings! {
+    regularizer RegularizerSpec(self) -> dyn Regularizer { self.build(0, RegularizerStage::tried) }
+}
 
 /// A regularizer from a library.
 pub struct RegularizerStage(Foreign<ConefieldRegularizer>);
@@ -24,10 +19,16 @@ impl RegularizerStage {
         let stage = Self(Foreign::new(handle)?);
         stage.weight(&SMALL, &mut |k| 0.01 * k)?;
         let mut penalty = stage.made_on(&SMALL)?;
-        trial::regularizer(stage.0.ty(), penalty.count, |v, u| {
-            penalty.try_prox(v, 0.1, u)?;
-            penalty.try_value(v)
-        })?;
+        let mut v = Guarded::of(&drawn(penalty.count).map(|x| x - 0.3).collect::<Vec<f32>>());
+        for _ in 0..2 {
+            let mut u = Guarded::<f32>::new(penalty.count);
+            penalty.try_prox(v.inner(), 0.1, u.inner())?;
+            let value = penalty.try_value(v.inner())?;
+            stage.0.settled(u.complaint("coefficients").or_else(|| v.broken("input")))?;
+            stage.0.settled(below_zero("the penalty", value))?;
+            let negative = u.inner().iter().find(|u| **u < 0.0).map(|u| format!("its proximal map gives {u}"));
+            stage.0.settled(negative)?;
+        }
         Ok(stage)
     }
 
@@ -103,18 +104,15 @@ impl PenaltyOn {
     }
 
     fn read_state(&self) -> Result<Vec<(String, usize)>> {
-        let wrong = |what: String| self.own.wrong("state", &what);
         let (mut all, mut names, mut numbers) = (vec![], BTreeSet::new(), 0usize);
         while let Some(entry) = self.entry(all.len())? {
             // SAFETY: the plugin guarantees that this many bytes are valid while the penalty lives.
             let name = unsafe { text(entry.name, &self.own.ty().words(), "state") }?;
             numbers = numbers.saturating_add(entry.length);
-            if entry.data.is_null() || entry.length == 0 || numbers > MOST_STATE * self.count.max(64) {
-                return Err(wrong(format!("{name:?} has {} numbers", entry.length)));
-            }
-            if !names.insert(name.clone()) {
-                return Err(wrong(format!("two entries are called {name:?}")));
-            }
+            let sane = !entry.data.is_null() && entry.length > 0 && numbers <= MOST_STATE * self.count.max(64);
+            self.own.require(sane, "state", || format!("{name:?} has {} numbers", entry.length))?;
+            let fresh = names.insert(name.clone());
+            self.own.require(fresh, "state", || format!("two entries are called {name:?}"))?;
             all.push((name, entry.length));
         }
         Ok(all)

@@ -1,12 +1,12 @@
 //! Bases and their expansions on a grid.
 
-use super::{array, array_mut, grid, guard, hand_over_on, shims, table};
-use crate::built::OnGrid;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
+use super::*;
 
-table! { ConefieldBasis: on info expand adjoint expand_f64 adjoint_f64 }
+table! {
+    ConefieldBasis: on info expand adjoint expand_f64 adjoint_f64;
+    basis(keys, _) { Box::new(settings::<dyn BasisSpec>(keys)?.build()?) };
+    dyn Basis: "basis", On: "basis on a grid"
+}
 
 /// What a basis makes for one grid.
 type On = OnGrid<dyn Expansion>;
@@ -14,7 +14,7 @@ type On = OnGrid<dyn Expansion>;
 shims! {
     fn on(basis: dyn Basis, voxels: *const ConefieldGrid, expansion: *mut *mut c_void; error) {
         let grid = grid(voxels);
-        *expansion = hand_over_on(grid.shape, basis.on(&grid)?);
+        *expansion = hand_over(Box::new(OnGrid { shape: grid.shape, part: basis.on(&grid)? }));
     }
 
     fn info(on: On, out: *mut ConefieldExpansion) {

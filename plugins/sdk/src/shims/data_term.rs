@@ -1,12 +1,12 @@
 //! Data terms and their misfits for a scan.
 
-use super::{array, guard, hand_over, header, many, many_mut, shims, table};
-use crate::built::Built;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
+use super::*;
 
-table! { ConefieldDataTerm: bytes of noise differentiate curve spread }
+table! {
+    ConefieldDataTerm: bytes of noise differentiate curve spread;
+    data_term(keys, _) { Box::new(settings::<dyn DataTermSpec>(keys)?.build()?) };
+    dyn DataTerm: "data term", dyn Misfit: "data term of a scan"
+}
 
 shims! {
     fn bytes(term: dyn DataTerm, shape: *const usize, held: *mut u64, brief: *mut u64) -> (), or (), {
@@ -19,9 +19,7 @@ shims! {
     fn of(
         term: dyn DataTerm, measured: *const f32, shape: *const usize, misfit: *mut *mut c_void; error
     ) {
-        let made = term.of(array(*shape.cast(), measured)?)?;
-        let describe = made.describe();
-        *misfit = hand_over(Built::of(made, describe));
+        *misfit = hand_over(term.of(array(*shape.cast(), measured)?)?);
     }
 
     fn noise(misfit: dyn Misfit) -> f64, or f64::NAN, { misfit.noise() }

@@ -1,13 +1,14 @@
 //! Initializers.
 
-use super::{guard, hand_over, many, many_mut, shims, table, text};
+use super::*;
 use crate::built::{Filling, Waiting};
 use conefield_core::arena::Block;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
 
-table! { ConefieldInitializer: apply check weights with_weights volume }
+table! {
+    ConefieldInitializer: apply check weights with_weights volume;
+    initializer(keys, _) { Waiting::build(settings(keys)?)? };
+    Filling: "initializer that fills parameters", Waiting: "initializer that waits for weights"
+}
 
 unsafe fn layout(blocks: *const ConefieldBlock, count: usize) -> Result<Layout> {
     let block = |b: &ConefieldBlock| -> Result<Block> {

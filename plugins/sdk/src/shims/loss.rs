@@ -1,12 +1,12 @@
 //! Losses.
 
-use super::{guard, hand_over, many, many_mut, shims, table, write_wgsl};
-use crate::built::Built;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
+use super::*;
 
-table! { ConefieldLoss: at needs_scan fitted wgsl }
+table! {
+    ConefieldLoss: at needs_scan fitted wgsl;
+    loss(keys, _) { Box::new(settings::<dyn LossSpec>(keys)?.build()?) };
+    dyn Loss: "loss"
+}
 
 shims! {
     fn at(loss: dyn Loss, predicted: *const f64, measured: *const f64, count: usize, out: *mut f64, slope: *mut f64; error) {
@@ -25,8 +25,7 @@ shims! {
         let fitted = loss.fitted(&NoiseModel { sigma, growth, measured: many(measured, count) });
         loss.fault()?;
         if let Some(fitted) = fitted {
-            let describe = fitted.describe();
-            *out = hand_over(Built::of(fitted, describe));
+            *out = hand_over(fitted);
         }
     }
 

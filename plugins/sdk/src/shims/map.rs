@@ -1,13 +1,16 @@
 //! Encoders, normalizers and fields.
 
-use super::{guard, hand_over, many, many_mut, shims, table, write_wgsl};
-use crate::built::Map;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
+use super::*;
+use crate::built::{Map, Rows};
 use std::borrow::Cow;
-use std::ffi::c_void;
 
-table! { ConefieldMap: info parameter init forward backward forward_f64 backward_f64 partition reduce wgsl passes forward_pass resolutions }
+table! {
+    ConefieldMap: info parameter init forward backward forward_f64 backward_f64 partition reduce wgsl passes forward_pass resolutions;
+    encoder(keys, _) { of(Rows::Encoder(settings::<dyn EncoderSpec>(keys)?.build()?)) }
+    normalizer(keys, width) { of(Rows::Normalizer(settings::<dyn NormalizerSpec>(keys)?.build(width)?)) }
+    field(keys, width) { of(Rows::Field(settings::<dyn FieldSpec>(keys)?.build(width)?)) };
+    Map: "encoder, normalizer or field"
+}
 
 shims! {
     fn info(map: Map, out: *mut ConefieldInfo) {
@@ -39,7 +42,7 @@ shims! {
     }
 
     fn reduce(map: Map, side: u32, keep: *const usize, keep_count: usize, out: *mut ConefieldReduced; error) {
-        let smaller = map.reduced(side, many(keep, keep_count))?;
+        let smaller = Box::new(map.reduced(side, many(keep, keep_count))?);
         // Both lists stay where they are when the stage moves.
         let (params, channels) = &smaller.kept;
         *out = ConefieldReduced {
@@ -47,13 +50,17 @@ shims! {
             params_count: params.len(),
             channels: channels.as_ptr(),
             channels_count: channels.len(),
-            stage: hand_over(smaller.built()),
+            stage: hand_over(smaller),
         };
     }
 
     fn wgsl(map: Map; source) {
         write_wgsl(source, map.stage().wgsl())?;
     }
+}
+
+fn of(rows: Rows) -> super::Held {
+    Box::new(Box::new(Map::of(rows)))
 }
 
 /// Channels in the host's memory, with a stride.

@@ -15,19 +15,42 @@ pub mod prior;
 pub mod projector;
 pub mod regularizer;
 
-use crate::built::{Built, OnGrid};
+// The shims of each kind begin with these imports, too.
+use crate::built::{Named, OnGrid, Part, settings};
 use conefield_core::prelude::*;
-use conefield_core::registry::StageType;
+use conefield_core::registry::{Kind, StageType};
 use conefield_core::scan::ScanHeader;
 use conefield_plugin_abi::*;
+use serde_json::Value;
 use std::ffi::c_void;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::{mem, ptr, slice};
 
-/// The table of a kind, with these functions.
+/// Defines the table of a kind, with these functions; the constructors of its kinds, each called as its kind; and the
+/// parts that the functions take, each with its name in errors.
 macro_rules! table {
-    ($table:ident: $($function:ident)*) => {
+    (
+        $table:ident: $($function:ident)*;
+        $($kind:ident($keys:pat, $width:pat) { $build:expr })*;
+        $($part:ty: $name:literal),*
+    ) => {
         pub static TABLE: $table = $table { size: size_of::<$table>(), $($function: Some($function),)* };
+
+        $(pub fn $kind($keys: serde_json::Value, $width: usize) -> Result<crate::shims::Held> {
+            Ok($build)
+        })*
+
+        $(
+            impl crate::built::Named for $part {
+                const NAME: &str = $name;
+            }
+
+            impl crate::built::Part for Box<$part> {
+                fn describe(&self) -> String {
+                    (**self).describe()
+                }
+            }
+        )*
     };
 }
 use table;
@@ -46,7 +69,7 @@ macro_rules! shims {
             let error = [$($error,)? std::ptr::null_mut()][0];
             // SAFETY: see `shims/mod.rs`.
             guard(error, || unsafe {
-                let $stage = crate::shims::built(stage).get::<$kind>()?;
+                let $stage = crate::shims::held(stage).get::<$kind>()?;
                 $body;
                 Ok(())
             })
@@ -62,7 +85,7 @@ macro_rules! shims {
             let error = [$($error,)? std::ptr::null_mut()][0];
             // SAFETY: see `shims/mod.rs`; nothing else uses the stage meanwhile.
             guard(error, || unsafe {
-                let $stage = (*stage.cast::<crate::built::Built>()).get_mut::<$kind>()?;
+                let $stage = (*stage.cast::<crate::shims::Held>()).get_mut::<$kind>()?;
                 $body;
                 Ok(())
             })
@@ -74,7 +97,7 @@ macro_rules! shims {
             let mut out = $failed;
             // SAFETY: see `shims/mod.rs`.
             guard(std::ptr::null_mut(), || unsafe {
-                let $stage = crate::shims::built(stage).get::<$kind>()?;
+                let $stage = crate::shims::held(stage).get::<$kind>()?;
                 out = $body;
                 Ok(())
             });
@@ -166,19 +189,20 @@ unsafe fn array_mut<'a, R: Real>(shape: [usize; 3], data: *mut R) -> Result<Arra
     ArrayViewMut3::from_shape(shape, data).map_err(|e| Error::unsupported("an array from the host", e.to_string()))
 }
 
-unsafe fn built<'a>(stage: *const c_void) -> &'a Built {
+/// A part as it is held behind a pointer.
+type Held = Box<dyn Part>;
+
+unsafe fn held<'a>(stage: *const c_void) -> &'a Held {
     // SAFETY: see the top of this file.
-    unsafe { &*stage.cast::<Built>() }
+    unsafe { &*stage.cast::<Held>() }
 }
 
-/// Passes ownership of a stage to the host.
-fn hand_over(built: Built) -> *mut c_void {
-    Box::into_raw(Box::new(built)).cast()
-}
-
-/// The same of what a stage made for a grid of this shape.
-fn hand_over_on<T: ?Sized + 'static>(shape: [usize; 3], part: Box<T>) -> *mut c_void {
-    hand_over(Built::of(Box::new(OnGrid { shape, part }), String::new()))
+/// Passes ownership of a part to the host.
+fn hand_over<T: Named + ?Sized>(part: Box<T>) -> *mut c_void
+where
+    Box<T>: Part,
+{
+    Box::into_raw(Box::<Held>::new(Box::new(part))).cast()
 }
 
 /// Writes the WGSL of a stage, if there is some.
@@ -186,6 +210,23 @@ fn write_wgsl(out: *mut ConefieldText, fragment: Option<Fragment>) -> Result<()>
     let fragment = fragment.ok_or_else(|| Error::unsupported("this stage", "it has no WGSL"))?;
     write(out, &fragment.source);
     Ok(())
+}
+
+/// The stage of type `t` with `keys`, its settings without their type; some need the number of input channels.
+fn build(t: &StageType, mut keys: Value, width: usize) -> Result<Held> {
+    let Some(table) = keys.as_object_mut() else {
+        return Err(Error::invalid("spec", "", &keys, "a table of settings"));
+    };
+    table.insert("type".into(), t.name.into());
+    macro_rules! built {
+        ($($table:ident $field:ident: $($kind:ident $name:ident $code:ident $spec:ident $place:literal),+;)*) => {
+            match t.kind {
+                $($(Kind::$kind => $field::$name(keys, width),)+)*
+                other => Err(Error::unsupported(t.name, format!("a {other} cannot come from a plugin"))),
+            }
+        };
+    }
+    conefield_plugin_abi::kinds! { built }
 }
 
 pub unsafe extern "C" fn create(
@@ -199,8 +240,9 @@ pub unsafe extern "C" fn create(
         // SAFETY: see the top of this file; `context` is set by the table and points to a static.
         let (t, settings) = unsafe { (&*context.cast::<StageType>(), text(settings)?) };
         let settings = serde_json::from_str(settings).map_err(|e| Error::invalid("spec", "", e, "JSON"))?;
+        let part = build(t, settings, width)?;
         // SAFETY: see the top of this file.
-        unsafe { *stage = hand_over(Built::new(t, settings, width)?) };
+        unsafe { *stage = Box::into_raw(Box::new(part)).cast() };
         Ok(())
     })
 }
@@ -208,7 +250,7 @@ pub unsafe extern "C" fn create(
 pub unsafe extern "C" fn destroy(stage: *mut c_void) {
     guard(ptr::null_mut(), || {
         // SAFETY: see the top of this file; the host gives up ownership here.
-        drop(unsafe { Box::from_raw(stage.cast::<Built>()) });
+        drop(unsafe { Box::from_raw(stage.cast::<Held>()) });
         Ok(())
     });
 }
@@ -216,7 +258,7 @@ pub unsafe extern "C" fn destroy(stage: *mut c_void) {
 pub unsafe extern "C" fn describe(stage: *const c_void, out: *mut ConefieldText) -> ConefieldStatus {
     guard(out, || {
         // SAFETY: see the top of this file.
-        write(out, &unsafe { built(stage) }.describe);
+        write(out, &unsafe { held(stage) }.describe());
         Ok(())
     })
 }
@@ -224,16 +266,12 @@ pub unsafe extern "C" fn describe(stage: *const c_void, out: *mut ConefieldText)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use conefield_core::registry::{Kind, find};
-    use conefield_core::settings::EncoderSpec;
-    use conefield_core::stage::{Backward, Encoder, GradKind, Info, Kernel, Parameter, Scope, Stage, Tile, TileMut};
-    use schemars::JsonSchema;
-    use serde::{Deserialize, Serialize};
+    use conefield_core::registry::find;
 
-    /// `y = w·x`, or a panic.
+    /// `y = w·x`.
     #[derive(Clone, Serialize, Deserialize, JsonSchema)]
     struct Scaled {
-        panics: bool,
+        initial: f32,
     }
 
     conefield_core::stage_type!(EncoderSpec, "scaled", Scaled, "for tests");
@@ -245,7 +283,6 @@ mod tests {
 
     impl Kernel<f32> for Scaled {
         fn forward(&self, params: &[f32], x: Tile<'_, f32>, y: TileMut<'_, f32>, tape: TileMut<'_, f32>) {
-            assert!(!self.panics, "on request, {}", "é".repeat(600));
             for (y, x) in y.data.iter_mut().zip(x.data) {
                 *y = params[0] * x;
             }
@@ -263,14 +300,13 @@ mod tests {
 
     impl Stage for Scaled {
         fn info(&self) -> Info {
-            let (scope, grads) = (Scope::Row, GradKind::Dense);
-            Info { input: 3, output: 3, params: 1, tape: 1, scope, grads, macs: 3, identity: false }
+            Info { input: 3, output: 3, params: 1, tape: 1, grads: GradKind::Dense, ..Info::default() }
         }
         fn parameters(&self) -> Vec<Parameter> {
             vec![Parameter { name: "w".into(), shape: vec![1], start: 0 }]
         }
         fn init(&self, _: u64, params: &mut [f32]) {
-            params.fill(2.0);
+            params.fill(self.initial);
         }
         fn kernel(&self) -> &dyn Kernel<f32> {
             self
@@ -297,7 +333,7 @@ mod tests {
     /// Rows `0..3` of 3 channels with stride 5; the gaps are -1 and must stay so.
     #[test]
     fn strided_tiles_are_read_and_written_in_place() {
-        let (status, stage) = made(r#"{"panics": false}"#, ptr::null_mut());
+        let (status, stage) = made(r#"{"initial": 2.0}"#, ptr::null_mut());
         assert_eq!(status, CONEFIELD_OK);
         let spread = |v: [f32; 9]| -> Vec<f32> { v.chunks(3).flat_map(|c| [c[0], c[1], c[2], -1.0, -1.0]).collect() };
         let x = spread([1., 2., 3., 4., 5., 6., 7., 8., 9.]);
@@ -326,34 +362,27 @@ mod tests {
 
     #[test]
     fn a_panic_is_a_status_and_a_text_that_fits_its_room() {
-        let (_, stage) = made(r#"{"panics": true}"#, ptr::null_mut());
         let mut bytes = [0u8; 16];
         let mut error = room(&mut bytes);
-        let (x, mut y, mut tape) = ([0.5f32; 3], [0.0f32; 3], [0.0f32; 1]);
-        let status = unsafe {
-            map::TABLE.forward.unwrap()(
-                stage,
-                [1.0f32].as_ptr(),
-                ConefieldTile { data: x.as_ptr(), channels: 3, rows: 1, stride: 1 },
-                ConefieldTileMut { data: y.as_mut_ptr(), channels: 3, rows: 1, stride: 1 },
-                ConefieldTileMut { data: tape.as_mut_ptr(), channels: 1, rows: 1, stride: 1 },
-                &mut error,
-            )
-        };
+        let status = guard(&mut error, || panic!("on request, {}", "é".repeat(600)));
         assert_eq!((status, error.length), (CONEFIELD_PANICKED, "panicked: on request, ".len() + 1200));
         assert_eq!(&bytes, b"panicked: on req");
-        unsafe { destroy(stage) };
     }
 
     #[test]
-    fn settings_that_do_not_fit_are_refused_in_words() {
+    fn what_does_not_fit_is_refused_in_words() {
         let mut bytes = [0u8; 200];
         let mut error = room(&mut bytes);
-        let (status, stage) = made(r#"{"panics": 3}"#, &mut error);
+        let (status, stage) = made(r#"{"initial": true}"#, &mut error);
         assert_eq!(status, CONEFIELD_INVALID);
         assert!(stage.is_null());
         let n = error.length;
         let said = String::from_utf8_lossy(&bytes[..n]);
         assert!(said.contains("boolean"), "{said}");
+        // A stage whose table has no such function.
+        let (_, stage) = made(r#"{"initial": 2.0}"#, ptr::null_mut());
+        let other = unsafe { held(stage) }.get::<dyn Loss>().map(drop).unwrap_err();
+        assert_eq!(other.to_string(), "this stage: it is no loss");
+        unsafe { destroy(stage) };
     }
 }

@@ -1,11 +1,12 @@
 //! Priors.
 
-use super::{guard, many, many_mut, shims, table, write_wgsl};
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
+use super::*;
 
-table! { ConefieldPrior: blocks block wgsl }
+table! {
+    ConefieldPrior: blocks block wgsl;
+    prior(keys, _) { Box::new(settings::<dyn PriorSpec>(keys)?.build()?) };
+    dyn Prior: "prior"
+}
 
 shims! {
     fn blocks(prior: dyn Prior, out: *mut ConefieldBlocks) {

@@ -1,14 +1,14 @@
 //! Projectors.
 
-use super::{guard, hand_over, many, many_mut, shims, table, write_wgsl};
-use crate::built::Built;
-use conefield_core::prelude::*;
+use super::*;
 use conefield_core::stage::Lengths;
-use conefield_plugin_abi::*;
 use std::cell::RefCell;
-use std::ffi::c_void;
 
-table! { ConefieldProjector: max_samples sample integrate adjoint fitted wgsl }
+table! {
+    ConefieldProjector: max_samples sample integrate adjoint fitted wgsl;
+    projector(keys, _) { Box::new(settings::<dyn ProjectorSpec>(keys)?.build()?) };
+    dyn Projector: "projector"
+}
 
 /// A ray in the unit cube.
 pub(super) fn ray(ray: &ConefieldRay) -> UnitRay {
@@ -57,8 +57,7 @@ shims! {
         let ConefieldLengths { voxel_mm, cell_mm } = *lengths;
         let lengths = Lengths { voxel_mm, cell_mm: (cell_mm > 0.0).then_some(cell_mm) };
         if let Some(fitted) = projector.fitted(lengths)? {
-            let describe = fitted.describe();
-            *out = hand_over(Built::of(fitted, describe));
+            *out = hand_over(fitted);
         }
     }
 

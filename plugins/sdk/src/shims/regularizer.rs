@@ -1,14 +1,14 @@
 //! Regularizers and their penalties on a grid.
 
-use super::{array, grid, guard, hand_over_on, header, many, many_mut, shims, table};
-use crate::built::OnGrid;
+use super::*;
 use conefield_core::place::Host;
-use conefield_core::prelude::*;
-use conefield_plugin_abi::*;
-use std::ffi::c_void;
 use std::sync::Arc;
 
-table! { ConefieldRegularizer: bytes on weight value prox state adapt }
+table! {
+    ConefieldRegularizer: bytes on weight value prox state adapt;
+    regularizer(keys, _) { Box::new(settings::<dyn RegularizerSpec>(keys)?.build()?) };
+    dyn Regularizer: "regularizer", On: "penalty on a grid"
+}
 
 /// What a regularizer makes for one grid.
 type On = OnGrid<dyn Penalty>;
@@ -24,7 +24,7 @@ shims! {
     fn on(regularizer: dyn Regularizer, voxels: *const ConefieldGrid, penalty: *mut *mut c_void; error) {
         let grid = grid(voxels);
         let space = Space::new(header(grid.shape, [0; 3]), Arc::new(Host));
-        *penalty = hand_over_on(grid.shape, regularizer.on(&grid, &space)?);
+        *penalty = hand_over(Box::new(OnGrid { shape: grid.shape, part: regularizer.on(&grid, &space)? }));
     }
 
     fn weight(

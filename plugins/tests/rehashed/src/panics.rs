@@ -10,6 +10,7 @@ stage_type!(EncoderSpec, "panics", Panics, "panics on request");
 #[serde(rename_all = "kebab-case")]
 enum When {
     Create,
+    Describe,
     Forward,
     Backward,
     /// In forward, after more calls than a trial needs.
@@ -60,6 +61,7 @@ impl RowMap for Copying {
     }
 
     fn describe(&self) -> String {
+        assert!(self.when != When::Describe, "as ordered, in describe");
         "panics".into()
     }
 }
