@@ -93,7 +93,7 @@ impl Input {
     }
 
     /// An error about this file unless `ok`.
-    pub fn ensure(&self, ok: bool, field: &str, found: impl ToString, expected: impl Into<String>) -> Result<()> {
+    pub fn ensure(&self, ok: bool, field: &str, found: impl ToString, expected: impl ToString) -> Result<()> {
         if ok { Ok(()) } else { Err(self.invalid(field, found, expected)) }
     }
 

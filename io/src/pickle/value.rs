@@ -207,7 +207,7 @@ impl<'p, 'a> Item<'p, 'a> {
     }
 
     /// An error about this value unless `ok`.
-    pub fn ensure(&self, ok: bool, found: impl ToString, expected: impl Into<String>) -> Result<()> {
+    pub fn ensure(&self, ok: bool, found: impl ToString, expected: impl ToString) -> Result<()> {
         if ok { Ok(()) } else { Err(self.invalid(found, expected)) }
     }
 
