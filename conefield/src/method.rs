@@ -47,7 +47,7 @@ pub fn planned(
     let mut sets = sets.to_vec();
     if let Some(path) = start {
         if conefield_io::is_volume(path) {
-            Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
+            Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check()?;
         }
         sets.push(init(&read(&sets)?, path)?);
     }
@@ -57,12 +57,12 @@ pub fn planned(
     if !disk && memory.total > memory::limit() {
         return Err(Error::unsupported("memory", format!("needs {}: only the disk holds it", memory.line())));
     }
-    memory.check(|available| {
-        let smaller = smaller_tables(&loaded).into_iter().filter_map(|(bits, set)| {
+    memory.check_or(&|available| {
+        let mut smaller = smaller_tables(&loaded).into_iter().filter_map(|(bits, set)| {
             let loaded = read(&[&sets[..], &[set]].concat()).ok()?;
             Some((bits, plan_without_files(&loaded, backend).ok()?))
         });
-        run.smaller(plan.as_ref(), available, smaller)
+        run.smaller(plan.as_ref(), available, &mut smaller)
     })?;
     Ok(Planned { loaded, plan, memory })
 }

@@ -68,7 +68,7 @@ impl CalibrateArgs {
         }
         let backend = self.backend.open()?;
         let size = conefield_io::scan_size(&self.scan)?;
-        Memory::of_data_set(&size).check(|_| vec![])?;
+        Memory::of_data_set(&size).check()?;
         let DataSet { train: scan, test, volume } = conefield_scans::read_data_set(&self.scan, Parts::ALL)?;
         scan.validate(&self.scan.display().to_string())?;
         let settings =

@@ -78,7 +78,7 @@ impl EvaluateArgs {
         let [volume, reference] = voxels;
         let (volume, reference) = (volume?, reference?);
         let maps = if self.segmenter.is_some() { &[volume, reference][..] } else { &[] };
-        Memory::of_volumes(&[&[volume, reference], maps].concat()).check(|_| vec![])?;
+        Memory::of_volumes(&[&[volume, reference], maps].concat()).check()?;
         let report = match self.threshold {
             Some(threshold) => self.material(threshold)?,
             None if self.labels => self.label_maps()?,

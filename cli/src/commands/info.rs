@@ -110,7 +110,7 @@ fn statistics(values: ArrayView3<'_, f32>) -> Value {
 }
 
 fn volume(path: &Path, png: Option<&Path>) -> Result<Value> {
-    Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
+    Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check()?;
     let v = conefield_io::read_volume(path)?;
     if let Some(png) = png {
         files::picture(png, None, &MiddleSlices::of(&v))?;
@@ -232,7 +232,7 @@ pub fn in_short(scan: &Scan, survey: &Survey, counts: Option<&CountsReport>) -> 
 
 /// Facts of a scan, and the most important ones in short.
 fn scan(path: &Path, png: Option<&Path>) -> Result<(Value, String)> {
-    Memory::of_data_set(&conefield_io::scan_size(path)?).check(|_| vec![])?;
+    Memory::of_data_set(&conefield_io::scan_size(path)?).check()?;
     let data = conefield_scans::read_data_set(path, conefield_io::Parts::ALL)?;
     let s = &data.train;
     s.validate(&path.display().to_string())?;

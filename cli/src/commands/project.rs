@@ -65,7 +65,7 @@ impl ProjectArgs {
         let buffers = 4 * size.pixels + projector.scratch(&header, header.views);
         let projecting = Memory { scan: 4 * size.pixels, volume: 4 * voxels, buffers, ..Memory::default() };
         let memory = Memory::most(&[reading, projecting]);
-        memory.check(|_| vec![])?;
+        memory.check()?;
 
         let volume = conefield_io::read_volume(&self.volume)?;
         parse::must_be_attenuation(&volume)?;

@@ -75,5 +75,5 @@ impl OpenedField {
 /// Memory of the file with its numbers, then of the numbers with the model.
 fn memory(bytes: u64, buffers: u64) -> Result<Memory> {
     let memory = Memory::most(&[Memory { model: 2 * bytes, buffers, ..Memory::default() }]);
-    memory.check(|_| vec![]).map(|()| memory)
+    memory.check().map(|()| memory)
 }

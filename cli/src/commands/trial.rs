@@ -71,7 +71,7 @@ pub fn input_of(path: &Path, protocol: &RunProtocol, check: impl FnOnce(&Scan) -
         reference: protocol.reference.is_some(),
         resume: false,
     };
-    all.reading().check(|_| vec![])?;
+    all.reading().check()?;
     let (scan, reference) = input::read(path, protocol.reference.as_deref())?;
     check(&scan)?;
     let held = protocol.held_out(scan.geometry.views.len())?;

@@ -83,7 +83,7 @@ impl Simulation {
 
     /// The volume to scan.
     fn prepared(&self) -> Result<Volume> {
-        Memory::of_volumes(&[files::voxels(&self.volume)?]).check(|_| vec![])?;
+        Memory::of_volumes(&[files::voxels(&self.volume)?]).check()?;
         simulation::prepared(files::volume(&self.volume)?, self.values, self.downsample)
     }
 
