@@ -43,8 +43,8 @@ pub struct Progress {
     shown: Instant,
     what: String,
     step: u64,
-    latest: Record,
-    records: Vec<Record>,
+    /// The last record.
+    pub latest: Option<Record>,
     log: Option<(PathBuf, File)>,
     /// Checkpoints.
     pub keeper: Option<Keeper>,
@@ -79,8 +79,7 @@ impl Progress {
             shown: Instant::now(),
             what: what.into(),
             step: 0,
-            latest: Record::default(),
-            records: vec![],
+            latest: None,
             log,
             keeper: None,
             live: None,
@@ -96,11 +95,6 @@ impl Progress {
             warn!("{e}; nothing more is written for TensorBoard");
             self.board = None;
         }
-    }
-
-    /// The records so far.
-    pub fn records(&self) -> &[Record] {
-        &self.records
     }
 
     /// Shows that `share` of the work is done, with an explanatory line, unless the last update is recent.
@@ -121,7 +115,7 @@ impl Progress {
 
     /// The current state in one line.
     fn line(&self, step: u64, seconds_left: f64) -> String {
-        let r = &self.latest;
+        let r = self.latest.clone().unwrap_or_default();
         // A narrow terminal cuts the end off.
         let parts = [
             Some(format!("step {step}")),
@@ -142,8 +136,7 @@ impl Observer for Progress {
     }
 
     fn record(&mut self, record: &Record) {
-        self.latest = record.clone();
-        self.records.push(record.clone());
+        self.latest = Some(record.clone());
         if let Some((path, file)) = &mut self.log {
             let line = serde_json::to_string(record).map_err(io::Error::other).and_then(|mut line| {
                 line.push('\n');

@@ -67,6 +67,13 @@ pub fn write_weights(path: impl AsRef<Path>, weights: &Weights) -> Result<()> {
     conefield_io::write_weights(path, &tensors, &weights.notes)
 }
 
+/// Whether `path` is one of these folders or files, by name, or an unfinished file.
+pub fn is_one_of(path: &Path, folders: &[&str], files: &[&str]) -> bool {
+    let name = path.file_name().unwrap_or_default();
+    let names = if path.is_dir() { folders } else { files };
+    names.iter().any(|own| name == *own) || conefield_io::is_unfinished(name)
+}
+
 /// The note with the placement of the field.
 const PLACEMENT: &str = "placement";
 

@@ -73,7 +73,7 @@ impl CalibrateArgs {
         scan.validate(&self.scan.display().to_string())?;
         let settings =
             Settings { parameters: self.parameters.clone(), width: self.pixels.into(), curves: self.png.is_some() };
-        signals::listen()?;
+        signals::listen();
         let watch = Shown::new();
         let found = calibrate(&scan, &settings, backend.as_ref(), &watch)?;
         drop(watch);

@@ -124,7 +124,7 @@ impl EvaluateArgs {
         let dice = match &self.segmenter {
             None => None,
             Some(segmenter) => {
-                signals::listen()?;
+                signals::listen();
                 // A segmentation may depend on the voxel size: both volumes get the same.
                 let volume = Volume { data: volume.data, grid: reference.grid, affine: reference.affine };
                 let [volume, reference] = [volume, reference].map(|v| self.in_hu(v));

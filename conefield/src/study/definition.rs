@@ -21,6 +21,7 @@
 
 use crate::parse::{self, AnglesOption};
 use crate::simulation::Changes;
+use crate::study::layout::group;
 use crate::study::method::{self, Method};
 use crate::study::simulation::Simulation;
 pub use crate::study::written::Protocol;
@@ -122,6 +123,11 @@ impl Study {
         cells
     }
 
+    /// The name of a run, CASE-seedS/METHOD, which is also its path.
+    pub fn run_name(&self, cell: &Cell) -> String {
+        format!("{}/{}", group(&self.cases[cell.case].name, cell.seed), self.methods[cell.method].name)
+    }
+
     /// Input files and folders of the study, without its specs.
     pub fn inputs(&self) -> Vec<PathBuf> {
         let mut all = vec![self.path.clone()];
@@ -156,7 +162,9 @@ impl Reading<'_> {
             Some(p) => (p.get_ref().clone(), self.at(&p)),
             None => (Protocol::default(), place.clone()),
         };
-        check_ends(&protocol, &at)?;
+        let beside = protocol.steps.is_some() || protocol.seconds.is_some() || protocol.at_most.is_some();
+        let expected = "budget, or some of steps, seconds and at_most";
+        ensure(protocol.budget.is_none() || !beside, &at, "budget", "another end beside it", expected)?;
         let simulated = !volumes.is_empty();
         let written =
             [("views", views.as_ref().map(|v| self.at(v))), ("simulate", simulate.as_ref().map(|s| self.at(s)))];
@@ -344,14 +352,6 @@ impl Reading<'_> {
     fn placed<T>(&self, entry: &Spanned<T>, key: &str, error: Error) -> Error {
         Error::unsupported(format!("{}: {key}", self.at(entry)), error.to_string())
     }
-}
-
-/// Refuses contradictory limits.
-fn check_ends(protocol: &Protocol, at: &str) -> Result<()> {
-    let Protocol { steps, seconds, at_most, budget, .. } = protocol;
-    let beside = steps.is_some() || seconds.is_some() || at_most.is_some();
-    let expected = "budget, or some of steps, seconds and at_most";
-    ensure(budget.is_none() || !beside, at, "budget", "another end beside it", expected)
 }
 
 /// The name of a volume: phantom:head:64 becomes head-64, and a file loses its extensions.

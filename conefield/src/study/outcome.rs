@@ -33,8 +33,11 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// The outcome of the finished run in `folder`.
-    pub fn of_run(folder: &Path) -> Result<Self> {
+    /// The outcome of the run in `folder`, which is finished or has failed with `error`.
+    pub fn of_run(folder: &Path, error: Option<String>) -> Result<Self> {
+        if let Some(error) = error {
+            return Ok(Self::failed(error));
+        }
         let figures = read_json(&folder.join("record.json"))?;
         Ok(Self { status: Status::Done, error: None, figures: Some(figures) })
     }

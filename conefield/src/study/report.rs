@@ -126,7 +126,7 @@ impl<'a> StudyReport<'a> {
         let summary = Summary { study, outcomes: &outcomes }.lines();
         let line = |(cell, outcome): (Cell, Outcome)| {
             let (case, method) = (study.cases[cell.case].name.clone(), study.methods[cell.method].name.clone());
-            let run = layout.run(&case, cell.seed, &method);
+            let run = layout.run(&study.run_name(&cell));
             let machine = outcome.figures.as_ref().and_then(|f| f.machine.clone());
             RunLine { case, seed: cell.seed, method, run, machine, outcome }
         };
