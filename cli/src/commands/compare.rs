@@ -234,11 +234,10 @@ fn progressed(folder: &Path) -> Progressed {
 fn table(report: &Report) -> Table {
     let protocol = &report.protocol;
     let columns = Columns::of(protocol.reference.is_some(), !protocol.held_out_views.is_empty());
-    let row = |name: &str, cells: Vec<String>| [vec![name.to_owned()], cells].concat();
-    let mut rows = vec![row("method", columns.heads().iter().map(|h| h.to_string()).collect())];
+    let mut rows = vec![columns.heads("method")];
     let mut notes = vec![protocol.line()];
     for Entry { name, outcome, .. } in &report.methods {
-        rows.push(row(name, columns.cells(outcome)));
+        rows.push(columns.cells(name, outcome));
         notes.extend(outcome.error.as_ref().map(|e| format!("{name} failed: {e}")));
     }
     Table { rows, notes }
