@@ -5,9 +5,8 @@ use super::units::HounsfieldOption;
 use super::{EndOptions, calibrate, protocol::RunProtocol, watch};
 use crate::board::Board;
 use crate::boundary::{self, Inputs};
-use crate::live::Live;
 use crate::outgoing::{self, WrittenVolume};
-use crate::progress::{Keeper, Progress};
+use crate::progress::{Progress, Renewed};
 use crate::run_folder::RunFolder;
 use crate::{out, signals};
 use clap::error::ErrorKind;
@@ -33,7 +32,7 @@ use conefield_evaluation::report::text::bytes;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::PathBuf;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Reconstruct a volume from a scan.
 ///
@@ -311,14 +310,10 @@ impl ReconstructArgs {
     ) -> Result<Progress> {
         let board = self.tensorboard.then(|| Board::new(&folder.file("events.out.tfevents.conefield"), &metrics.0));
         let mut progress = Progress::new("reconstruct", Some(metrics));
-        progress.keeper = Some(Keeper {
-            path: folder.file(CHECKPOINT),
-            every: Duration::from_secs_f64(self.protocol.checkpoint_every),
-            run,
-            last: Instant::now(),
-        });
+        progress.keeper = Some(Renewed::new(folder.file(CHECKPOINT), self.protocol.checkpoint_every));
+        progress.run = run;
         let interval = self.live.or(self.watch.map(|_| WATCHED));
-        progress.live = interval.map(|seconds| Live::new(folder.file("live.png"), seconds));
+        progress.live = interval.map(|seconds| Renewed::new(folder.file("live.png"), seconds));
         progress.board = board.transpose()?;
         Ok(progress)
     }
