@@ -107,7 +107,7 @@ impl Progress {
     }
 
     /// Shows that `share` of the work is done, with an explanatory line, unless the last update is recent.
-    pub fn show(&mut self, share: f64, line: impl FnOnce(&Self) -> String) {
+    pub fn show(&mut self, share: f64, line: &dyn Fn(&Self) -> String) {
         let wait = if self.bar.is_hidden() { EVERY } else { Duration::from_millis(100) };
         if self.shown.elapsed() < wait {
             return;
@@ -141,7 +141,7 @@ impl Progress {
 impl Observer for Progress {
     fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
         self.step = step;
-        self.show(share, |me| me.line(step, seconds_left));
+        self.show(share, &|me| me.line(step, seconds_left));
     }
 
     fn record(&mut self, record: &Record) {

@@ -21,7 +21,7 @@ use std::path::Path;
 pub fn volume(name: &str) -> Result<Volume> {
     match phantom(name)? {
         Some((kind, size)) => Ok(phantom_of(kind, size)),
-        None => conefield_io::read_volume(name),
+        None => conefield_io::read_volume(Path::new(name)),
     }
 }
 
@@ -29,7 +29,7 @@ pub fn volume(name: &str) -> Result<Volume> {
 pub fn voxels(name: &str) -> Result<u64> {
     match phantom(name)? {
         Some((_, size)) => Ok((size as u64).pow(3)),
-        None => conefield_io::volume_voxels(name),
+        None => conefield_io::volume_voxels(Path::new(name)),
     }
 }
 

@@ -22,7 +22,7 @@ pub struct Planned {
 
 /// Builds a spec for `backend`: every stage once. Errors name the line of the spec.
 pub fn plan(loaded: &Loaded, backend: &dyn Backend) -> Result<Box<dyn Plan>> {
-    let context = Context { weights: &|path| files::read_weights(path), ..Context::new(backend) };
+    let context = Context { weights: &|path| files::read_weights(Path::new(path)), ..Context::new(backend) };
     loaded.spec.method.plan(&context).map_err(|e| loaded.locate(e))
 }
 

@@ -219,7 +219,7 @@ impl Watch for Shown {
     fn progress(&self, share: f64) {
         let left = self.begin.elapsed().as_secs_f64() * (1.0 - share) / share.max(1e-6);
         let mut progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner);
-        progress.show(share, |_| format!("{} left", out::duration(left)));
+        progress.show(share, &|_| format!("{} left", out::duration(left)));
     }
 }
 
