@@ -88,7 +88,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     let run = Reconstruct::with("fast").set("encoder.type=waves").set("encoder.waves=48").set("field.width=16");
     let result = run.steps(200).reference(truth).run(scan)?;
-    let psnr = result.scores.map_or(0.0, |s| s.psnr);
+    let psnr = result.scores.map_or(f64::NAN, |s| s.psnr);
     println!("{} steps in {:.1} s: {psnr:.2} dB", result.steps, result.train_s);
     Ok(())
 }

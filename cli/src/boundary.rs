@@ -21,8 +21,14 @@ impl Inputs {
 
     /// Adds further inputs.
     pub fn and<P: AsRef<Path>>(mut self, paths: impl IntoIterator<Item = P>) -> Self {
-        self.0.extend(paths.into_iter().map(|p| p.as_ref().to_path_buf()).filter(|p| p.exists()));
+        paths.into_iter().for_each(|path| self.add(path.as_ref()));
         self
+    }
+
+    fn add(&mut self, path: &Path) {
+        if path.exists() {
+            self.0.push(path.to_path_buf());
+        }
     }
 
     /// Adds a spec with everything it extends and names.

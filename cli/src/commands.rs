@@ -2,7 +2,6 @@
 
 mod backends;
 mod calibrate;
-mod cell;
 mod compare;
 mod completions;
 mod convert;

@@ -3,7 +3,6 @@
 mod board;
 mod boundary;
 mod commands;
-mod live;
 mod log;
 mod out;
 mod outgoing;

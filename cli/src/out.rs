@@ -52,7 +52,7 @@ fn wrapped(text: &str, width: usize) -> String {
 pub fn json(value: &impl Serialize) -> Result<()> {
     // JSON does not escape these characters by itself, but may.
     let text = to_json(value)?;
-    print(&escaped(&text, |c| c.is_control() && c != '\n', |c, out| write!(out, "\\u{:04x}", c as u32)))
+    print(&escaped(&text, &|c| c.is_control() && c != '\n', &|c, out| write!(out, "\\u{:04x}", c as u32)))
 }
 
 fn print(text: &str) -> Result<()> {
@@ -69,7 +69,7 @@ pub fn raw(bytes: &[u8]) -> Result<()> {
 
 /// `text` without terminal control characters except line ends.
 fn plain(text: &str) -> String {
-    escaped(text, |c| obeyed(c) && c != '\n', |c, out| write!(out, "{}", c.escape_default()))
+    escaped(text, &|c| obeyed(c) && c != '\n', &|c, out| write!(out, "{}", c.escape_default()))
 }
 
 /// `text` as one line of at most `most` characters, without terminal control characters. A longer text loses its
@@ -77,7 +77,7 @@ fn plain(text: &str) -> String {
 pub fn plain_line(text: &str, most: usize) -> String {
     let count = text.chars().count();
     if count <= most {
-        return escaped(text, obeyed, |c, out| write!(out, "{}", c.escape_default()));
+        return escaped(text, &obeyed, &|c, out| write!(out, "{}", c.escape_default()));
     }
     let byte = |n: usize| text.char_indices().nth(n).map_or(text.len(), |(at, _)| at);
     let (begin, end) = (&text[..byte(most / 2)], &text[byte(count - most / 2)..]);
@@ -91,7 +91,7 @@ fn obeyed(c: char) -> bool {
         || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}' | '\u{2029}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
-fn escaped(text: &str, bad: impl Fn(char) -> bool, escape: impl Fn(char, &mut String) -> std::fmt::Result) -> String {
+fn escaped(text: &str, bad: &dyn Fn(char) -> bool, escape: &dyn Fn(char, &mut String) -> std::fmt::Result) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         if bad(c) {

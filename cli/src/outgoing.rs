@@ -101,7 +101,7 @@ impl Voxels for Outgoing<'_> {
         self.done += out.len();
         let share = self.done as f64 / self.voxels.grid().len().unwrap_or(usize::MAX) as f64;
         let left = self.start.elapsed().as_secs_f64() * (1.0 - share) / share;
-        self.progress.show(share, |_| format!("{} left", duration(left)));
+        self.progress.show(share, &|_| format!("{} left", duration(left)));
         Ok(())
     }
 }

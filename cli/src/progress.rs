@@ -1,7 +1,6 @@
 //! Progress on standard error: bars on a terminal, otherwise log lines.
 
 use crate::board::Board;
-use crate::live::Live;
 use crate::signals;
 use conefield::files;
 use conefield_core::Result;
@@ -9,6 +8,7 @@ use conefield_core::checkpoint::Checkpoint;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::{Observer, Record};
 use conefield_core::parts::Part;
+use conefield_evaluation::report::MiddleSlices;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use ndarray::Array3;
 use std::collections::BTreeMap;
@@ -43,27 +43,35 @@ pub struct Progress {
     shown: Instant,
     what: String,
     step: u64,
-    latest: Record,
-    records: Vec<Record>,
+    /// The last record.
+    pub latest: Option<Record>,
     log: Option<(PathBuf, File)>,
-    /// Checkpoints.
-    pub keeper: Option<Keeper>,
-    /// Live pictures.
-    pub live: Option<Live>,
+    /// The checkpoint.
+    pub keeper: Option<Renewed>,
+    /// What identifies the run in its checkpoint.
+    pub run: BTreeMap<String, String>,
+    /// The middle slices during the run.
+    pub live: Option<Renewed>,
     /// The file for TensorBoard.
     pub board: Option<Board>,
 }
 
-/// Path, interval and identity of checkpoints.
-pub struct Keeper {
-    /// The file.
-    pub path: PathBuf,
-    /// Interval between checkpoints.
-    pub every: Duration,
-    /// Identity of the run.
-    pub run: BTreeMap<String, String>,
-    /// Time of the last checkpoint.
-    pub last: Instant,
+/// A file that is written anew at an interval.
+pub struct Renewed {
+    path: PathBuf,
+    every: Duration,
+    last: Instant,
+}
+
+impl Renewed {
+    /// Writes `path` every `seconds` seconds.
+    pub fn new(path: PathBuf, seconds: f64) -> Self {
+        Self { path, every: Duration::from_secs_f64(seconds), last: Instant::now() }
+    }
+
+    fn due(&self) -> bool {
+        self.last.elapsed() >= self.every
+    }
 }
 
 impl Progress {
@@ -79,10 +87,10 @@ impl Progress {
             shown: Instant::now(),
             what: what.into(),
             step: 0,
-            latest: Record::default(),
-            records: vec![],
+            latest: None,
             log,
             keeper: None,
+            run: BTreeMap::new(),
             live: None,
             board: None,
         }
@@ -98,13 +106,8 @@ impl Progress {
         }
     }
 
-    /// The records so far.
-    pub fn records(&self) -> &[Record] {
-        &self.records
-    }
-
     /// Shows that `share` of the work is done, with an explanatory line, unless the last update is recent.
-    pub fn show(&mut self, share: f64, line: impl FnOnce(&Self) -> String) {
+    pub fn show(&mut self, share: f64, line: &dyn Fn(&Self) -> String) {
         let wait = if self.bar.is_hidden() { EVERY } else { Duration::from_millis(100) };
         if self.shown.elapsed() < wait {
             return;
@@ -121,7 +124,7 @@ impl Progress {
 
     /// The current state in one line.
     fn line(&self, step: u64, seconds_left: f64) -> String {
-        let r = &self.latest;
+        let r = self.latest.clone().unwrap_or_default();
         // A narrow terminal cuts the end off.
         let parts = [
             Some(format!("step {step}")),
@@ -138,12 +141,11 @@ impl Progress {
 impl Observer for Progress {
     fn progress(&mut self, step: u64, share: f64, seconds_left: f64) {
         self.step = step;
-        self.show(share, |me| me.line(step, seconds_left));
+        self.show(share, &|me| me.line(step, seconds_left));
     }
 
     fn record(&mut self, record: &Record) {
-        self.latest = record.clone();
-        self.records.push(record.clone());
+        self.latest = Some(record.clone());
         if let Some((path, file)) = &mut self.log {
             let line = serde_json::to_string(record).map_err(io::Error::other).and_then(|mut line| {
                 line.push('\n');
@@ -170,12 +172,12 @@ impl Observer for Progress {
     }
 
     fn checkpoint_due(&self) -> bool {
-        self.keeper.as_ref().is_some_and(|k| k.last.elapsed() >= k.every)
+        self.keeper.as_ref().is_some_and(Renewed::due)
     }
 
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
         let Some(keeper) = &mut self.keeper else { return Ok(()) };
-        let written = files::write_checkpoint(&keeper.path, checkpoint, &keeper.run);
+        let written = files::write_checkpoint(&keeper.path, checkpoint, &self.run);
         keeper.last = Instant::now();
         written?;
         debug!("checkpoint after step {}", checkpoint.standing.step);
@@ -183,12 +185,16 @@ impl Observer for Progress {
     }
 
     fn slices_due(&self) -> bool {
-        self.live.as_ref().is_some_and(Live::due)
+        self.live.as_ref().is_some_and(Renewed::due)
     }
 
     fn slices(&mut self, grid: VoxelGrid, slices: &[(Part, Array3<f32>)]) -> Result<()> {
         let Some(live) = &mut self.live else { return Ok(()) };
-        let (picture, step) = (live.draw(grid, slices)?.to_path_buf(), self.step);
+        let mut middle = MiddleSlices::new(grid);
+        slices.iter().for_each(|(part, values)| middle.gather(part, values.view()));
+        files::picture(&live.path, None, &middle)?;
+        live.last = Instant::now();
+        let (picture, step) = (live.path.clone(), self.step);
         self.on_board(|board| board.picture(step, "live", &picture));
         Ok(())
     }

@@ -2,6 +2,7 @@
 //! `checkpoint.safetensors` during the run. At the end `volume.nii.gz`, `volume-hu.nii.gz` if requested,
 //! `weights.safetensors`, `slices.png` and, last and only for a finished run, `record.json`.
 
+use crate::commands::EndOptions;
 use conefield::plugins::Used;
 use conefield::record::ScanRecord;
 use conefield::scratch;
@@ -9,7 +10,6 @@ use conefield::tradeoff::json::{LONGEST, read_json};
 use conefield_core::error::ensure;
 use conefield_core::files::read_text;
 use conefield_core::method::Record;
-use conefield_core::scan::Unit;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::text::bytes;
 use conefield_io::{Contents, Lease, Progressed};
@@ -55,7 +55,7 @@ pub fn progressed(folder: &Path) -> Progressed {
 }
 
 /// A folder reserved for this run.
-pub struct RunFolder(Lease);
+pub struct RunFolder(pub Lease);
 
 impl RunFolder {
     /// Reserves the folder, which need not exist yet, without changing it.
@@ -82,16 +82,6 @@ impl RunFolder {
         if let Some(free) = scratch::free(place).filter(|free| *free < volume) {
             tracing::warn!("{}: {} are free; the volume takes up to {}", place.display(), bytes(free), bytes(volume));
         }
-    }
-
-    /// Begins a run in the folder, emptying it; an earlier run is set aside until this one is complete.
-    pub fn begin(&mut self) -> Result<()> {
-        self.0.replace()
-    }
-
-    /// Continues the existing run.
-    pub fn go_on(&self) {
-        self.0.go_on();
     }
 
     /// The path of one of [`FILES`].
@@ -145,16 +135,37 @@ pub struct RunOnDisk {
     pub curves: Vec<Value>,
     /// `record.json` of a finished run.
     pub record: Option<Value>,
-    known: Option<Known>,
+    known: Option<Recorded>,
 }
 
-/// The fields of a record needed to show a run.
+/// What other commands need of `record.json`.
 #[derive(Deserialize)]
-struct Known {
-    spec: String,
-    scan: ScanRecord,
-    held_out_views: Vec<usize>,
-    reference: Option<PathBuf>,
+pub struct Recorded {
+    pub version: String,
+    pub spec: String,
+    pub seed: u64,
+    pub scan: ScanRecord,
+    pub held_out_views: Vec<usize>,
+    pub limits: EndOptions,
+    #[serde(default)]
+    pub budget_s: Option<f64>,
+    pub reference: Option<String>,
+    #[serde(default)]
+    pub plugins: Vec<Used>,
+    pub backend: Value,
+    pub peak: f64,
+}
+
+impl Recorded {
+    /// The record in `folder`, and all of it.
+    pub fn read(folder: &Path) -> Result<(Self, Value)> {
+        let file = folder.join("record.json");
+        let record: Value = read_json(&file)?;
+        let known = serde_json::from_value(record.clone()).map_err(|e| {
+            Error::invalid(file.display().to_string(), "JSON", e, "what \"conefield reconstruct\" writes there")
+        })?;
+        Ok((known, record))
+    }
 }
 
 impl RunOnDisk {
@@ -166,12 +177,8 @@ impl RunOnDisk {
 
     /// Reads everything but the large files.
     pub fn read(folder: &Path) -> Result<Self> {
-        let file = folder.join("record.json");
-        let record: Option<Value> = if file.exists() { Some(read_json(&file)?) } else { None };
-        let known = record.clone().map(serde_json::from_value).transpose();
-        let known = known.map_err(|e| {
-            Error::invalid(file.display().to_string(), "JSON", e, "what \"conefield reconstruct\" writes there")
-        })?;
+        let recorded = folder.join("record.json").exists().then(|| Recorded::read(folder)).transpose()?;
+        let (known, record) = recorded.unzip();
         let text = |name: &str| match folder.join(name) {
             path if path.exists() => read_text(&path, LONGEST),
             _ => Ok(String::new()),
@@ -213,20 +220,9 @@ impl RunOnDisk {
         self.known.as_ref().map(|k| Path::new(&k.scan.path))
     }
 
-    /// The unit of its volume, if its record names it.
-    pub fn unit(&self) -> Option<Unit> {
-        self.known.as_ref()?.scan.unit.clone()
-    }
-
     /// The reference volume, as named on the command line.
     pub fn reference(&self) -> Option<&Path> {
-        self.known.as_ref()?.reference.as_deref()
-    }
-
-    /// The plugins whose stages it used.
-    pub fn plugins(&self) -> Vec<Used> {
-        let plugins = self.record.as_ref().map(|r| r["plugins"].clone());
-        plugins.and_then(|p| serde_json::from_value(p).ok()).unwrap_or_default()
+        self.known.as_ref()?.reference.as_ref().map(Path::new)
     }
 
     /// Held-out views.

@@ -31,9 +31,8 @@ pub fn watch() -> Result<()> {
 }
 
 /// From now on the command checks [`caught`] and stops by itself.
-pub fn listen() -> Result<()> {
+pub fn listen() {
     LISTENING.store(true, Ordering::Relaxed);
-    Ok(())
 }
 
 /// The signal of a closed terminal, unless the parent process ignores it, as `nohup` does.

@@ -21,7 +21,7 @@ use std::path::Path;
 pub fn volume(name: &str) -> Result<Volume> {
     match phantom(name)? {
         Some((kind, size)) => Ok(phantom_of(kind, size)),
-        None => conefield_io::read_volume(name),
+        None => conefield_io::read_volume(Path::new(name)),
     }
 }
 
@@ -29,7 +29,7 @@ pub fn volume(name: &str) -> Result<Volume> {
 pub fn voxels(name: &str) -> Result<u64> {
     match phantom(name)? {
         Some((_, size)) => Ok((size as u64).pow(3)),
-        None => conefield_io::volume_voxels(name),
+        None => conefield_io::volume_voxels(Path::new(name)),
     }
 }
 
@@ -65,6 +65,13 @@ pub fn warn_of(path: &Path, survey: &Survey) {
 pub fn write_weights(path: impl AsRef<Path>, weights: &Weights) -> Result<()> {
     let tensors = weights.tensors.iter().map(|(name, (shape, values))| (&name[..], &shape[..], &values[..]));
     conefield_io::write_weights(path.as_ref(), &tensors.collect::<Vec<_>>(), &weights.notes)
+}
+
+/// Whether `path` is one of these folders or files, by name, or an unfinished file.
+pub fn is_one_of(path: &Path, folders: &[&str], files: &[&str]) -> bool {
+    let name = path.file_name().unwrap_or_default();
+    let names = if path.is_dir() { folders } else { files };
+    names.iter().any(|own| name == *own) || conefield_io::is_unfinished(name)
 }
 
 /// The note with the placement of the field.

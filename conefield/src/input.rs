@@ -117,3 +117,12 @@ pub fn held_out(choice: Option<&HoldOut>, n: usize, place: &str, field: &str) ->
     ensure(!held.is_empty(), place, field, found, "at least one view")?;
     Ok(held)
 }
+
+/// The views that `--views` chooses out of `n`; none without a choice.
+pub fn chosen(choice: Option<&HoldOut>, n: usize) -> Result<Vec<usize>> {
+    let views = held_out(choice, n, "command line", "--views")?;
+    match views.iter().find(|view| **view >= n) {
+        Some(view) => Err(Error::invalid("command line", "--views", view, format!("numbers below {n}"))),
+        None => Ok(views),
+    }
+}

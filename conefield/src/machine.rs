@@ -5,8 +5,9 @@ use conefield_evaluation::report::text::bytes;
 use serde::{Deserialize, Serialize};
 use sysinfo::{CpuRefreshKind, MemoryRefreshKind, RefreshKind, System};
 
-/// The properties of a machine that determine the speed of a run.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// The properties of a machine that determine the speed of a run. The record of an earlier version may lack some.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Machine {
     /// Name of the processor.
     pub cpu: String,
@@ -54,5 +55,7 @@ mod tests {
         assert!(here.cores > 0 && here.memory_bytes > 1 << 20 && !here.cpu.is_empty(), "{here:?}");
         let text = serde_json::to_string(&here).unwrap();
         assert_eq!(serde_json::from_str::<Machine>(&text).unwrap(), here);
+        let earlier: Machine = serde_json::from_str("{\"cpu\": \"a\"}").unwrap();
+        assert_eq!(earlier, Machine { cpu: "a".into(), ..Machine::default() });
     }
 }

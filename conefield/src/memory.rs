@@ -88,9 +88,14 @@ impl Memory {
         (!fits).then_some(self.total + self.total / 8)
     }
 
+    /// [`Self::check_or`] without suggestions.
+    pub fn check(&self) -> Result<()> {
+        self.check_or(&|_| vec![])
+    }
+
     /// Moves arrays to the disk if the estimate does not fit and a folder is allowed for them. Else refuses it, with
     /// figures; `smaller` lists what would fit into the given bytes.
-    pub fn check(&self, smaller: impl FnOnce(u64) -> Vec<String>) -> Result<()> {
+    pub fn check_or(&self, smaller: &dyn Fn(u64) -> Vec<String>) -> Result<()> {
         let limit = limit();
         if self.total <= limit {
             return Ok(());
@@ -109,11 +114,17 @@ impl Memory {
             [] => "no single reduction would make it fit".to_owned(),
             all => format!("{} would fit", all.join(" or ")),
         };
-        let there = match BUDGET.get() {
-            Some(_) => format!("--memory allows {}", bytes(limit)),
-            None => format!("{} are available", bytes(limit)),
-        };
+        let there = there(limit, BUDGET.get().is_some(), ranks::on_machine());
         Err(Error::unsupported("memory", format!("needs {}; {there}; {hint}", self.line())))
+    }
+}
+
+/// The limit in words: set by `--memory`, or the share of each of so many processes on this machine.
+fn there(limit: u64, set: bool, processes: u64) -> String {
+    match (set, processes) {
+        (true, _) => format!("--memory allows {}", bytes(limit)),
+        (_, 1) => format!("{} are available", bytes(limit)),
+        _ => format!("{} are available to each of {processes} processes on this machine", bytes(limit)),
     }
 }
 
@@ -256,7 +267,7 @@ impl Run {
         &self,
         plan: &dyn Plan,
         available: u64,
-        tables: impl Iterator<Item = (u32, Box<dyn Plan>)>,
+        tables: &mut dyn Iterator<Item = (u32, Box<dyn Plan>)>,
     ) -> Vec<String> {
         let fits = |run: &Run, plan: &dyn Plan| run.memory(plan).total <= available;
         let mut found = vec![];
@@ -269,10 +280,8 @@ impl Run {
         if let Some(run) = (1..8).map(halved).find(|run| fits(run, plan)) {
             found.push(format!("a volume of {}³ voxels", side(run.scan.voxels)));
         }
-        let mut tables = tables;
-        if let Some((bits, _)) = tables.find(|(_, plan)| fits(self, plan.as_ref())) {
-            found.push(format!("tables of 2^{bits}"));
-        }
+        let fitting = |(bits, plan): (u32, Box<dyn Plan>)| fits(self, plan.as_ref()).then_some(bits);
+        found.extend(tables.filter_map(fitting).next().map(|bits| format!("tables of 2^{bits}")));
         let binned = |k: u32| Run { scan: ScanSize { pixels: self.scan.pixels >> (2 * k), ..self.scan }, ..*self };
         if let Some(k) = (1..5).find(|k| fits(&binned(*k), plan)) {
             found.push(format!("a detector of 1/{} of the rows and columns", 1 << k));
@@ -337,12 +346,19 @@ mod tests {
         let plan = Fixed(1 << 22);
         let tables =
             || [(18, 1 << 21), (17, 1 << 20)].map(|(b, n)| (b, Box::new(Fixed(n)) as Box<dyn Plan>)).into_iter();
-        let found = run().smaller(&plan, 400 << 20, tables());
+        let found = run().smaller(&plan, 400 << 20, &mut tables());
         assert_eq!(found, ["a run without --reference", "a volume of 256³ voxels"]);
         let alone = Run { reference: false, ..run() };
-        let found = alone.smaller(&plan, alone.memory(&plan).total - (70 << 20), tables());
+        let found = alone.smaller(&plan, alone.memory(&plan).total - (70 << 20), &mut tables());
         assert_eq!(found, ["tables of 2^17"]);
-        assert!(run().smaller(&plan, 1 << 20, tables()).is_empty());
+        assert!(run().smaller(&plan, 1 << 20, &mut tables()).is_empty());
+    }
+
+    #[test]
+    fn a_share_of_the_memory_is_said_to_be_one() {
+        let said = [(true, 4), (false, 1), (false, 4)].map(|(set, processes)| there(1 << 30, set, processes));
+        let shared = "1.0 GiB are available to each of 4 processes on this machine";
+        assert_eq!(said, ["--memory allows 1.0 GiB", "1.0 GiB are available", shared]);
     }
 
     #[test]

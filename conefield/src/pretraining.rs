@@ -16,7 +16,7 @@ pub fn check_memory(voxels: &[u64], outline: &Outline) -> Result<()> {
         let training = Memory { volume, model: half, optimizer: half, buffers: backend, ..Memory::default() };
         Memory::most(&[Memory::of_volumes(voxels), training])
     };
-    need(voxels).check(|available| {
+    need(voxels).check_or(&|available| {
         let fewer = (1..voxels.len()).rev().find(|n| need(&voxels[..*n]).total <= available);
         fewer.map(|n| format!("the first {n} of the {} volumes", voxels.len())).into_iter().collect()
     })

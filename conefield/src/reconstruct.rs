@@ -1,9 +1,8 @@
 //! Reconstruction from Rust: a scan, the name of a spec, a volume.
 
-use crate::input::{Input, check_reference};
 use crate::method::Read;
-use crate::session::{self, InMemory, Request, Session};
-use crate::{memory, specs};
+use crate::session::{self, Request, Run};
+use crate::specs;
 use conefield_backend_cpu::Cpu;
 use conefield_core::Result;
 use conefield_core::method::{Limits, Observer, Reconstruction, Silent, Solution};
@@ -108,18 +107,12 @@ impl Reconstruct {
         let Self { spec, sets, limits, budget, held_out, reference, seed } = self;
         let (scan, backend) = (scan.into(), Cpu::new());
         scan.validate("scan")?;
-        if let Some(reference) = &reference {
-            check_reference("reference", reference, &scan)?;
-        }
-        let (split, scored) = (!held_out.is_empty(), reference.is_some());
-        let run = memory::Run { split, reference: scored, ..memory::Run::on_scan(&scan) };
         let read = spec.as_ref().map(|spec| |sets: &[String]| specs::read(spec, sets));
         let spec = read.as_ref().map(|read| read as Read<'_>);
         let request = Request { spec, sets, limits, budget, seed, ..Request::default() };
-        let session = Session::open(request, &backend, run, begin)?;
-        let mut run = session.plan(Input::new(scan, held_out, reference, None)?, 0.0, &|| false)?;
+        let mut run = Run::in_memory(scan, held_out, reference, None, request, &backend, begin, &|| false)?;
         let solved = run.solve(None, None, observer)?;
-        let InMemory { volume, written } = run.in_memory(&solved, Reconstruction::volume)?;
+        let (volume, written) = run.scored(&solved, &Reconstruction::volume)?;
         let Solution { result, steps, train_s, .. } = solved.solution;
         let spec = run.method.loaded.spec.name.clone();
         Ok(Reconstructed { volume, field: session::field(result), spec, steps, train_s, scores: written.scores })

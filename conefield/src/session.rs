@@ -4,7 +4,7 @@
 //! [`Session::plan`] takes the inputs and, within a budget, measures this machine and chooses the method. [`Run::solve`]
 //! runs it, and [`Run::record`] describes all of it.
 
-use crate::input::Input;
+use crate::input::{Input, check_reference};
 use crate::machine::{Machine, simd_level};
 use crate::memory;
 use crate::method::{self, Planned, Read};
@@ -17,7 +17,7 @@ use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
 use conefield_core::method::{Job, Limits, Observer, Reconstruction, Record, Silent, Solution};
 use conefield_core::place::Moved;
-use conefield_core::scan::Volume;
+use conefield_core::scan::{Scan, Volume};
 use conefield_core::spec::load::Loaded;
 use conefield_core::trained::TrainedField;
 use conefield_core::{Error, Result};
@@ -25,6 +25,7 @@ use conefield_evaluation::metrics::Scores;
 use conefield_evaluation::report::text::bytes;
 use std::cell::Cell;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Instant;
 use tracing::info;
 
@@ -171,15 +172,26 @@ pub struct Solved {
     pub prepare_s: f64,
 }
 
-/// A result in memory.
-pub struct InMemory {
-    /// The volume, in attenuation per unit of the scan.
-    pub volume: Volume,
-    /// Its scores, if there is a reference, and the time to compute both.
-    pub written: Written,
-}
+impl<'a> Run<'a> {
+    /// Plans a run on a `scan` in memory, of whose views those with the indices `held` are held out. Refuses a reference of
+    /// another shape than the scan's volume; see [`Session::open`] and [`Session::plan`].
+    pub fn in_memory(
+        scan: Arc<Scan>,
+        held: Vec<usize>,
+        reference: Option<Volume>,
+        peak: Option<f64>,
+        request: Request<'_>,
+        backend: &'a dyn Backend,
+        begin: Instant,
+        cancelled: &dyn Fn() -> bool,
+    ) -> Result<Self> {
+        reference.iter().try_for_each(|r| check_reference("reference", r, &scan))?;
+        let (split, scored) = (!held.is_empty(), reference.is_some());
+        let run = memory::Run { split, reference: scored, ..memory::Run::on_scan(&scan) };
+        let session = Session::open(request, backend, run, begin)?;
+        session.plan(Input::new(scan, held, reference, peak)?, 0.0, cancelled)
+    }
 
-impl Run<'_> {
     /// Runs the method from `start`, a volume, or from the checkpoint `resume`.
     pub fn solve(
         &mut self,
@@ -216,12 +228,13 @@ impl Run<'_> {
         self.input.reference.as_ref().map(|r| score::score(place, volume, r, self.input.peak)).transpose()
     }
 
-    /// The scored volume of a solution; `collect` computes its voxels.
-    pub fn in_memory(
+    /// The volume of a solution, in attenuation per unit of the scan, with its scores, if there is a reference, and the time
+    /// for both. `collect` computes its voxels.
+    pub fn scored(
         &self,
         solved: &Solved,
-        collect: impl FnOnce(&Reconstruction, &dyn Backend) -> Result<Volume>,
-    ) -> Result<InMemory> {
+        collect: &dyn Fn(&Reconstruction, &dyn Backend) -> Result<Volume>,
+    ) -> Result<(Volume, Written)> {
         let start = Instant::now();
         let mut volume = collect(&solved.solution.result, self.backend)?;
         volume.affine = volume.affine.or(self.input.reference.as_ref().and_then(|r| r.affine));
@@ -230,7 +243,7 @@ impl Run<'_> {
         let scores = self.scores("the volume", &volume)?;
         let parameters = parameters(&solved.solution.result);
         let written = Written { parameters, export_s, picture_s: 0.0, score_s: start.elapsed().as_secs_f64(), scores };
-        Ok(InMemory { volume, written })
+        Ok((volume, written))
     }
 
     /// The record of the whole run; `last` is its last record of progress. The caller adds the names of files.

@@ -130,7 +130,7 @@ pub fn check_memory(volume: &Volume, g: &Geometry) -> Result<()> {
         let volume = 4 * (volume.data.len() as u64 + rim);
         Memory::most(&[Memory { scan: 4 * pixels, volume, ..Memory::default() }])
     };
-    need(g.views.len(), 1).check(|available| {
+    need(g.views.len(), 1).check_or(&|available| {
         let fits = |m: Memory| m.total <= available;
         let views = (1..=g.views.len()).rev().find(|&n| fits(need(n, 1)));
         let detector = (1..5).find(|k| fits(need(g.views.len(), 1 << (2 * k))));

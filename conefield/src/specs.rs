@@ -24,21 +24,20 @@ pub fn help() -> String {
 
 /// Reads a built-in spec by name, or a file, with overriding settings `sets`.
 pub fn read(what: &str, sets: &[String]) -> Result<Loaded> {
-    let draft = Draft::find(what, sets, SHIPPED)?;
-    plugins::of_spec(&draft)?;
-    draft.finish()
+    loaded(Draft::find(what, sets, SHIPPED)?)
 }
 
 /// Parses a spec in TOML or JSON with overriding settings `sets`; errors name `source`.
 pub fn parse(text: &str, source: &str, sets: &[String]) -> Result<Loaded> {
-    let draft = Draft::of(text, source, sets, SHIPPED)?;
-    plugins::of_spec(&draft)?;
-    draft.finish()
+    loaded(Draft::of(text, source, sets, SHIPPED)?)
 }
 
 /// Parses a spec from a saved file; errors name `source`.
 pub fn reread(text: &str, source: &str) -> Result<Loaded> {
-    let draft = Draft::of(text, source, &[], &[])?;
+    loaded(Draft::of(text, source, &[], &[])?)
+}
+
+fn loaded(draft: Draft) -> Result<Loaded> {
     plugins::of_spec(&draft)?;
     draft.finish()
 }

@@ -16,7 +16,7 @@ fn main() -> Result<()> {
     let result = Reconstruct::with("sirt").steps(20).reference(truth).run(scan)?;
     io::write_volume(folder.join("volume.nii.gz"), &result.volume)?;
 
-    let psnr = result.scores.map_or(0.0, |s| s.psnr);
+    let psnr = result.scores.map_or(f64::NAN, |s| s.psnr);
     println!("{}: {} passes in {:.1} s, {psnr:.2} dB", result.spec, result.steps, result.train_s);
     println!("{:?} voxels written and removed again", io::read_volume(folder.join("volume.nii.gz"))?.data.dim());
     std::fs::remove_dir_all(&folder).map_err(|e| conefield::Error::io(&folder, e))

@@ -95,5 +95,5 @@ pub fn project_scan<'py>(
 
 fn check_memory(projector: &dyn VoxelProjector, geometry: &geometry::Geometry) -> Result<()> {
     let buffers = projection::bytes(projector, geometry);
-    Memory::most(&[Memory { buffers, ..Memory::default() }]).check(|_| vec![])
+    Memory::most(&[Memory { buffers, ..Memory::default() }]).check()
 }

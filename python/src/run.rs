@@ -8,11 +8,10 @@ use crate::specs::SpecArgument;
 use crate::volume::{made, taken};
 use crate::work::{Callback, Progress, Watch, without_lock};
 use conefield::explain::Explanation;
-use conefield::input::{self, Input};
 use conefield::memory::{self, Memory};
 use conefield::method::{self, Planned, Read};
 use conefield::record::{RunRecord, ScanRecord};
-use conefield::session::{self, InMemory, Request, Run, Session};
+use conefield::session::{self, Request, Run};
 use conefield::{files, pretraining, score, specs};
 use conefield_core::backend::Backend;
 use conefield_core::error::ensure;
@@ -76,11 +75,6 @@ impl Wanted {
     ) -> Result<Run<'a>> {
         let peak = arguments::peak(self.peak)?;
         let held = arguments::held_out(self.hold_out.as_ref(), scan.geometry.views.len())?;
-        if let Some(reference) = &reference {
-            input::check_reference("reference", reference, &scan)?;
-        }
-        let memory =
-            memory::Run { split: !held.is_empty(), reference: reference.is_some(), ..memory::Run::on_scan(&scan) };
         let read = |sets: &[String]| self.spec.read(sets);
         let request = Request {
             spec: self.spec.is_given().then_some(&read as Read<'_>),
@@ -91,8 +85,7 @@ impl Wanted {
             budget: arguments::seconds("budget", self.budget.as_ref())?,
             seed: self.seed,
         };
-        let session = Session::open(request, backend, memory, begin)?;
-        let mut run = session.plan(Input::new(scan, held, reference, peak)?, 0.0, &|| watch.cancelled())?;
+        let mut run = Run::in_memory(scan, held, reference, peak, request, backend, begin, &|| watch.cancelled())?;
         let plan = run.method.plan.as_mut();
         let starts = match plan.links() {
             [first, ..] => first.starts_from_volume(),
@@ -179,8 +172,8 @@ pub fn reconstruct<'py>(
         let mut progress = Progress::new(watch, function);
         let solved = run.solve(start.as_ref(), None, &mut progress)?;
         progress.finish();
-        let InMemory { volume, written, .. } =
-            run.in_memory(&solved, |result, backend| collect(result.voxels(backend)?.as_mut(), &|| watch.cancelled()))?;
+        let (volume, written) =
+            run.scored(&solved, &|result, backend| collect(result.voxels(backend)?.as_mut(), &|| watch.cancelled()))?;
         let loaded = &run.method.loaded;
         let init = wanted.init.as_ref().map(|path| path.display().to_string());
         let mut record = json!(RunRecord {
@@ -250,7 +243,7 @@ pub fn evaluate<'py>(
     let (volume, reference) = (taken(volume)?, taken(reference)?);
     let found = without_lock(py, |_| {
         let held = [&volume, &reference].map(|v| v.data.len() as u64);
-        Memory::of_volumes(&held).check(|_| vec![])?;
+        Memory::of_volumes(&held).check()?;
         if labels {
             score::same_shape("the volume", volume.data.shape(), reference.data.shape())?;
             let [a, b] = [("the volume", &volume), ("the reference", &reference)];

@@ -134,7 +134,7 @@ impl Scan {
 #[pyfunction]
 pub fn read_scan(py: Python<'_>, path: PathBuf) -> PyResult<Scan> {
     let scan = without_lock(py, |_| {
-        Memory::of_views(&conefield_io::scan_size(&path)?).check(|_| vec![])?;
+        Memory::of_views(&conefield_io::scan_size(&path)?).check()?;
         files::scan(&path)
     })?;
     Ok(Scan { scan: Arc::new(scan), path: Some(path.clone()), truth: Truth::Of(path) })

@@ -195,6 +195,12 @@ impl Written {
         })
     }
 
+    /// The stage that `new` makes of a new object.
+    fn stage<T>(&self, kind: Kind, new: fn(Python<'_>, StageObject) -> PyResult<Result<T>>) -> Result<T> {
+        let of = StageObject::new(self.name, self.object(kind)?);
+        Python::attach(|py| new(py, of).unwrap_or_else(|e| Err(Error::unsupported(self.name, words(py, &e)))))
+    }
+
     /// The error for settings that a class refuses.
     fn refused(&self, py: Python<'_>, e: PyErr) -> Error {
         let why = format!("{}, which {} refuses: {}", self.settings, self.name, words(py, &e));
@@ -220,21 +226,13 @@ impl Registered for Written {
 
 impl EncoderSpec for Written {
     fn build(&self) -> Result<Box<dyn Encoder>> {
-        let of = StageObject::new(self.name, self.object(Kind::Encoder)?);
-        Python::attach(|py| match PythonEncoder::new(py, of) {
-            Ok(encoder) => Ok(Box::new(encoder?) as Box<dyn Encoder>),
-            Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
-        })
+        Ok(Box::new(self.stage(Kind::Encoder, PythonEncoder::new)?))
     }
 }
 
 impl RegularizerSpec for Written {
     fn build(&self) -> Result<Box<dyn Regularizer>> {
-        let of = StageObject::new(self.name, self.object(Kind::Regularizer)?);
-        Python::attach(|py| match PythonRegularizer::new(py, of) {
-            Ok(regularizer) => Ok(Box::new(regularizer?) as Box<dyn Regularizer>),
-            Err(e) => Err(Error::unsupported(self.name, words(py, &e))),
-        })
+        Ok(Box::new(self.stage(Kind::Regularizer, PythonRegularizer::new)?))
     }
 }
 

@@ -42,7 +42,7 @@ pub fn made<'py>(py: Python<'py>, volume: Volume) -> PyResult<Bound<'py, PyAny>>
 pub fn read_volume(py: Python<'_>, name: String) -> PyResult<Bound<'_, PyAny>> {
     let volume = without_lock(py, |_| {
         let voxels = conefield::files::voxels(&name)?;
-        conefield::memory::Memory::of_volumes(&[voxels]).check(|_| vec![])?;
+        conefield::memory::Memory::of_volumes(&[voxels]).check()?;
         conefield::files::volume(&name)
     })?;
     made(py, volume)

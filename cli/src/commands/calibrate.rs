@@ -68,12 +68,12 @@ impl CalibrateArgs {
         }
         let backend = self.backend.open()?;
         let size = conefield_io::scan_size(&self.scan)?;
-        Memory::of_data_set(&size).check(|_| vec![])?;
+        Memory::of_data_set(&size).check()?;
         let DataSet { train: scan, test, volume } = conefield_scans::read_data_set(&self.scan, Parts::ALL)?;
         scan.validate(&self.scan.display().to_string())?;
         let settings =
             Settings { parameters: self.parameters.clone(), width: self.pixels.into(), curves: self.png.is_some() };
-        signals::listen()?;
+        signals::listen();
         let watch = Shown::new();
         let found = calibrate(&scan, &settings, backend.as_ref(), &watch)?;
         drop(watch);
@@ -219,7 +219,7 @@ impl Watch for Shown {
     fn progress(&self, share: f64) {
         let left = self.begin.elapsed().as_secs_f64() * (1.0 - share) / share.max(1e-6);
         let mut progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner);
-        progress.show(share, |_| format!("{} left", out::duration(left)));
+        progress.show(share, &|_| format!("{} left", out::duration(left)));
     }
 }
 

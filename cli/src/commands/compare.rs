@@ -1,11 +1,10 @@
 //! `conefield compare`
 
-use super::cell::{Cell, Start};
 use super::protocol::RunProtocol;
-use super::trial;
+use super::trial::{self, Start, Trial};
 use super::{EndOptions, General};
 use crate::boundary::Inputs;
-use crate::{out, run_folder, signals};
+use crate::{out, run_folder};
 use clap::Args;
 use conefield::backend::BackendChoice;
 use conefield::machine::simd_level;
@@ -98,30 +97,18 @@ impl CompareArgs {
     pub fn run(self, general: &General) -> Result<()> {
         // Errors in the input are reported before anything is created.
         let methods = self.methods()?;
-        let input = trial::input(&self.scan, &self.protocol)?;
+        let input = trial::input(&self.scan, &self.protocol, &|_| Ok(()))?;
         methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
         let mut lease = Lease::take(&self.output, CONTENTS)?;
         self.look_into_folder()?;
         self.spare_inputs(&methods)?;
-        let cell = |method| Cell {
-            method,
-            scan: self.scan.clone(),
-            run: self.output.join(&method.name),
-            protocol: self.protocol.clone(),
-        };
-        let cells: Vec<Cell> = methods.iter().map(cell).collect();
-        let start = |c: &Cell| if self.resume { c.start(&input) } else { Ok(Start::Anew) };
-        let starts: Vec<Start> = cells.iter().map(start).collect::<Result<_>>()?;
-        signals::listen()?;
-        if !self.resume || !self.output.exists() {
-            lease.replace()?;
-        } else {
-            lease.go_on();
-        }
+        let start = |m: &Method| if self.resume { self.trial(m).start(&m.loaded, &input) } else { Ok(Start::Anew) };
+        let starts: Vec<Start> = methods.iter().map(start).collect::<Result<_>>()?;
+        trial::begin(&mut lease, self.resume && self.output.exists())?;
         let mut entries = vec![];
-        for (i, (cell, start)) in cells.iter().zip(starts).enumerate() {
-            let part = format!("{} ({} of {})", cell.method.name, i + 1, cells.len());
-            entries.push(entry(cell, start, part, general)?);
+        for (i, (method, start)) in methods.iter().zip(starts).enumerate() {
+            let part = format!("{} ({} of {})", method.name, i + 1, methods.len());
+            entries.push(self.entry(method, start, part, general)?);
         }
         // Without any result there is no comparison: an earlier one is kept.
         if entries.iter().all(|e| e.outcome.figures.is_none()) {
@@ -169,6 +156,20 @@ impl CompareArgs {
         Ok(methods)
     }
 
+    /// The run of a method.
+    fn trial<'a>(&self, method: &'a Method) -> Trial<'a> {
+        let (scan, output) = (self.scan.clone(), self.output.join(&method.name));
+        Trial { scan, spec: &method.spec, init: None, output, protocol: self.protocol.clone() }
+    }
+
+    /// Runs a method unless that run is finished. Returns its row of the table.
+    fn entry(&self, method: &Method, start: Start, part: String, general: &General) -> Result<Entry> {
+        info!("{part}{}", if start == Start::Done { " is already finished" } else { "" });
+        let trial = self.trial(method);
+        let outcome = Outcome::of_run(&trial.output, trial.run(start, part, general)?)?;
+        Ok(Entry { name: method.name.clone(), spec: method.spec.clone(), run: trial.output, outcome })
+    }
+
     /// Refuses to replace an input.
     fn spare_inputs(&self, methods: &[Method]) -> Result<()> {
         let named = self.protocol.reference.iter().filter(|r| !conefield::input::is_truth(r));
@@ -203,16 +204,6 @@ impl CompareArgs {
     }
 }
 
-/// Runs a spec unless that run is finished. Returns its row of the table.
-fn entry(cell: &Cell, start: Start, part: String, general: &General) -> Result<Entry> {
-    info!("{part}{}", if start == Start::Done { " is already finished" } else { "" });
-    let outcome = match cell.carry_out(start, part, general)? {
-        Some(error) => Outcome::failed(error),
-        None => Outcome::of_run(&cell.run)?,
-    };
-    Ok(Entry { name: cell.method.name.clone(), spec: cell.method.spec.clone(), run: cell.run.clone(), outcome })
-}
-
 /// The results, for a picture.
 fn shown(entries: &[Entry]) -> Vec<Shown> {
     let results = entries.iter().filter_map(|e| Some((e, e.outcome.figures.as_ref()?)));
@@ -243,11 +234,10 @@ fn progressed(folder: &Path) -> Progressed {
 fn table(report: &Report) -> Table {
     let protocol = &report.protocol;
     let columns = Columns::of(protocol.reference.is_some(), !protocol.held_out_views.is_empty());
-    let row = |name: &str, cells: Vec<String>| [vec![name.to_owned()], cells].concat();
-    let mut rows = vec![row("method", columns.heads().iter().map(|h| h.to_string()).collect())];
+    let mut rows = vec![columns.heads("method")];
     let mut notes = vec![protocol.line()];
     for Entry { name, outcome, .. } in &report.methods {
-        rows.push(row(name, columns.cells(outcome)));
+        rows.push(columns.cells(name, outcome));
         notes.extend(outcome.error.as_ref().map(|e| format!("{name} failed: {e}")));
     }
     Table { rows, notes }

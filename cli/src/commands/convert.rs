@@ -78,7 +78,7 @@ impl ConvertArgs {
             }
             let template = self.dicom_template.as_ref().map(DicomTemplate::read).transpose()?;
             let voxels = conefield_io::volume_voxels(&self.input)?;
-            Memory::of_volumes(&[voxels]).check(|_| vec![])?;
+            Memory::of_volumes(&[voxels]).check()?;
             let volume = conefield_io::read_volume(&self.input)?;
             conefield_io::check_shape(&self.output, volume.grid.shape)?;
             let mut volume = &self.values.apply(volume)?;
@@ -100,7 +100,7 @@ impl ConvertArgs {
                 return Err(Error::invalid(self.input.display().to_string(), option, "a scan", expected));
             }
             let size = corrected_size(conefield_io::scan_size(&self.input)?, &corrections);
-            Memory::of_data_set(&size).check(|_| vec![])?;
+            Memory::of_data_set(&size).check()?;
             let DataSet { train, test, volume } = conefield_scans::read_data_set(&self.input, Parts::ALL)?;
             let place = self.input.display().to_string();
             let (train, applied) = corrections.apply(train, &place)?;

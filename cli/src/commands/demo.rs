@@ -1,30 +1,22 @@
 //! `conefield demo`
 
-use super::reconstruct;
+use super::Command;
+use super::protocol::word;
 use crate::boundary::refuse_existing;
-use crate::progress::Progress;
-use crate::run_folder::RunFolder;
-use crate::{out, signals};
-use clap::Args;
-use conefield::input::Input;
-use conefield::record::{RunRecord, ScanRecord};
+use crate::{Cli, out};
+use clap::{Args, Parser};
 use conefield::score::{SCORES, cells_of};
-use conefield::session::{Request, Session};
-use conefield::{memory, parse, specs};
+use conefield::{memory, method, parse, specs};
 use conefield_backend_cpu::Cpu;
-use conefield_core::method::{Limits, Solution};
-use conefield_core::scan::{Scan, Volume};
-use conefield_core::spec::load::to_toml;
 use conefield_core::{Error, Result};
 use conefield_evaluation::metrics::Scores;
-use conefield_evaluation::report::{MiddleSlices, Table};
+use conefield_evaluation::report::{MiddleSlices, Table, compare_png};
 use conefield_io::ScanSize;
 use conefield_projectors::simulate::{DetectorNoise, Protocol, phantom, simulate};
 use serde::Serialize;
 use serde_json::{Value, json};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::time::Instant;
 use tracing::info;
 
 /// Simulate a small scan, reconstruct it with three methods and compare them.
@@ -73,25 +65,14 @@ struct Entry {
     train_s: f64,
     export_s: f64,
     scores: Scores,
-    #[serde(skip)]
-    slices: MiddleSlices,
 }
 
 impl DemoArgs {
     pub fn run(self) -> Result<()> {
         let folder = &self.output;
         refuse_existing(folder, self.force)?;
-        // Every method is built, and refused if it does not fit into memory, before anything is created.
-        let weights = tempfile::Builder::new().suffix(".safetensors").tempfile();
-        let weights = weights.map_err(|e| Error::io(std::env::temp_dir(), e))?;
-        std::fs::write(weights.path(), specs::FAST_WEIGHTS).map_err(|e| Error::io(weights.path(), e))?;
-        let backend = Cpu::new();
-        let without = || vec!["normalizers=[]".to_owned(), "initializer.type=random".to_owned()];
-        // Passes over the views end by themselves, within seconds.
-        let voxels = self.session(&backend, VOXELS, vec![], None, Limits::default())?;
-        let timed = Limits { seconds: Some(self.seconds), ..Limits::default() };
-        let field = self.session(&backend, FIELD, vec![], Some(weights.path()), timed)?;
-        drop(self.session(&backend, FIELD, without(), None, timed)?);
+        // A method that does not fit into memory is refused before anything is created.
+        [VOXELS, FIELD].into_iter().try_for_each(|spec| self.check_memory(spec))?;
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         let size = usize::from(self.size);
         let truth = phantom(size);
@@ -101,30 +82,24 @@ impl DemoArgs {
             .with_detector([2 * size; 2])
             .with_views(self.views.into())
             .with_noise(noise, self.seed);
-        let scan = simulate(&truth, &protocol)?;
-        conefield_io::write_scan(folder.join(SCAN), &scan, Some(&truth))?;
-        // As it is on disk, so that a report recognizes it.
-        let scan = conefield_scans::read_scan(folder.join(SCAN))?;
+        conefield_io::write_scan(folder.join(SCAN), &simulate(&truth, &protocol)?, Some(&truth))?;
         info!("simulated {views} views of {0} x {0} pixels", 2 * size, views = self.views);
-
-        signals::listen()?;
         let path = folder.join("fast.safetensors");
         conefield_io::write_atomic(&path, &mut |w| w.write_all(specs::FAST_WEIGHTS).map_err(|e| Error::io(&path, e)))?;
-        let shared = Shared { folder, seed: self.seed, scan: Arc::new(scan), truth: &truth };
-        let voxels = shared.compete("smooth-tv", "smooth-tv", voxels)?;
-        let field = shared.compete("fast (LN, MCI)", "fast", field)?;
+
+        // Passes over the views end by themselves, within seconds.
+        let voxels = self.compete("smooth-tv", "smooth-tv", VOXELS, &[])?;
+        let timed = [word("--init", &path), word("--seconds", self.seconds.to_string())];
+        let field = self.compete("fast (LN, MCI)", "fast", FIELD, &timed)?;
         // At equal steps: how many fit into a time depends on what else the machine does.
-        let limits = Limits { steps: Some(field.steps), ..Limits::default() };
-        let other = self.session(&backend, FIELD, without(), None, limits)?;
-        let other = shared.compete("without LN, MCI", "without", other)?;
+        let without = ["--set=normalizers=[]".into(), "--set=initializer.type=random".into()];
+        let other = [&without[..], &[word("--steps", field.steps.to_string())]].concat();
+        let other = self.compete("without LN, MCI", "without", FIELD, &other)?;
         let entries = [voxels, field, other];
         let methods: Vec<Value> = entries.iter().map(|e| json!({ "name": e.run })).collect();
         conefield_io::write_text_atomic(folder.join("table.json"), &out::to_json(&json!({ "methods": methods }))?)?;
-        let captions: Vec<String> = entries.iter().map(|e| format!("{} {:.2} dB", e.name, e.scores.psnr)).collect();
-        let results: Vec<_> = captions.iter().map(|c| &c[..]).zip(entries.iter().map(|e| &e.slices)).collect();
         let picture = folder.join("compare.png");
-        let truth = MiddleSlices::of(&truth);
-        conefield_evaluation::report::compare_png(&picture, ("phantom", &truth), &results, truth.window())?;
+        self.draw(&picture, &MiddleSlices::of(&truth), &entries)?;
         if self.json {
             return out::json(&json!({ "folder": folder, "picture": picture, "results": entries }));
         }
@@ -143,63 +118,41 @@ impl DemoArgs {
         ))
     }
 
-    /// A run of `spec`. The simulated volume and the first two results are held beside it.
-    fn session<'a>(
-        &self,
-        backend: &'a Cpu,
-        spec: &str,
-        sets: Vec<String>,
-        init: Option<&Path>,
-        limits: Limits,
-    ) -> Result<Session<'a>> {
+    /// Refuses a run of `spec` that does not fit into memory, together with the volume that is scanned.
+    fn check_memory(&self, spec: &str) -> Result<()> {
         let (side, views) = (u64::from(self.size), usize::from(self.views));
         let (pixels, voxels) = (4 * side * side * u64::from(self.views), side.pow(3));
-        let size = ScanSize { pixels, voxels, test_pixels: 0, reading: 12 * voxels, views };
+        let size = ScanSize { pixels, voxels, test_pixels: 0, reading: 4 * voxels, views };
         let run = memory::Run { reference: true, ..memory::Run::on(size) };
-        let read = |sets: &[String]| specs::read(spec, sets);
-        let request = Request {
-            spec: Some(&read),
-            sets,
-            init: init.map(Path::to_path_buf),
-            limits,
-            seed: self.seed,
-            ..Request::default()
-        };
-        Session::open(request, backend, run, Instant::now())
+        method::planned(&|sets| specs::read(spec, sets), &[], None, &Cpu::new(), &run, true).map(drop)
     }
-}
 
-/// What the methods share.
-struct Shared<'a> {
-    folder: &'a Path,
-    seed: u64,
-    scan: Arc<Scan>,
-    truth: &'a Volume,
-}
-
-impl Shared<'_> {
-    /// Runs a method called `name`, and writes what "conefield reconstruct" writes to the folder `run`.
-    fn compete(&self, name: &'static str, run: &'static str, session: Session<'_>) -> Result<Entry> {
-        let mut folder = RunFolder::take(&self.folder.join(run))?;
-        folder.may_begin(true)?;
-        let input = Input::new(self.scan.clone(), vec![], Some(self.truth.clone()), Some(1.0))?;
-        let mut method = session.plan(input, 0.0, &|| false)?;
-        folder.begin()?;
-        let loaded = &method.method.loaded;
-        conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
-        let mut progress = Progress::new(name, Some(folder.metrics()?));
-        let solved = method.solve(None, None, &mut progress)?;
-        let (written, slices) = reconstruct::write(&folder, &method, &solved, self.seed, &Cpu::new())?;
-        let Solution { steps, train_s, .. } = solved.solution;
-        let (scores, export_s) = (written.scores.clone(), written.export_s);
-        let record = RunRecord {
-            scan: Some(ScanRecord::of(&self.folder.join(SCAN), &self.scan)?),
-            reference: Some("truth".into()),
-            ..method.record(&solved, progress.records().last(), written)
+    /// Runs a method called `name` by "conefield reconstruct" with `more` options, into the folder `run`.
+    fn compete(&self, name: &'static str, run: &'static str, spec: &str, more: &[OsString]) -> Result<Entry> {
+        info!("{name}");
+        let output = word("--output", self.output.join(run));
+        let fixed = ["conefield", "reconstruct", "--backend=cpu", "--force", "--reference=truth", "--peak=1"];
+        let words = fixed.map(OsString::from).into_iter().chain(more.iter().cloned());
+        let words = words.chain([output, word("--spec", spec), word("--seed", self.seed.to_string())]);
+        let line = Cli::try_parse_from(words.chain(["--".into(), self.output.join(SCAN).into()]));
+        let failed = |why: String| Error::unsupported("demo", why);
+        let Command::Reconstruct(command) = line.map_err(|e| failed(e.to_string()))?.command else {
+            return Err(failed("no reconstruction".into()));
         };
-        conefield_io::write_text_atomic(folder.file("record.json"), &out::to_json(&record)?)?;
-        folder.finish()?;
-        let scores = scores.ok_or_else(|| Error::unsupported("demo", "the phantom is not scored"))?;
-        Ok(Entry { name, run, steps, train_s, export_s, scores, slices })
+        let record = command.reconstruct()?.ok_or_else(|| failed("no record".into()))?;
+        let scores = record.written.scores.ok_or_else(|| failed("the phantom is not scored".into()))?;
+        let (steps, train_s, export_s) = (record.steps, record.train_s, record.written.export_s);
+        Ok(Entry { name, run, steps, train_s, export_s, scores })
+    }
+
+    /// Draws the middle slices of the phantom and of all results.
+    fn draw(&self, picture: &Path, truth: &MiddleSlices, entries: &[Entry]) -> Result<()> {
+        let mut results = vec![];
+        for e in entries {
+            let volume = conefield_io::read_volume(self.output.join(e.run).join("volume.nii.gz"))?;
+            results.push((format!("{} {:.2} dB", e.name, e.scores.psnr), MiddleSlices::of(&volume)));
+        }
+        let results: Vec<_> = results.iter().map(|(caption, slices)| (&caption[..], slices)).collect();
+        compare_png(picture, ("phantom", truth), &results, truth.window())
     }
 }

@@ -78,7 +78,7 @@ impl EvaluateArgs {
         let [volume, reference] = voxels;
         let (volume, reference) = (volume?, reference?);
         let maps = if self.segmenter.is_some() { &[volume, reference][..] } else { &[] };
-        Memory::of_volumes(&[&[volume, reference], maps].concat()).check(|_| vec![])?;
+        Memory::of_volumes(&[&[volume, reference], maps].concat()).check()?;
         let report = match self.threshold {
             Some(threshold) => self.material(threshold)?,
             None if self.labels => self.label_maps()?,
@@ -124,7 +124,7 @@ impl EvaluateArgs {
         let dice = match &self.segmenter {
             None => None,
             Some(segmenter) => {
-                signals::listen()?;
+                signals::listen();
                 // A segmentation may depend on the voxel size: both volumes get the same.
                 let volume = Volume { data: volume.data, grid: reference.grid, affine: reference.affine };
                 let [volume, reference] = [volume, reference].map(|v| self.in_hu(v));

@@ -36,7 +36,7 @@ impl ExplainArgs {
             None => Explanation::new(&loaded, plan.as_ref(), None)?,
             Some(path) => {
                 let size = conefield_io::scan_size(path)?;
-                Memory::of_views(&size).check(|_| vec![])?;
+                Memory::of_views(&size).check()?;
                 let scan = files::scan(path)?;
                 Explanation::new(&loaded, plan.as_ref(), Some((&scan, memory::Run::on(size))))?
             }

@@ -54,7 +54,7 @@ impl ExportArgs {
         let unit = if self.units.hu.is_some() { unit_of(&opened.file)? } else { None }.unwrap_or_else(unknown);
         let hu = self.units.of_attenuation()?.open(&opened.file, Some(&unit), &grid, None)?;
         let backend = self.trained.backend.open()?;
-        signals::listen()?;
+        signals::listen();
         let start = Instant::now();
         let mut voxels = opened.field.voxels(backend.as_ref(), grid)?;
         let hounsfield = outgoing::write_only(&self.output, &mut voxels, None, hu.as_ref(), template.as_ref())?;

@@ -119,21 +119,14 @@ impl FeaturesArgs {
 
 /// The middle slices perpendicular to x, y and z.
 fn planes(grid: &VoxelGrid) -> [Part; 3] {
-    std::array::from_fn(|cut| {
-        std::array::from_fn(|k| {
-            let (n, middle) = (grid.shape[k], grid.shape[k] / 2);
-            if k == cut { middle..middle + 1 } else { 0..n }
-        })
-    })
+    let (whole, middle) = (|k: usize| 0..grid.shape[k], |k: usize| grid.shape[k] / 2..grid.shape[k] / 2 + 1);
+    [0, 1, 2].map(|cut| std::array::from_fn(|k| if k == cut { middle(k) } else { whole(k) }))
 }
 
 /// The voxels of a part, in array order.
-fn indices([xs, ys, zs]: &Part) -> impl Iterator<Item = [usize; 3]> {
-    let (ys, zs) = (ys.clone(), zs.clone());
-    xs.clone().flat_map(move |x| {
-        let zs = zs.clone();
-        ys.clone().flat_map(move |y| zs.clone().map(move |z| [x, y, z]))
-    })
+fn indices([xs, ys, zs]: &Part) -> Vec<[usize; 3]> {
+    let row = |x: usize, y: usize| zs.clone().map(move |z| [x, y, z]);
+    xs.clone().flat_map(|x| ys.clone().flat_map(move |y| row(x, y))).collect()
 }
 
 /// Slices with values at the points in `held`; other points get `outside`.

@@ -60,7 +60,7 @@ impl ImportArgs {
         Inputs::default().and_description(&self.scanner).spare_folder(&self.output)?;
         let corrections = self.corrections.corrections()?;
         let size = corrected_size(conefield_io::scanner_size(&self.scanner)?, &corrections);
-        Memory::of_views(&size).check(|_| vec![])?;
+        Memory::of_views(&size).check()?;
         let selection = self.selection.selection();
         let options = ImportOptions { i0: self.i0, floor: self.floor, corrections, selection };
         let imported = conefield_scans::import(&self.scanner, &options)?;

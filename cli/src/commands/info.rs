@@ -110,7 +110,7 @@ fn statistics(values: ArrayView3<'_, f32>) -> Value {
 }
 
 fn volume(path: &Path, png: Option<&Path>) -> Result<Value> {
-    Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check(|_| vec![])?;
+    Memory::of_volumes(&[conefield_io::volume_voxels(path)?]).check()?;
     let v = conefield_io::read_volume(path)?;
     if let Some(png) = png {
         files::picture(png, None, &MiddleSlices::of(&v))?;
@@ -148,33 +148,20 @@ fn volume_warnings(path: &Path, v: &Volume) -> Vec<Value> {
 /// Geometry in mm, values and warnings of a scan.
 pub fn facts(s: &Scan, survey: &Survey) -> Value {
     let g = &s.geometry;
-    let setup = &survey.setup;
-    json!({
-        "kind": "scan",
-        "views": g.views.len(),
-        "detector": g.detector,
-        "pixel_mm": setup.pixel_mm,
-        "detector_mm": setup.detector_mm,
-        "offset_mm": setup.offset_mm,
-        "source_to_axis_mm": setup.source_to_axis_mm,
-        "source_to_detector_mm": setup.source_to_detector_mm,
-        "magnification": setup.magnification,
-        "circle": setup.circle,
-        "angles": setup.angles,
-        "supported_voxel_mm": setup.supported_voxel_mm,
-        "supported_voxel_is": "pixel / magnification at the isocentre (u for x and y, v for z)",
-        "field_of_view": setup.field_of_view,
-        "volume": {
-            "shape": g.volume.shape, "spacing_mm": g.volume.spacing, "size_mm": g.volume.size(),
-            "center_mm": g.volume.center,
-        },
-        "coverage": survey.coverage,
-        "truncation": survey.truncation,
-        "outside": survey.outside,
-        "unit": s.unit,
-        "attenuation_per_mm": survey.attenuation_per_mm,
-        "warnings": survey.warnings,
-    })
+    let (mut found, rest) = (json!(survey.setup), json!(survey));
+    for key in ["coverage", "truncation", "outside", "attenuation_per_mm", "warnings"] {
+        found[key] = rest[key].clone();
+    }
+    found["kind"] = json!("scan");
+    found["views"] = json!(g.views.len());
+    found["detector"] = json!(g.detector);
+    found["supported_voxel_is"] = json!("pixel / magnification at the isocentre (u for x and y, v for z)");
+    found["volume"] = json!({
+        "shape": g.volume.shape, "spacing_mm": g.volume.spacing, "size_mm": g.volume.size(),
+        "center_mm": g.volume.center,
+    });
+    found["unit"] = json!(s.unit);
+    found
 }
 
 /// Views, distances, arc and values of a scan, a line each, as names and texts. `counts` are those it was made from.
@@ -232,7 +219,7 @@ pub fn in_short(scan: &Scan, survey: &Survey, counts: Option<&CountsReport>) -> 
 
 /// Facts of a scan, and the most important ones in short.
 fn scan(path: &Path, png: Option<&Path>) -> Result<(Value, String)> {
-    Memory::of_data_set(&conefield_io::scan_size(path)?).check(|_| vec![])?;
+    Memory::of_data_set(&conefield_io::scan_size(path)?).check()?;
     let data = conefield_scans::read_data_set(path, conefield_io::Parts::ALL)?;
     let s = &data.train;
     s.validate(&path.display().to_string())?;

@@ -64,10 +64,10 @@ impl PretrainArgs {
         let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
         let job =
             PretrainJob { volumes: &volumes, backend: backend.as_ref(), seed: self.seed, limits: self.ends.limits() };
-        signals::listen()?;
+        signals::listen();
         let mut progress = Progress::new("pretrain", None);
         let weights = pretraining::train(&loaded, plan.as_mut(), &job, &mut progress)?;
-        let last = progress.records().last().cloned().unwrap_or_default();
+        let last = progress.latest.take().unwrap_or_default();
         drop(progress);
         files::write_weights(&self.output, &weights)?;
         let numbers: usize = weights.tensors.values().map(|t| t.1.len()).sum();

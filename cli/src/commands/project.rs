@@ -65,7 +65,7 @@ impl ProjectArgs {
         let buffers = 4 * size.pixels + projector.scratch(&header, header.views);
         let projecting = Memory { scan: 4 * size.pixels, volume: 4 * voxels, buffers, ..Memory::default() };
         let memory = Memory::most(&[reading, projecting]);
-        memory.check(|_| vec![])?;
+        memory.check()?;
 
         let volume = conefield_io::read_volume(&self.volume)?;
         parse::must_be_attenuation(&volume)?;
@@ -76,7 +76,7 @@ impl ProjectArgs {
         if let Some(odd) = projection::oddity(&geometry.volume, &scan.geometry.volume) {
             tracing::warn!("{}: {odd}", self.volume.display());
         }
-        signals::listen()?;
+        signals::listen();
         let start = Instant::now();
         let views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref())?;
         let project_s = start.elapsed().as_secs_f64();
@@ -103,14 +103,9 @@ impl ProjectArgs {
     /// The scan with the requested views.
     fn chosen(&self, scan: Scan) -> Result<Scan> {
         let n = scan.geometry.views.len();
-        match conefield::input::held_out(self.views.as_ref(), n, "command line", "--views")? {
+        match conefield::input::chosen(self.views.as_ref(), n)? {
             all if all.is_empty() || all.len() == n => Ok(scan),
-            some => {
-                if let Some(v) = some.iter().find(|v| **v >= n) {
-                    return Err(Error::invalid("command line", "--views", v, format!("numbers below {n}")));
-                }
-                Ok(scan.split(&some)?.1)
-            }
+            some => Ok(scan.split(&some)?.1),
         }
     }
 

@@ -3,12 +3,16 @@
 use super::EndOptions;
 use clap::Args;
 use conefield::backend::{self, BackendChoice};
+use conefield::input::{self, Input};
+use conefield::memory;
 use conefield::parse::{self, HoldOut};
-use conefield::{input, score};
+use conefield::record::ScanRecord;
 use conefield_core::Result;
-use conefield_core::scan::Volume;
+use conefield_core::scan::{Scan, Volume};
+use conefield_io::ScanSize;
 use std::ffi::{OsStr, OsString};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// The options that `reconstruct` and `compare` share.
 #[derive(Debug, Clone, Args)]
@@ -41,19 +45,23 @@ pub struct RunProtocol {
 }
 
 impl RunProtocol {
-    /// The data range of the scores.
-    pub fn peak(&self, reference: Option<&Volume>) -> f64 {
-        reference.map_or(self.peak.unwrap_or(1.0), |r| score::peak(self.peak, r))
-    }
-
     /// The reference as it is named.
     pub fn named_reference(&self) -> Option<String> {
         self.reference.as_ref().map(|r| r.display().to_string())
     }
 
-    /// Indices of the held-out views, of `n`. Refuses a choice without any.
-    pub fn held_out(&self, n: usize) -> Result<Vec<usize>> {
-        input::held_out(self.hold_out.as_ref(), n, "command line", "--hold-out")
+    /// The memory of a run besides its method.
+    pub fn memory(&self, scan: ScanSize) -> memory::Run {
+        memory::Run { split: self.hold_out.is_some(), reference: self.reference.is_some(), ..memory::Run::on(scan) }
+    }
+
+    /// The inputs of a run on the scan `whole` from `path`, and the record of that scan. Refuses held-out views that select
+    /// none, or that leave none for training.
+    pub fn input(&self, path: &Path, whole: Scan, reference: Option<Volume>) -> Result<(Input, ScanRecord)> {
+        let n = whole.geometry.views.len();
+        let held = input::held_out(self.hold_out.as_ref(), n, "command line", "--hold-out")?;
+        let record = ScanRecord::of(path, &whole)?;
+        Ok((Input::new(Arc::new(whole), held, reference, self.peak)?, record))
     }
 
     /// The same options for a child process. Flag and value form one argument, since a value may begin with a dash.

@@ -5,9 +5,8 @@ use super::units::HounsfieldOption;
 use super::{EndOptions, calibrate, protocol::RunProtocol, watch};
 use crate::board::Board;
 use crate::boundary::{self, Inputs};
-use crate::live::Live;
 use crate::outgoing::{self, WrittenVolume};
-use crate::progress::{Keeper, Progress};
+use crate::progress::{Progress, Renewed};
 use crate::run_folder::RunFolder;
 use crate::{out, signals};
 use clap::error::ErrorKind;
@@ -33,8 +32,7 @@ use conefield_evaluation::report::text::bytes;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Reconstruct a volume from a scan.
 ///
@@ -107,15 +105,18 @@ impl ReconstructArgs {
         if self.spec.is_none() && self.protocol.budget.is_none() {
             Self::without_a_spec();
         }
-        if !self.as_part {
-            return self.reconstruct();
+        if self.as_part {
+            signals::follow_input();
         }
-        signals::follow_input();
         let done = self.reconstruct();
-        if let Err(e) = &done {
+        if let (Err(e), true) = (&done, self.as_part) {
             out::say(&format!("{FAILED}{}", out::plain_line(&e.to_string(), out::LONGEST_LINE)))?;
         }
-        done
+        match done? {
+            None => Ok(()),
+            Some(record) if self.json => out::json(&record),
+            Some(record) => out::say(&summary(&record, &self.output)),
+        }
     }
 
     /// Exits with a usage error and advice.
@@ -138,7 +139,7 @@ impl ReconstructArgs {
         let (input, _, resume) = self.input(&session)?;
         let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
         let mut run = session.plan(input, spent, &|| false)?;
-        signals::listen()?;
+        signals::listen();
         // Such a process is quiet.
         match run.solve(None, resume.as_ref(), &mut Progress::new("reconstruct", None)) {
             // The leading process writes the checkpoint and says so.
@@ -147,14 +148,15 @@ impl ReconstructArgs {
         }
     }
 
-    fn reconstruct(&self) -> Result<()> {
+    /// Does the run and returns its record, if this process leads.
+    pub fn reconstruct(&self) -> Result<Option<RunRecord>> {
         let begin = Instant::now();
         if ranks::count() > 1 && self.protocol.budget.is_some() {
             let expected = "--spec without --budget: processes that measure their own speed would choose differently";
             return Err(Error::invalid("mpirun", "--budget", "several processes", expected));
         }
         if ranks::rank() > 0 {
-            return self.follow(begin);
+            return self.follow(begin).map(|()| None);
         }
         let mut folder = RunFolder::take(&self.output)?;
         if !self.resume {
@@ -186,7 +188,7 @@ impl ReconstructArgs {
         let mut run = session.plan(input, spent, &|| signals::caught().is_some())?;
         let loaded = &run.method.loaded;
         let identity = identity(loaded, &self.protocol, &run.input.held, &scan)?;
-        signals::listen()?;
+        signals::listen();
         // The parent process has ended, and nothing of this run has been written yet.
         if signals::caught().is_some() {
             return Err(Error::Aborted { part: "preparation".into() });
@@ -205,7 +207,7 @@ impl ReconstructArgs {
             tracing::info!("{} processes; this one sent {} to the others", ranks::count(), bytes(ranks::sent()));
         }
         // A run resumed after its last pass adds no record.
-        let last = progress.records().last().cloned().or(earlier);
+        let last = progress.latest.take().or(earlier);
         let board = progress.board.take();
         drop(progress);
 
@@ -220,7 +222,7 @@ impl ReconstructArgs {
             return Err(e);
         }
         self.doubt(&run.input.scan, record.held_out);
-        if self.json { out::json(&record) } else { out::say(&summary(&record, &scan, &self.output)) }
+        Ok(Some(record))
     }
 
     /// Writes the volumes, the scores and the record. Returns the record, and an error that only the volume in Hounsfield
@@ -236,7 +238,7 @@ impl ReconstructArgs {
         backend: &dyn Backend,
     ) -> Result<(RunRecord, Option<Error>)> {
         let affine = run.input.reference.as_ref().and_then(|r| r.affine);
-        let (written, _) = write(folder, run, solved, self.protocol.seed, backend)?;
+        let written = write(folder, run, solved, self.protocol.seed, backend)?;
         let hounsfield = hu.map(|hu| {
             let mut voxels = solved.solution.result.voxels(backend)?;
             outgoing::write_only(&folder.file("volume-hu.nii.gz"), voxels.as_mut(), affine, Some(hu), None)
@@ -281,21 +283,14 @@ impl ReconstructArgs {
             budget: self.protocol.budget,
             seed: self.protocol.seed,
         };
-        let run = memory::Run {
-            scan: conefield_io::scan_size(&self.scan)?,
-            split: self.protocol.hold_out.is_some(),
-            reference: self.protocol.reference.is_some(),
-            resume: self.resume,
-        };
+        let run = memory::Run { resume: self.resume, ..self.protocol.memory(conefield_io::scan_size(&self.scan)?) };
         Session::open(request, backend, run, begin)
     }
 
     /// Reads all inputs, and the checkpoint that a resumed run continues from.
     fn input(&self, session: &Session<'_>) -> Result<(Input, ScanRecord, Option<Resume>)> {
         let (whole, reference) = session.reading(|| input::read(&self.scan, self.protocol.reference.as_deref()))?;
-        let held = self.protocol.held_out(whole.geometry.views.len())?;
-        let record = ScanRecord::of(&self.scan, &whole)?;
-        let input = Input::new(Arc::new(whole), held, reference, self.protocol.peak)?;
+        let (input, record) = self.protocol.input(&self.scan, whole, reference)?;
         let resume = match session.requested() {
             Some(loaded) if self.resume => {
                 let identity = identity(loaded, &self.protocol, &input.held, &record)?;
@@ -315,14 +310,10 @@ impl ReconstructArgs {
     ) -> Result<Progress> {
         let board = self.tensorboard.then(|| Board::new(&folder.file("events.out.tfevents.conefield"), &metrics.0));
         let mut progress = Progress::new("reconstruct", Some(metrics));
-        progress.keeper = Some(Keeper {
-            path: folder.file(CHECKPOINT),
-            every: Duration::from_secs_f64(self.protocol.checkpoint_every),
-            run,
-            last: Instant::now(),
-        });
+        progress.keeper = Some(Renewed::new(folder.file(CHECKPOINT), self.protocol.checkpoint_every));
+        progress.run = run;
         let interval = self.live.or(self.watch.map(|_| WATCHED));
-        progress.live = interval.map(|seconds| Live::new(folder.file("live.png"), seconds));
+        progress.live = interval.map(|seconds| Renewed::new(folder.file("live.png"), seconds));
         progress.board = board.transpose()?;
         Ok(progress)
     }
@@ -341,22 +332,16 @@ fn begin_or_go_on(
     resume: Option<&Resume>,
 ) -> Result<((PathBuf, File), Option<Record>)> {
     if let Some(resume) = resume {
-        folder.go_on();
+        folder.0.go_on();
         return folder.metrics_until(resume.standing.recorded);
     }
-    folder.begin()?;
+    folder.0.replace()?;
     conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
     Ok((folder.metrics()?, None))
 }
 
-/// Writes the result of a run with this `seed` to its folder, and scores it. Returns its middle slices too.
-pub fn write(
-    folder: &RunFolder,
-    run: &Run<'_>,
-    solved: &Solved,
-    seed: u64,
-    backend: &dyn Backend,
-) -> Result<(Written, MiddleSlices)> {
+/// Writes the result of a run with this `seed` to its folder, and scores it.
+fn write(folder: &RunFolder, run: &Run<'_>, solved: &Solved, seed: u64, backend: &dyn Backend) -> Result<Written> {
     let (reference, result) = (run.input.reference.as_ref(), &solved.solution.result);
     let place = folder.file("volume.nii.gz");
     let start = Instant::now();
@@ -375,7 +360,7 @@ pub fn write(
     let start = Instant::now();
     let scores = whole.map(|v| run.scores(&place.display().to_string(), &v)).transpose()?.flatten();
     let score_s = start.elapsed().as_secs_f64();
-    Ok((Written { parameters, export_s, picture_s, score_s, scores }, slices))
+    Ok(Written { parameters, export_s, picture_s, score_s, scores })
 }
 
 /// Properties that must match to resume a run or to count it as finished.

@@ -101,7 +101,7 @@ impl ReportArgs {
         // Worst case: incompressible data as text, and before that its two halves.
         let packed = 2 * all.min(self.embed);
         let moments = groups.iter().map(|g| g.memory(options, packed)).collect::<Result<Vec<_>>>()?;
-        Memory::most(&moments.concat()).check(|_| vec![])
+        Memory::most(&moments.concat()).check()
     }
 
     fn summarize(&self, page: &Page, coarser: usize, bytes: u64) -> Result<()> {

@@ -101,7 +101,7 @@ impl SimulateArgs {
         };
         Inputs::of([&self.volume, &self.protocol]).and(angles).spare_folder(&self.output)?;
         let before = files::voxels(&self.volume)?;
-        Memory::of_volumes(&[before]).check(|_| vec![])?;
+        Memory::of_volumes(&[before]).check()?;
         let volume = simulation::prepared(files::volume(&self.volume)?, self.values, self.downsample.into())?;
         let set_up = self.set_up.protocol(self.detector, &volume.grid);
         let changes = Changes {

@@ -1,8 +1,8 @@
 //! `conefield study`
 
-use super::cell::{self, Start, is_done};
 use super::protocol::RunProtocol;
-use super::{EndOptions, General, trial};
+use super::trial::{self, Start, Trial, is_done};
+use super::{EndOptions, General};
 use crate::boundary::{Inputs, refuse_existing};
 use crate::{out, program, signals};
 use clap::Args;
@@ -114,13 +114,11 @@ impl StudyArgs {
         if goes_on {
             work.check_runs(cells)?;
         }
-        signals::listen()?;
-        let Some(mut lease) = lease else { return SharedLease::take(&self.output).map(Hold::Shared) };
-        if goes_on && any {
-            lease.go_on();
-        } else {
-            lease.replace()?;
-        }
+        let Some(mut lease) = lease else {
+            signals::listen();
+            return SharedLease::take(&self.output).map(Hold::Shared);
+        };
+        trial::begin(&mut lease, goes_on && any)?;
         Ok(Hold::Alone(lease))
     }
 
@@ -216,7 +214,7 @@ impl Work<'_> {
             // A missing scan is simulated again bit-identically, and is checked then.
             if self.scan(&cells[0]).exists() && cells.iter().any(|c| self.run(c).exists()) {
                 let input = self.input(&cells[0])?;
-                cells.iter().try_for_each(|c| self.process(c).start(&input).map(drop))?;
+                cells.iter().try_for_each(|c| self.start(c, &input).map(drop))?;
             }
         }
         Ok(())
@@ -231,9 +229,9 @@ impl Work<'_> {
             let input = self.input(&same[0])?;
             for cell in same {
                 number += 1;
-                let part = format!("{} ({number} of {})", self.name(cell), cells.len());
+                let part = format!("{} ({number} of {})", self.study.run_name(cell), cells.len());
                 self.await_run(cell, &part)?;
-                let start = self.process(cell).start(&input)?;
+                let start = self.start(cell, &input)?;
                 if start == Start::Done {
                     info!("{part} is already finished");
                     continue;
@@ -254,7 +252,7 @@ impl Work<'_> {
         if failure.exists() {
             fs::remove_file(&failure).map_err(|e| Error::io(&failure, e))?;
         }
-        let Some(error) = self.process(cell).carry_out(start, part, self.general)? else { return Ok(()) };
+        let Some(error) = self.trial(cell).run(start, part, self.general)? else { return Ok(()) };
         let folder = failure.parent().unwrap_or(Path::new(""));
         fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         conefield_io::write_text_atomic(&failure, &error)
@@ -287,16 +285,22 @@ impl Work<'_> {
     /// The scan of a run.
     fn input(&self, cell: &Cell) -> Result<TrialInput> {
         let scan = self.scan(cell);
-        trial::input_of(&scan, &self.protocol(cell), |s| match &self.study.cases[cell.case].source {
+        trial::input(&scan, &self.protocol(cell), &|s| match &self.study.cases[cell.case].source {
             Source::Simulated(simulation) => simulation.check_made(cell.seed, s, &scan),
             Source::Scan { .. } => Ok(()),
         })
     }
 
-    /// A run with its method, scan and options.
-    fn process(&self, cell: &Cell) -> cell::Cell<'_> {
+    /// A run with its scan and options.
+    fn trial(&self, cell: &Cell) -> Trial<'_> {
         let method = &self.study.methods[cell.method];
-        cell::Cell { method, scan: self.scan(cell), run: self.run(cell), protocol: self.protocol(cell) }
+        let (scan, output, protocol) = (self.scan(cell), self.run(cell), self.protocol(cell));
+        Trial { scan, spec: &method.spec, init: method.init.as_deref(), output, protocol }
+    }
+
+    /// How a run starts. Refuses a folder with a different run.
+    fn start(&self, cell: &Cell, input: &TrialInput) -> Result<Start> {
+        self.trial(cell).start(&self.study.methods[cell.method].loaded, input)
     }
 
     /// The options of a run.
@@ -327,11 +331,11 @@ impl Work<'_> {
     }
 
     fn run(&self, cell: &Cell) -> PathBuf {
-        self.layout.run(&self.study.cases[cell.case].name, cell.seed, &self.study.methods[cell.method].name)
+        self.layout.run(&self.study.run_name(cell))
     }
 
     fn failure_file(&self, cell: &Cell) -> PathBuf {
-        self.layout.failure(&self.study.cases[cell.case].name, cell.seed, &self.study.methods[cell.method].name)
+        self.layout.failure(&self.study.run_name(cell))
     }
 
     /// The error of a failed run.
@@ -342,10 +346,6 @@ impl Work<'_> {
         text.map(|text| String::from_utf8_lossy(&text).into_owned())
     }
 
-    fn name(&self, cell: &Cell) -> String {
-        format!("{}/{}", group(&self.study.cases[cell.case].name, cell.seed), self.study.methods[cell.method].name)
-    }
-
     /// Whether every run of the study has ended.
     fn is_over(&self) -> bool {
         self.study.cells().iter().all(|c| is_done(&self.run(c)) || self.failure_file(c).exists())
@@ -353,10 +353,7 @@ impl Work<'_> {
 
     /// The outcomes of all runs, after all have ended; draws the pictures.
     fn report(&self) -> Result<StudyReport<'_>> {
-        let outcome = |c: &Cell| match self.failure(c) {
-            Some(error) => Ok((*c, Outcome::failed(error))),
-            None => Outcome::of_run(&self.run(c)).map(|o| (*c, o)),
-        };
+        let outcome = |c: &Cell| Ok((*c, Outcome::of_run(&self.run(c), self.failure(c))?));
         let outcomes: Vec<(Cell, Outcome)> = self.study.cells().iter().map(outcome).collect::<Result<_>>()?;
         if outcomes.iter().all(|(_, o)| o.figures.is_none()) {
             let why: Vec<&str> = outcomes.iter().filter_map(|(_, o)| o.error.as_deref()).take(3).collect();

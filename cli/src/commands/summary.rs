@@ -2,19 +2,19 @@
 
 use super::evaluate;
 use crate::out;
-use conefield::record::{RunRecord, ScanRecord};
+use conefield::record::RunRecord;
 use std::path::Path;
 
 /// Below this share a budget counts as not used up.
 const USED: f64 = 0.8;
 
 /// The record as text.
-pub fn summary(r: &RunRecord, scan: &ScanRecord, output: &Path) -> String {
-    let [x, y, z] = scan.volume;
+pub fn summary(r: &RunRecord, output: &Path) -> String {
+    let ([x, y, z], views) = r.scan.as_ref().map_or(([0; 3], 0), |scan| (scan.volume, scan.views));
     let speed = r.samples_per_s.map(|s| format!(" ({:.2} M samples/s)", s / 1e6)).unwrap_or_default();
     let mut lines = vec![format!(
         "{x} x {y} x {z} voxels from {} views: {} in {}{speed}, export {}",
-        scan.views - r.held_out_views.len(),
+        views - r.held_out_views.len(),
         if r.steps == 1 { "1 step".into() } else { format!("{} steps", r.steps) },
         out::duration(r.train_s),
         out::duration(r.written.export_s),

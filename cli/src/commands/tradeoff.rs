@@ -1,10 +1,10 @@
 //! `conefield tradeoff`
 
 use super::protocol::RunProtocol;
-use super::trial::{self, Trial};
+use super::trial::{self, Start, Trial};
 use super::{EndOptions, General};
 use crate::boundary::Inputs;
-use crate::{out, signals};
+use crate::out;
 use clap::Args;
 use conefield::backend::{self, BackendChoice};
 use conefield::input::is_truth;
@@ -13,7 +13,7 @@ use conefield::parse::{self, HoldOut};
 use conefield::specs;
 use conefield::tradeoff::levers::{self, Candidate, Levers};
 use conefield::tradeoff::report::TradeoffReport;
-use conefield::tradeoff::search::{CONTENTS, Due, Earlier, Search};
+use conefield::tradeoff::search::{CONTENTS, Due, Search};
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use conefield_io::Lease;
@@ -94,24 +94,14 @@ impl TradeoffArgs {
         };
         let levers = levers.only(&self.bases)?;
         let search = self.search(levers.candidates(self.candidates.into(), self.seed)?, general)?;
-        let earlier = match (self.force, self.resume) {
-            (true, _) => Earlier::Replace,
-            (_, true) => Earlier::Resume,
-            _ => Earlier::Refuse,
-        };
         let named = self.reference.iter().filter(|r| !is_truth(r));
         let inputs = Inputs::of(&self.scans).and(named).and(&self.levers);
         // Also the specs that a list of levers names.
         let bases: Vec<_> = search.candidates.iter().map(|c| specs::read(&c.spec, &c.sets)).collect::<Result<_>>()?;
         bases.iter().fold(inputs, |inputs, base| inputs.and_spec(base)).spare_folder(output)?;
         let mut lease = Lease::take(output, CONTENTS)?;
-        let mut over = search.look(output, earlier)?;
-        signals::listen()?;
-        if earlier != Earlier::Resume || !output.exists() {
-            lease.replace()?;
-        } else {
-            lease.go_on();
-        }
+        let mut over = search.look(output, self.force, self.resume)?;
+        trial::begin(&mut lease, self.resume && output.exists())?;
         let rungs = search.climb(output, &mut over, &mut |due| self.trial(&search, due, general))?;
         let report = TradeoffReport::new(search, rungs, over)?;
         report.write(output)?;
@@ -142,7 +132,7 @@ impl TradeoffArgs {
         for (i, scan) in self.scans.iter().enumerate() {
             let again = self.scans[..i].contains(scan);
             ensure(!again, "tradeoff", "SCAN", scan.display(), "every scan once")?;
-            let input = trial::input(scan, &self.protocol(references.get(i), 1.0, &[]))?;
+            let input = trial::input(scan, &self.protocol(references.get(i), 1.0, &[]), &|_| Ok(()))?;
             ensure(all > 0 || !input.held.is_empty(), "tradeoff", "--hold-out", "no view", "at least one")?;
             scans.push(input.scan);
         }
@@ -181,14 +171,8 @@ impl TradeoffArgs {
     fn trial(&self, search: &Search, due: &Due<'_>, general: &General) -> Result<Option<String>> {
         let Due { candidate, budget_s, scan, output, part } = due;
         let protocol = self.protocol(search.references.get(*scan), *budget_s, &candidate.sets);
-        let trial = Trial {
-            scan: &self.scans[*scan],
-            spec: &candidate.spec,
-            output,
-            protocol: &protocol,
-            // Replaces the remains of an interrupted trial.
-            more: &["--force".into()],
-        };
-        trial.run(part.clone(), general)
+        let (scan, output) = (self.scans[*scan].clone(), output.clone());
+        // Replaces the remains of an interrupted trial.
+        Trial { scan, spec: &candidate.spec, init: None, output, protocol }.run(Start::Replacing, part.clone(), general)
     }
 }

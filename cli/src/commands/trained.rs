@@ -1,6 +1,6 @@
 //! Shared parts of commands on the field of a finished run.
 
-use crate::run_folder::RunOnDisk;
+use crate::run_folder::Recorded;
 use clap::Args;
 use conefield::backend::{self, BackendChoice};
 use conefield::files;
@@ -53,8 +53,8 @@ impl Trained {
     /// The error of reading the field; if the run used plugins that are not loaded, it says how to load them.
     fn with_plugins(&self, error: Error) -> Error {
         let folder = if self.run.is_dir() { &self.run } else { self.run.parent().unwrap_or(Path::new("")) };
-        let used = RunOnDisk::read(folder).map(|run| run.plugins()).unwrap_or_default();
-        let missing: Vec<&Used> = used.iter().filter(|plugin| !plugin.is_loaded()).collect();
+        let Ok((Recorded { plugins, .. }, _)) = Recorded::read(folder) else { return error };
+        let missing: Vec<&Used> = plugins.iter().filter(|plugin| !plugin.is_loaded()).collect();
         if missing.is_empty() {
             return error;
         }
@@ -75,5 +75,5 @@ impl OpenedField {
 /// Memory of the file with its numbers, then of the numbers with the model.
 fn memory(bytes: u64, buffers: u64) -> Result<Memory> {
     let memory = Memory::most(&[Memory { model: 2 * bytes, buffers, ..Memory::default() }]);
-    memory.check(|_| vec![]).map(|()| memory)
+    memory.check().map(|()| memory)
 }

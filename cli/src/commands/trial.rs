@@ -2,38 +2,94 @@
 
 use super::General;
 use super::protocol::{RunProtocol, word};
-use super::reconstruct::FAILED;
+use super::reconstruct::{FAILED, conditions, identity};
+use crate::run_folder::Recorded;
 use crate::{program, signals};
-use conefield::input;
-use conefield::memory::Run;
+use conefield::tradeoff::json::LONGEST;
 use conefield::tradeoff::trial::TrialInput;
+use conefield::{files, input, plugins};
 use conefield_core::scan::Scan;
+use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
-use std::path::Path;
+use conefield_io::Lease;
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
 /// One run.
 pub struct Trial<'a> {
-    pub scan: &'a Path,
+    pub scan: PathBuf,
     /// The spec, as on the command line.
     pub spec: &'a str,
+    /// The file to start from.
+    pub init: Option<&'a str>,
     /// The run's folder.
-    pub output: &'a Path,
-    pub protocol: &'a RunProtocol,
-    /// Further options.
-    pub more: &'a [String],
+    pub output: PathBuf,
+    pub protocol: RunProtocol,
+}
+
+/// How a run starts, given the content of its folder.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Start {
+    /// The folder is empty.
+    Anew,
+    /// An earlier run ended without a checkpoint.
+    Replacing,
+    /// There is a checkpoint.
+    Resuming,
+    /// The run is finished.
+    Done,
+}
+
+/// Whether `folder` holds a finished run.
+pub fn is_done(folder: &Path) -> bool {
+    ["record.json", "volume.nii.gz"].iter().all(|f| folder.join(f).exists())
 }
 
 impl Trial<'_> {
-    /// Runs it. Returns the error of a failed run. `part` names the work in the message of an interruption.
-    pub fn run(&self, part: String, general: &General) -> Result<Option<String>> {
+    /// How the run starts; `loaded` is its spec.
+    ///
+    /// # Errors
+    /// The folder holds a different run.
+    pub fn start(&self, loaded: &Loaded, input: &TrialInput) -> Result<Start> {
+        let Self { output, protocol, .. } = self;
+        if !output.exists() {
+            return Ok(Start::Anew);
+        }
+        let mut now = identity(loaded, protocol, &input.held, &input.scan)?;
+        if is_done(output) {
+            now.insert("reference".into(), Value::from(protocol.named_reference()).to_string());
+            now.insert("peak".into(), input.peak.to_string());
+            now.insert("backend".into(), protocol.backend.kind().into());
+            files::same_run(&output.join("record.json").display().to_string(), &recorded(output)?, &now)?;
+            return Ok(Start::Done);
+        }
+        let checkpoint = output.join("checkpoint.safetensors");
+        if checkpoint.exists() {
+            files::read_checkpoint(&checkpoint, &now)?;
+            return Ok(Start::Resuming);
+        }
+        Ok(Start::Replacing)
+    }
+
+    /// Does the run unless it is finished. Returns the error of a failed run. `part` names the work in the message of an
+    /// interruption.
+    pub fn run(&self, start: Start, part: String, general: &General) -> Result<Option<String>> {
+        let mode = match start {
+            Start::Done => return Ok(None),
+            Start::Resuming => Some("--resume"),
+            Start::Replacing => Some("--force"),
+            Start::Anew => None,
+        };
         if signals::caught().is_some() {
             return Err(Error::Stopped { part });
         }
         let mut command = program::command()?;
-        command.args(general.arguments()).args(["reconstruct", "--as-part"]).args(self.more);
-        command.arg(word("--spec", self.spec)).arg(word("--output", self.output));
-        command.args(self.protocol.arguments()).arg("--").arg(self.scan);
+        command.args(general.arguments()).args(["reconstruct", "--as-part"]).args(mode);
+        command.args(self.init.map(|init| word("--init", init)));
+        command.arg(word("--spec", self.spec)).arg(word("--output", &self.output));
+        command.args(self.protocol.arguments()).arg("--").arg(&self.scan);
         let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
         let mut child = child.map_err(|e| Error::io("conefield", e))?;
         let mut input = child.stdin.take();
@@ -58,25 +114,39 @@ impl Trial<'_> {
     }
 }
 
-/// Reads scan and reference to check that they fit together, and keeps a summary.
-pub fn input(path: &Path, protocol: &RunProtocol) -> Result<TrialInput> {
-    input_of(path, protocol, |_| Ok(()))
+/// The [`identity`] of a finished run and its reference.
+fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
+    let known = Recorded::read(folder)?.0;
+    let backend = known.backend["backend"].as_str().unwrap_or_default();
+    let mut all = BTreeMap::from([
+        ("conefield".into(), known.version),
+        ("seed".into(), known.seed.to_string()),
+        ("spec".into(), conefield_core::files::read_text(&folder.join("spec.toml"), LONGEST)?),
+        ("reference".into(), Value::from(known.reference).to_string()),
+        ("peak".into(), known.peak.to_string()),
+        ("backend".into(), backend.split(',').next().unwrap_or_default().into()),
+    ]);
+    all.extend(conditions(&known.scan, &known.held_out_views, &known.limits, known.budget_s)?);
+    all.extend(plugins::identity(&known.plugins));
+    Ok(all)
 }
 
-/// The same, after `check` has inspected the scan.
-pub fn input_of(path: &Path, protocol: &RunProtocol, check: impl FnOnce(&Scan) -> Result<()>) -> Result<TrialInput> {
-    let all = Run {
-        scan: conefield_io::scan_size(path)?,
-        split: protocol.hold_out.is_some(),
-        reference: protocol.reference.is_some(),
-        resume: false,
-    };
-    all.reading().check(|_| vec![])?;
+/// Begins the work in a folder: continues there, or moves aside what is there. From now on a signal ends it after its step.
+pub fn begin(lease: &mut Lease, goes_on: bool) -> Result<()> {
+    signals::listen();
+    if goes_on {
+        lease.go_on();
+        return Ok(());
+    }
+    lease.replace()
+}
+
+/// Reads scan and reference to check that they fit together and that `check` accepts the scan, and keeps a summary.
+pub fn input(path: &Path, protocol: &RunProtocol, check: &dyn Fn(&Scan) -> Result<()>) -> Result<TrialInput> {
+    protocol.memory(conefield_io::scan_size(path)?).reading().check()?;
     let (scan, reference) = input::read(path, protocol.reference.as_deref())?;
     check(&scan)?;
-    let held = protocol.held_out(scan.geometry.views.len())?;
-    let peak = protocol.peak(reference.as_ref());
-    TrialInput::of(path, scan, reference.as_ref(), peak, held)
+    protocol.input(path, scan, reference).map(|(input, record)| TrialInput::of(input, record))
 }
 
 /// The signal that ended a process, from an exit status above 128 (as in shells) or from the system.

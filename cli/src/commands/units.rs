@@ -1,6 +1,6 @@
 //! The option for Hounsfield units of a written volume.
 
-use crate::run_folder::RunOnDisk;
+use crate::run_folder::Recorded;
 use clap::Args;
 use conefield::hounsfield::{Calibration, How};
 use conefield_core::geometry::VoxelGrid;
@@ -51,7 +51,7 @@ impl HounsfieldOption {
 pub fn unit_of(path: &Path) -> Result<Option<Unit>> {
     let folder = folder_of(path);
     if folder.join("record.json").is_file() {
-        return Ok(RunOnDisk::read(folder)?.unit());
+        return Ok(Recorded::read(folder)?.0.scan.unit);
     }
     conefield_io::scan_unit(folder)
 }

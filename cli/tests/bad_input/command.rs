@@ -31,6 +31,7 @@ pub fn cases() -> Vec<Case> {
         wrong("a detector of one number", "simulate phantom:head:16 -o scan --detector 64", &["ROWSxCOLS"]),
         wrong("a detector without rows", "simulate phantom:head:16 -o scan --detector 0x64", &["both above 0"]),
         wrong("no views", "simulate phantom:head:16 -o scan --views 0", &["--views"]),
+        wrong("blocks of no voxels", "simulate phantom:head:16 -o scan --downsample 0", &["--downsample"]),
         wrong("an offset of NaN", "simulate phantom:head:16 -o scan --offset nan,0", &["finite"]),
         wrong("angles over no range", "simulate phantom:head:16 -o scan --angles 0:0", &["START:RANGE"]),
         wrong("noise of no photons", "simulate phantom:head:16 -o scan --noise poisson:0", &["poisson"]),

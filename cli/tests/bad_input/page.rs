@@ -1,7 +1,7 @@
 //! The table in `cases.md`.
 
 use crate::case::Outcome;
-use std::fs;
+use conefield_tests::blessed;
 use std::path::Path;
 
 const HEAD: &str = "# Bad inputs and what conefield says\n\nWritten by `CONEFIELD_BLESS=1 cargo test --release --workspace --test bad_input`.\n";
@@ -9,13 +9,7 @@ const HEAD: &str = "# Bad inputs and what conefield says\n\nWritten by `CONEFIEL
 /// Compares the table with the outcomes, or writes it.
 pub fn check(run: &[(&str, Vec<Outcome>)]) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/bad_input/cases.md");
-    let wanted = format!("{HEAD}{}", table(run));
-    if std::env::var_os("CONEFIELD_BLESS").is_some() {
-        return fs::write(path, wanted).unwrap();
-    }
-    let found = fs::read_to_string(&path).unwrap();
-    let differ = found.lines().zip(wanted.lines()).find(|(a, b)| a != b);
-    assert!(found == wanted, "{} is not current (CONEFIELD_BLESS=1 writes it): {differ:?}", path.display());
+    blessed::check(&path, &format!("{HEAD}{}", table(run)));
 }
 
 fn table(run: &[(&str, Vec<Outcome>)]) -> String {

@@ -4,7 +4,6 @@
 use crate::common::{Folder, SCAN, number, signal};
 use std::fs;
 use std::os::unix::ffi::OsStrExt;
-use std::process::Child;
 use std::time::{Duration, Instant};
 
 /// Runs of a few steps, of one pass, and of several methods.
@@ -132,17 +131,11 @@ fn a_closed_terminal_leaves_a_checkpoint() {
     assert!(d.has("run/checkpoint.safetensors"));
 }
 
-/// A long run that has a checkpoint.
-fn checkpointed(d: &Folder) -> Child {
-    let child = d.started(&format!("{LONG} --checkpoint-every 0.05s"));
-    d.wait_for("run/checkpoint.safetensors");
-    child
-}
-
 #[test]
 fn a_run_has_its_folder_alone() {
     let d = Folder::after(&[SCAN]);
-    let mut child = checkpointed(&d);
+    let mut child = d.started(&format!("{LONG} --checkpoint-every 0.05s"));
+    d.wait_for("run/checkpoint.safetensors");
     for _ in 0..6 {
         for more in ["--force", "--resume"] {
             d.refused_with(1, &format!("{FAST} {more}"), &["another conefield is writing"]);
@@ -175,9 +168,8 @@ fn a_killed_replacement_gives_back_what_it_replaced() {
 #[test]
 fn a_checkpoint_of_which_a_bit_is_changed_is_refused() {
     let d = Folder::after(&[SCAN]);
-    let mut child = checkpointed(&d);
-    signal(&child, "INT");
-    child.wait().unwrap();
+    let saved = || d.filled("run/checkpoint.safetensors");
+    d.interrupted(&format!("{LONG} --checkpoint-every 0.05s"), "INT", &saved);
     let (path, resume) = (d.at("run/checkpoint.safetensors"), format!("{LONG} --resume"));
     let good = d.bytes(&path);
     let step = b"\\\"step\\\":";

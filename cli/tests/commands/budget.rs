@@ -1,6 +1,6 @@
 //! `reconstruct --budget`: the plan, refusals, and the record.
 
-use crate::common::{Folder, number, signal};
+use crate::common::{Folder, number};
 use serde_json::Value;
 
 const SCAN: &str = "simulate phantom:head:16 -o scan --views 12 --detector 16x16";
@@ -94,11 +94,8 @@ fn an_interrupted_run_goes_on_with_what_it_chose() {
          [[points]]\nname = \"p\"\nkind = \"voxels\"\nspec = \"sirt\"\nsets = [\"relaxation=1.5\"]\nbudget_s = 1.0\n\
          [[points.runs]]\nsteps = 10\ntrain_s = 0.1\ntotal_s = 0.2\npsnr = 20.0\n",
     );
-    let child = d.started("reconstruct scan -o run --budget 6s --front front.toml");
-    d.wait_for("run/metrics.jsonl");
-    signal(&child, "INT");
-    let output = child.wait_with_output().unwrap();
-    assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8(output.stderr).unwrap());
+    let begun = || d.filled("run/metrics.jsonl");
+    d.interrupted("reconstruct scan -o run --budget 6s --front front.toml", "INT", &begun);
     for (other, want) in
         [("--budget 7s", "budget"), ("--spec run/spec.toml", "budget"), ("--budget 6s --set relaxation=1.2", "spec")]
     {

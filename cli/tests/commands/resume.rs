@@ -1,7 +1,7 @@
 //! A killed or interrupted run resumes to the same bits.
 
-use crate::common::{Folder, SCAN, signal};
-use std::time::{Duration, Instant};
+use crate::common::{Folder, SCAN};
+use std::time::Instant;
 
 /// The mask removes channels during the run: its decision must be restored too.
 fn line(run: &str, steps: u64, more: &str) -> String {
@@ -66,13 +66,9 @@ fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
     let d = Folder::after(&[SCAN]);
     let steps = 500;
     d.done(&line("whole", steps, ""));
-    for (name, code) in [("INT", 130), ("TERM", 143)] {
-        let child = d.started(&line(name, steps, "--checkpoint-every 1h"));
-        d.wait_for(&format!("{name}/metrics.jsonl"));
-        signal(&child, name);
-        let output = child.wait_with_output().unwrap();
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(code), "{said}");
+    for name in ["INT", "TERM"] {
+        let begun = || d.filled(&format!("{name}/metrics.jsonl"));
+        let said = d.interrupted(&line(name, steps, "--checkpoint-every 1h"), name, &begun);
         assert!(said.contains("interrupted") && said.contains("--resume"), "{said}");
         let run = d.at(name);
         assert!(run.join("checkpoint.safetensors").exists() && !run.join("volume.nii.gz").exists());
@@ -116,14 +112,9 @@ fn interrupted_methods_lose_no_record() {
     let line = |run: &str, more: &str| format!("reconstruct scan --spec three.toml -o {run} {more}");
     d.done(&line("whole", ""));
     for (run, after) in [("first", 9), ("last", 340)] {
-        let mut child = d.started(&line(run, "--checkpoint-every 1h"));
         let metrics = d.at(run).join("metrics.jsonl");
         let lines = || std::fs::read_to_string(&metrics).map_or(0, |text| text.lines().count());
-        while lines() < after && child.try_wait().unwrap().is_none() {
-            std::thread::sleep(Duration::from_millis(1));
-        }
-        signal(&child, "INT");
-        assert_eq!(child.wait().unwrap().code(), Some(130), "{run}");
+        d.interrupted(&line(run, "--checkpoint-every 1h"), "INT", &|| lines() >= after);
         let before = lines();
         d.done(&line(run, "--resume"));
         same_results(&d, "whole", run);

@@ -1,20 +1,14 @@
 //! The schema files for editors are current.
 
 use crate::common::Folder;
+use conefield_tests::blessed;
 use serde_json::Value;
 
 #[test]
 fn the_files_in_specs_are_current() {
     for (file, line) in [("spec.schema.json", "schema"), ("study.schema.json", "schema --study")] {
         let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../conefield/specs/schema").join(file);
-        let wanted = Folder::new().done(line);
-        if std::env::var_os("CONEFIELD_BLESS").is_some() {
-            std::fs::write(&path, &wanted).unwrap();
-        }
-        assert!(
-            std::fs::read_to_string(&path).unwrap_or_default() == wanted,
-            "write it anew: cargo run --release --bin conefield -- {line} > conefield/specs/schema/{file}"
-        );
+        blessed::check(&path, &Folder::new().done(line));
     }
 }
 

@@ -181,12 +181,8 @@ fn shards_come_to_the_serial_table_whatever_kills_them() {
             .replace("steps = 3", "steps = 4000"),
     );
     // Interrupted by Ctrl-C and resumed.
-    let first = d.started("study tiny.toml -o serial");
-    d.wait_for("serial/runs/head-6views-seed0/SIRT/metrics.jsonl");
-    signal(&first, "INT");
-    let output = first.wait_with_output().unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(130), "{said}");
+    let begun = || d.filled("serial/runs/head-6views-seed0/SIRT/metrics.jsonl");
+    let said = d.interrupted("study tiny.toml -o serial", "INT", &begun);
     let words = "interrupted during head-6views-seed0/SIRT (2 of 4); the same command with --resume";
     assert!(said.contains(words), "{said}");
     let before = d.times("serial/runs/head-6views-seed0/fdk");

@@ -1,6 +1,6 @@
 //! `tradeoff`: halving, a front, specs that run, and `--resume` without repetition.
 
-use crate::common::{Folder, number, signal};
+use crate::common::{Folder, number};
 use conefield_evaluation::report::Pixels;
 use serde_json::Value;
 
@@ -40,18 +40,9 @@ fn names(list: &Value) -> Vec<&str> {
 /// The trials of a search that is interrupted after two of them.
 #[cfg(unix)]
 fn interrupted(d: &Folder, first: &str) -> Vec<Value> {
-    use std::time::{Duration, Instant};
-    let child = d.started(first);
-    let until = Instant::now() + Duration::from_secs(60);
     let state = "out/tradeoff.json";
     let trials = || if d.has(state) { d.read(state)["trials"].as_array().unwrap().clone() } else { vec![] };
-    while trials().len() < 2 && Instant::now() < until {
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    signal(&child, "INT");
-    let output = child.wait_with_output().unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(130), "{said}");
+    let said = d.interrupted(first, "INT", &|| trials().len() >= 2);
     assert!(said.contains("interrupted during") && said.contains("--resume"), "{said}");
     let before = trials();
     assert!((2..8).contains(&before.len()) && !d.has("out/front.png"));

@@ -131,10 +131,31 @@ impl Folder {
         command.current_dir(&self.0).args(["-c", script]).arg(program()).args(words(line)).output().unwrap()
     }
 
+    /// Whether the file has content.
+    pub fn filled(&self, name: &str) -> bool {
+        fs::metadata(self.at(name)).is_ok_and(|m| m.len() > 0)
+    }
+
+    /// Starts the command of a line, and sends it the signal INT or TERM once it is `ready`. It ends with the status of that
+    /// signal and prints nothing; returns standard error.
+    pub fn interrupted(&self, line: &str, name: &str, ready: &dyn Fn() -> bool) -> String {
+        let mut child = self.started(line);
+        let until = Instant::now() + Duration::from_secs(60);
+        while !ready() && child.try_wait().unwrap().is_none() && Instant::now() < until {
+            sleep(Duration::from_millis(2));
+        }
+        signal(&child, name);
+        let output = child.wait_with_output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(if name == "INT" { 130 } else { 143 }), "{line}: {said}");
+        assert!(output.stdout.is_empty(), "{line}");
+        said
+    }
+
     /// Waits until the file has content.
     pub fn wait_for(&self, name: &str) {
         let until = Instant::now() + Duration::from_secs(60);
-        while fs::metadata(self.at(name)).map_or(0, |m| m.len()) == 0 {
+        while !self.filled(name) {
             assert!(Instant::now() < until, "{name} never came");
             sleep(Duration::from_millis(2));
         }

@@ -21,6 +21,7 @@
 
 use crate::parse::{self, AnglesOption};
 use crate::simulation::Changes;
+use crate::study::layout::group;
 use crate::study::method::{self, Method};
 use crate::study::simulation::Simulation;
 pub use crate::study::written::Protocol;
@@ -122,6 +123,11 @@ impl Study {
         cells
     }
 
+    /// The name of a run, CASE-seedS/METHOD, which is also its path.
+    pub fn run_name(&self, cell: &Cell) -> String {
+        format!("{}/{}", group(&self.cases[cell.case].name, cell.seed), self.methods[cell.method].name)
+    }
+
     /// Input files and folders of the study, without its specs.
     pub fn inputs(&self) -> Vec<PathBuf> {
         let mut all = vec![self.path.clone()];
@@ -156,7 +162,9 @@ impl Reading<'_> {
             Some(p) => (p.get_ref().clone(), self.at(&p)),
             None => (Protocol::default(), place.clone()),
         };
-        check_ends(&protocol, &at)?;
+        let beside = protocol.steps.is_some() || protocol.seconds.is_some() || protocol.at_most.is_some();
+        let expected = "budget, or some of steps, seconds and at_most";
+        ensure(protocol.budget.is_none() || !beside, &at, "budget", "another end beside it", expected)?;
         let simulated = !volumes.is_empty();
         let written =
             [("views", views.as_ref().map(|v| self.at(v))), ("simulate", simulate.as_ref().map(|s| self.at(s)))];
@@ -171,7 +179,7 @@ impl Reading<'_> {
             return Err(Error::invalid(at, "reference", format!("{r:?} and no scans"), expected));
         }
         ensure(!specs.is_empty(), &place, "specs", "none", "at least one")?;
-        let window = window.map_or(Ok(None), |w| self.window(&w, Some(*w.get_ref())))?;
+        let window = window.map_or(Ok(None), |w| checked(&self.at(&w), Some(w.into_inner())))?;
         let views: Vec<Option<usize>> = match views {
             Some(v) => self.distinct("views", Some(v), vec![])?.into_iter().map(|n| Some(n.get())).collect(),
             None => vec![None],
@@ -179,28 +187,29 @@ impl Reading<'_> {
 
         let mut cases: Vec<Case> = vec![];
         for entry in &volumes {
-            let Entry(volume) = entry.get_ref();
-            let name = self.name(entry, volume.name.as_deref(), &volume_name(&volume.volume))?;
-            let window = self.window(entry, volume.window)?.or(window);
+            let (at, Entry(volume)) = (self.at(entry), entry.get_ref());
+            let name = named(&at, volume.name.as_deref(), &volume_name(&volume.volume))?;
+            let window = checked(&at, volume.window)?.or(window);
             for &views in &views {
                 let name = views.map_or(name.clone(), |n| format!("{name}-{n}views"));
-                let simulation = self.simulation(entry, volume, &simulate, views, &protocol)?;
+                let simulation = self.simulation(&at, volume, &simulate, views, &protocol)?;
                 let source = Source::Simulated(Box::new(simulation));
-                self.add(&mut cases, entry, Case { name, source, window })?;
+                add(&mut cases, &at, Case { name, source, window })?;
             }
         }
         for entry in &scans {
-            let Entry(scan) = entry.get_ref();
-            let name = self.name(entry, scan.name.as_deref(), &stem(&scan.scan))?;
-            let window = self.window(entry, scan.window)?.or(window);
-            let source = self.scan(entry, scan, reference)?;
-            self.add(&mut cases, entry, Case { name, source, window })?;
+            let (at, Entry(scan)) = (self.at(entry), entry.get_ref());
+            let name = named(&at, scan.name.as_deref(), &stem(&scan.scan))?;
+            let window = checked(&at, scan.window)?.or(window);
+            let source = self.scan(&at, scan, reference)?;
+            add(&mut cases, &at, Case { name, source, window })?;
         }
         let backend = protocol.backend.clone().unwrap_or_default().open_for_run(protocol.budget)?;
         let mut methods: Vec<Method> = vec![];
         for entry in &specs {
-            let method = self.method(entry, &protocol, backend.as_ref())?;
-            method.differs(&methods).map_err(|e| self.placed(entry, "specs", e))?;
+            let (at, Entry(spec)) = (self.at(entry), entry.get_ref());
+            let method = self.method(&at, spec, &protocol, backend.as_ref())?;
+            method.differs(&methods).map_err(|e| placed(&at, "specs", e))?;
             methods.push(method);
         }
         let names: Vec<&str> = methods.iter().map(|m| &m.name[..]).collect();
@@ -219,7 +228,7 @@ impl Reading<'_> {
 
     fn simulation(
         &self,
-        entry: &Spanned<Entry<WrittenVolume>>,
+        at: &str,
         volume: &WrittenVolume,
         simulate: &WrittenSimulation,
         views: Option<usize>,
@@ -228,7 +237,7 @@ impl Reading<'_> {
         let values = match &volume.values {
             Some(text) => parse::values(text).map_err(|e| {
                 let expected = e.strip_prefix("expected ").unwrap_or(&e);
-                Error::invalid(self.at(entry), "values", format!("{text:?}"), expected)
+                Error::invalid(at, "values", format!("{text:?}"), expected)
             })?,
             None => parse::Values::AsIs,
         };
@@ -255,13 +264,13 @@ impl Reading<'_> {
                 seed: None,
             },
         };
-        simulation.check(protocol.hold_out.as_ref()).map_err(|e| self.placed(entry, "volumes", e))?;
+        simulation.check(protocol.hold_out.as_ref()).map_err(|e| placed(at, "volumes", e))?;
         Ok(simulation)
     }
 
-    fn scan(&self, entry: &Spanned<Entry<WrittenScan>>, scan: &WrittenScan, reference: Option<&str>) -> Result<Source> {
+    fn scan(&self, at: &str, scan: &WrittenScan, reference: Option<&str>) -> Result<Source> {
         let path = self.folder.join(&scan.scan);
-        ensure(path.exists(), &self.at(entry), "scans", format!("{}, which is not there", path.display()), "a scan")?;
+        ensure(path.exists(), at, "scans", format!("{}, which is not there", path.display()), "a scan")?;
         let reference = scan.reference.as_deref().or(reference).map(|r| match r {
             "truth" => PathBuf::from(r),
             file => self.folder.join(file),
@@ -269,38 +278,14 @@ impl Reading<'_> {
         Ok(Source::Scan { path, reference })
     }
 
-    fn method(
-        &self,
-        entry: &Spanned<Entry<WrittenSpec>>,
-        protocol: &Protocol,
-        backend: &dyn Backend,
-    ) -> Result<Method> {
-        let Entry(spec) = entry.get_ref();
+    fn method(&self, at: &str, spec: &WrittenSpec, protocol: &Protocol, backend: &dyn Backend) -> Result<Method> {
         let beside = self.folder.join(&spec.spec);
         // A name that is neither built in nor a file is reported as written, with the nearest valid one.
         let known = crate::specs::names().contains(&&spec.spec[..]);
         let what = if known || !beside.is_file() { spec.spec.clone() } else { self.beside(&spec.spec) };
         let sets = [&protocol.set[..], &spec.set].concat();
         let init = spec.init.as_ref().map(|i| self.beside(i));
-        Method::read(&what, spec.name.as_deref(), &sets, init.as_deref(), backend)
-            .map_err(|e| self.placed(entry, "specs", e))
-    }
-
-    /// The name of a case, which is the prefix of folders.
-    fn name<T>(&self, entry: &Spanned<Entry<T>>, given: Option<&str>, own: &str) -> Result<String> {
-        let name = given.unwrap_or(own);
-        method::check_name(name, &self.at(entry), "name")?;
-        Ok(name.to_owned())
-    }
-
-    fn add<T>(&self, cases: &mut Vec<Case>, entry: &Spanned<Entry<T>>, case: Case) -> Result<()> {
-        let free = cases.iter().all(|c| c.name.to_lowercase() != case.name.to_lowercase());
-        let found = format!("{:?}, the name of another one", case.name);
-        ensure(free, &self.at(entry), "name", found, "a unique name, for table and folders")?;
-        let other = case.name.to_lowercase() != "all";
-        ensure(other, &self.at(entry), "name", &case.name, "another name: the table calls the mean of all cases so")?;
-        cases.push(case);
-        Ok(())
+        Method::read(&what, spec.name.as_deref(), &sets, init.as_deref(), backend).map_err(|e| placed(at, "specs", e))
     }
 
     /// A list without duplicates; `default` if it is missing.
@@ -320,16 +305,6 @@ impl Reading<'_> {
         Ok(list.into_inner())
     }
 
-    /// A window, which is written at `place`.
-    fn window<T>(&self, place: &Spanned<T>, window: Option<[f32; 2]>) -> Result<Option<[f32; 2]>> {
-        if let Some(both @ [low, high]) = window {
-            let fits = low.is_finite() && high.is_finite() && low < high;
-            let expected = "two finite numbers, the first below the second";
-            ensure(fits, &self.at(place), "window", format!("{both:?}"), expected)?;
-        }
-        Ok(window)
-    }
-
     /// A path in the file, resolved relative to the study's folder.
     fn beside(&self, path: &str) -> String {
         self.folder.join(path).display().to_string()
@@ -339,19 +314,37 @@ impl Reading<'_> {
     fn at<T>(&self, what: &Spanned<T>) -> String {
         written::location(&self.path.display().to_string(), self.text, what.span().start)
     }
-
-    /// The same error, with the line of its entry.
-    fn placed<T>(&self, entry: &Spanned<T>, key: &str, error: Error) -> Error {
-        Error::unsupported(format!("{}: {key}", self.at(entry)), error.to_string())
-    }
 }
 
-/// Refuses contradictory limits.
-fn check_ends(protocol: &Protocol, at: &str) -> Result<()> {
-    let Protocol { steps, seconds, at_most, budget, .. } = protocol;
-    let beside = steps.is_some() || seconds.is_some() || at_most.is_some();
-    let expected = "budget, or some of steps, seconds and at_most";
-    ensure(budget.is_none() || !beside, at, "budget", "another end beside it", expected)
+/// The name of a case, which is the prefix of folders, as `given` at a place of the file.
+fn named(at: &str, given: Option<&str>, own: &str) -> Result<String> {
+    let name = given.unwrap_or(own);
+    method::check_name(name, at, "name")?;
+    Ok(name.to_owned())
+}
+
+fn add(cases: &mut Vec<Case>, at: &str, case: Case) -> Result<()> {
+    let free = cases.iter().all(|c| c.name.to_lowercase() != case.name.to_lowercase());
+    let found = format!("{:?}, the name of another one", case.name);
+    ensure(free, at, "name", found, "a unique name, for table and folders")?;
+    let other = case.name.to_lowercase() != "all";
+    ensure(other, at, "name", &case.name, "another name: the table calls the mean of all cases so")?;
+    cases.push(case);
+    Ok(())
+}
+
+/// A window at a place of the file.
+fn checked(at: &str, window: Option<[f32; 2]>) -> Result<Option<[f32; 2]>> {
+    if let Some(both @ [low, high]) = window {
+        let fits = low.is_finite() && high.is_finite() && low < high;
+        ensure(fits, at, "window", format!("{both:?}"), "two finite numbers, the first below the second")?;
+    }
+    Ok(window)
+}
+
+/// The same error, with the line of its entry.
+fn placed(at: &str, key: &str, error: Error) -> Error {
+    Error::unsupported(format!("{at}: {key}"), error.to_string())
 }
 
 /// The name of a volume: phantom:head:64 becomes head-64, and a file loses its extensions.

@@ -10,6 +10,7 @@
 //! curves/CASE.png           PSNR over steps and time
 //! ```
 
+use crate::files::is_one_of;
 use conefield_core::Result;
 use conefield_core::error::ensure;
 use conefield_io::{Contents, Progressed};
@@ -52,14 +53,14 @@ impl Layout<'_> {
         self.scans().join(group(case, seed))
     }
 
-    /// Folder of the run of a method.
-    pub fn run(&self, case: &str, seed: u64, method: &str) -> PathBuf {
-        self.0.join(RUNS).join(group(case, seed)).join(method)
+    /// Folder of the run with this [name](crate::study::definition::Study::run_name).
+    pub fn run(&self, name: &str) -> PathBuf {
+        self.0.join(RUNS).join(name)
     }
 
     /// File with the error of a failed run.
-    pub fn failure(&self, case: &str, seed: u64, method: &str) -> PathBuf {
-        self.0.join(FAILED).join(group(case, seed)).join(method)
+    pub fn failure(&self, name: &str) -> PathBuf {
+        self.0.join(FAILED).join(name)
     }
 
     /// Picture of the middle slices of a case's volumes.
@@ -91,9 +92,7 @@ pub fn group(case: &str, seed: u64) -> String {
 
 /// Whether a study may have written `path`.
 fn known(path: &Path) -> bool {
-    let name = path.file_name().unwrap_or_default();
-    let names = if path.is_dir() { &FOLDERS[..] } else { &FILES[..] };
-    names.iter().any(|f| name == *f) || conefield_io::is_unfinished(name)
+    is_one_of(path, &FOLDERS, &FILES)
 }
 
 /// Progress of the study in `folder`.

@@ -33,8 +33,11 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// The outcome of the finished run in `folder`.
-    pub fn of_run(folder: &Path) -> Result<Self> {
+    /// The outcome of the run in `folder`, which is finished or has failed with `error`.
+    pub fn of_run(folder: &Path, error: Option<String>) -> Result<Self> {
+        if let Some(error) = error {
+            return Ok(Self::failed(error));
+        }
         let figures = read_json(&folder.join("record.json"))?;
         Ok(Self { status: Status::Done, error: None, figures: Some(figures) })
     }
@@ -98,21 +101,19 @@ impl Columns {
         Self(COLUMNS.iter().filter(wanted).collect())
     }
 
-    /// The headings.
-    pub fn heads(&self) -> Vec<&'static str> {
-        self.0.iter().map(|c| c.head).collect()
+    /// The headings, after that of names.
+    pub fn heads(&self, names: &str) -> Vec<String> {
+        [names].into_iter().chain(self.0.iter().map(|c| c.head)).map(str::to_owned).collect()
     }
 
-    /// The cells below the headings; mostly empty for a failed run.
-    pub fn cells(&self, outcome: &Outcome) -> Vec<String> {
-        let Some(figures) = &outcome.figures else {
-            return (0..self.0.len()).map(|c| if c == 0 { "failed" } else { "-" }.to_owned()).collect();
+    /// The cells below the headings, after a name; mostly empty for a failed run.
+    pub fn cells(&self, name: &str, outcome: &Outcome) -> Vec<String> {
+        let cell = |(i, c): (usize, &&Column)| match (&outcome.figures, c.key) {
+            (None, _) => if i == 0 { "failed" } else { "-" }.to_owned(),
+            (Some(f), "held_out" | "loss") => (c.of)(f).map_or("-".into(), |x| format!("{x:.4e}")),
+            (Some(f), _) => (c.of)(f).map_or("-".into(), c.shown),
         };
-        let shown = |c: &Column, x: f64| match c.key {
-            "held_out" | "loss" => format!("{x:.4e}"),
-            _ => (c.shown)(x),
-        };
-        self.0.iter().map(|c| (c.of)(figures).map_or("-".into(), |x| shown(c, x))).collect()
+        [name.to_owned()].into_iter().chain(self.0.iter().enumerate().map(cell)).collect()
     }
 }
 
@@ -125,11 +126,11 @@ mod tests {
         let scores = serde_json::json!({ "psnr": null, "ssim_2d": 1.0, "ssim_3d": null, "ssim_skimage": 1.0 });
         let figures = Figures { steps: 1, train_s: 1.0, total_s: 2.0, scores: Some(scores), ..Figures::default() };
         let outcome = Outcome { status: Status::Done, error: None, figures: Some(figures) };
-        let shown = Columns::of(true, true).cells(&outcome);
-        assert_eq!(shown, ["inf", "1.0000", "-", "1.0000", "-", "1", "1.00", "2.00", "-"]);
-        let shown = Columns::of(false, false).cells(&outcome);
-        assert_eq!(shown, ["-", "1", "1.00", "2.00", "-"]);
-        let shown = Columns::of(false, true).cells(&Outcome::failed("why".into()));
-        assert_eq!(shown, ["failed", "-", "-", "-", "-"]);
+        let shown = Columns::of(true, true).cells("a", &outcome);
+        assert_eq!(shown, ["a", "inf", "1.0000", "-", "1.0000", "-", "1", "1.00", "2.00", "-"]);
+        let shown = Columns::of(false, false).cells("a", &outcome);
+        assert_eq!(shown, ["a", "-", "1", "1.00", "2.00", "-"]);
+        let shown = Columns::of(false, true).cells("a", &Outcome::failed("why".into()));
+        assert_eq!(shown, ["a", "failed", "-", "-", "-", "-"]);
     }
 }

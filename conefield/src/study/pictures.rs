@@ -30,7 +30,7 @@ pub fn slices(
     let mut panels = vec![];
     for method in shown {
         let volume = method.run.join("volume.nii.gz");
-        Memory::of_volumes(&[conefield_io::volume_voxels(&volume)?]).check(|_| vec![])?;
+        Memory::of_volumes(&[conefield_io::volume_voxels(&volume)?]).check()?;
         let caption = match method.psnr {
             Some(psnr) => format!("{} {psnr:.2} dB", method.name),
             None => method.name.clone(),

@@ -57,15 +57,13 @@ pub struct CaseRecord {
 impl CaseRecord {
     /// The record of the case `source`, named `name`, with the input of its first scan.
     pub fn new(name: &str, source: &Source, input: &TrialInput) -> Self {
-        let (volume, scan, reference) = match source {
-            Source::Simulated(s) => (Some(s.written.clone()), None, Some("truth".into())),
-            Source::Scan { path, reference } => {
-                (None, Some(path.clone()), reference.as_ref().map(|r| r.display().to_string()))
+        let (volume, noise, scan, reference) = match source {
+            Source::Simulated(s) => {
+                (Some(s.written.clone()), s.changes.noise.map(|n| n.to_string()), None, Some("truth".into()))
             }
-        };
-        let noise = match source {
-            Source::Simulated(s) => s.changes.noise.map(|n| n.to_string()),
-            Source::Scan { .. } => None,
+            Source::Scan { path, reference } => {
+                (None, None, Some(path.clone()), reference.as_ref().map(|r| r.display().to_string()))
+            }
         };
         Self {
             name: name.into(),
@@ -104,6 +102,12 @@ struct RunLine {
     outcome: Outcome,
 }
 
+impl RunLine {
+    fn name(&self) -> String {
+        format!("{}/{}", group(&self.case, self.seed), self.method)
+    }
+}
+
 /// A case and a method, over the seeds; the case [`ALL`] is the mean over all cases.
 #[derive(Serialize)]
 struct Line {
@@ -126,7 +130,7 @@ impl<'a> StudyReport<'a> {
         let summary = Summary { study, outcomes: &outcomes }.lines();
         let line = |(cell, outcome): (Cell, Outcome)| {
             let (case, method) = (study.cases[cell.case].name.clone(), study.methods[cell.method].name.clone());
-            let run = layout.run(&case, cell.seed, &method);
+            let run = layout.run(&study.run_name(&cell));
             let machine = outcome.figures.as_ref().and_then(|f| f.machine.clone());
             RunLine { case, seed: cell.seed, method, run, machine, outcome }
         };
@@ -155,7 +159,7 @@ impl<'a> StudyReport<'a> {
     /// The errors of failed runs, one line each.
     pub fn failures(&self) -> Vec<String> {
         let failed = self.runs.iter().filter_map(|r| Some((r, r.outcome.error.as_ref()?)));
-        failed.map(|(r, e)| format!("{}/{} failed: {e}", group(&r.case, r.seed), r.method)).collect()
+        failed.map(|(r, e)| format!("{} failed: {e}", r.name())).collect()
     }
 
     /// Text for a terminal: means and failures; `shown` writes a table.
@@ -259,12 +263,8 @@ impl<'a> StudyReport<'a> {
     fn every_run(&self) -> Table {
         let figures = || self.runs.iter().filter_map(|r| r.outcome.figures.as_ref());
         let columns = Columns::of(figures().any(|f| f.scores.is_some()), figures().any(|f| f.held_out.is_some()));
-        let mut heads = vec!["run".to_owned()];
-        heads.extend(columns.heads().iter().map(|h| h.to_string()));
-        let mut rows = vec![heads];
-        for r in &self.runs {
-            rows.push([vec![format!("{}/{}", group(&r.case, r.seed), r.method)], columns.cells(&r.outcome)].concat());
-        }
+        let mut rows = vec![columns.heads("run")];
+        rows.extend(self.runs.iter().map(|r| columns.cells(&r.name(), &r.outcome)));
         Table { rows, notes: self.failures() }
     }
 }

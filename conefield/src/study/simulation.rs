@@ -7,7 +7,7 @@ use crate::simulation::{self, Changes};
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, written};
 use conefield_projectors::simulate::Protocol;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -67,7 +67,8 @@ impl Simulation {
     /// Refuses a `scan` at `place` that [`Self::make`] would not have produced with `seed`.
     pub fn check_made(&self, seed: u64, scan: &Scan, place: &Path) -> Result<()> {
         let now = self.protocol(&scan.geometry.volume, seed)?;
-        let then: Option<Protocol> = serde_json::from_value(scan.provenance["simulated"]["protocol"].clone()).ok();
+        let then = scan.provenance["simulated"]["protocol"].to_string();
+        let then: Option<Protocol> = written::read("protocol.json", &then).ok();
         let same = then.as_ref() == Some(&now)
             && scan.provenance["source"] == self.written
             && scan.provenance["prepared"] == self.preparation();
@@ -83,7 +84,7 @@ impl Simulation {
 
     /// The volume to scan.
     fn prepared(&self) -> Result<Volume> {
-        Memory::of_volumes(&[files::voxels(&self.volume)?]).check(|_| vec![])?;
+        Memory::of_volumes(&[files::voxels(&self.volume)?]).check()?;
         simulation::prepared(files::volume(&self.volume)?, self.values, self.downsample)
     }
 

@@ -1,6 +1,7 @@
 //! The search: every candidate under the smallest budget, the best share of them under the next one, and so on. The
 //! state is kept in the search's folder, from which it can be resumed.
 
+use crate::files::is_one_of;
 use crate::record::ScanRecord;
 use crate::study::outcome::{Outcome, Status};
 use crate::tradeoff::front::Unknowns;
@@ -98,32 +99,21 @@ pub struct Due<'a> {
     pub part: String,
 }
 
-/// How to treat an earlier search in the folder.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Earlier {
-    /// Refuse to begin.
-    Refuse,
-    /// Remove it with all its trials.
-    Replace,
-    /// Resume it.
-    Resume,
-}
-
 impl Search {
-    /// Checks the folder: refuses one with other content, or with an earlier search that must not be touched. Returns
-    /// the finished trials of a resumed search.
-    pub fn look(&self, folder: &Path, earlier: Earlier) -> Result<Vec<Over>> {
+    /// Checks the folder: refuses one with other content, or with an earlier search that is neither to be replaced (`force`)
+    /// nor resumed. Returns the finished trials of a resumed search.
+    pub fn look(&self, folder: &Path, force: bool, resume: bool) -> Result<Vec<Over>> {
         let place = folder.display().to_string();
         let old = CONTENTS.entries(folder)?;
         let expected = "a new or empty folder, --resume to continue or --force to replace it";
         let state = folder.join(FILES[0]);
-        ensure(old.is_empty() || earlier != Earlier::Refuse, &place, "output", "an earlier search", expected)?;
-        if earlier == Earlier::Replace {
+        ensure(old.is_empty() || force || resume, &place, "output", "an earlier search", expected)?;
+        if force {
             // Only a folder with a search's state may be removed with its content.
             let marked = old.is_empty() || state.is_file();
             ensure(marked, &place, "output", "a folder without tradeoff.json", "an earlier search to replace")?;
         }
-        if earlier == Earlier::Resume && state.is_file() { self.done(&state) } else { Ok(vec![]) }
+        if resume && state.is_file() { self.done(&state) } else { Ok(vec![]) }
     }
 
     /// The finished trials in the state of this search; refuses the state of another search.
@@ -225,9 +215,7 @@ pub const CONTENTS: Contents = Contents { known, progressed };
 
 /// Whether a search may have written `path`.
 fn known(path: &Path) -> bool {
-    let name = path.file_name().unwrap_or_default();
-    let names = if path.is_dir() { &FOLDERS[..] } else { &FILES[..] };
-    names.iter().any(|f| name == *f) || conefield_io::is_unfinished(name)
+    is_one_of(path, &FOLDERS, &FILES)
 }
 
 /// Progress of the search in `folder`: its state is written after every trial, the table at the end.
@@ -241,11 +229,10 @@ fn progressed(folder: &Path) -> Progressed {
 
 /// Runs a trial, reads its results and removes its large files.
 fn settle(due: &Due<'_>, run: &mut dyn FnMut(&Due<'_>) -> Result<Option<String>>) -> Result<Over> {
-    let outcome = match run(due)? {
-        None => Outcome::of_run(&due.output)?,
-        Some(error) if error.starts_with(TOO_SHORT) => Outcome { status: Status::TooShort, ..Outcome::failed(error) },
-        Some(error) => Outcome::failed(error),
-    };
+    let mut outcome = Outcome::of_run(&due.output, run(due)?)?;
+    if outcome.error.as_ref().is_some_and(|error| error.starts_with(TOO_SHORT)) {
+        outcome.status = Status::TooShort;
+    }
     for file in HEAVY {
         let path = due.output.join(file);
         match fs::remove_file(&path) {

@@ -1,13 +1,11 @@
 //! A whole run in a search or a comparison: its inputs and its figures.
 
+use crate::input::Input;
 use crate::machine::Machine;
 use crate::record::ScanRecord;
-use conefield_core::Result;
-use conefield_core::scan::{Scan, Volume};
 use conefield_evaluation::report::MiddleSlices;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use std::path::Path;
 
 /// What is known about the input after it has been read.
 pub struct TrialInput {
@@ -22,14 +20,10 @@ pub struct TrialInput {
 }
 
 impl TrialInput {
-    /// The facts about the scan read from `path`; keeps little of it. Refuses held-out views that leave no training
-    /// views.
-    pub fn of(path: &Path, scan: Scan, reference: Option<&Volume>, peak: f64, held: Vec<usize>) -> Result<Self> {
-        let record = ScanRecord::of(path, &scan)?;
-        if !held.is_empty() {
-            scan.split(&held)?;
-        }
-        Ok(Self { scan: record, held, reference: reference.map(MiddleSlices::of), peak })
+    /// What is kept of `input` on the scan with this record.
+    pub fn of(input: Input, scan: ScanRecord) -> Self {
+        let Input { held, reference, peak, .. } = input;
+        Self { scan, held, reference: reference.as_ref().map(MiddleSlices::of), peak }
     }
 }
 

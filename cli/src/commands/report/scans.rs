@@ -235,12 +235,9 @@ impl Shown {
     fn new(scan: &Scan, held_out: &[usize], options: &Options) -> Result<Self> {
         let n = scan.geometry.views.len();
         let chosen = match options.views {
-            Some(choice) => input::held_out(Some(choice), n, "command line", "--views")?,
+            Some(choice) => input::chosen(Some(choice), n)?,
             None => (0..VIEWS.min(n)).map(|i| i * n / VIEWS.min(n)).collect(),
         };
-        if let Some(v) = chosen.iter().find(|v| **v >= n) {
-            return Err(Error::invalid("command line", "--views", v, format!("numbers below {n}")));
-        }
         let some = if chosen.len() == n { scan.clone() } else { scan.split(&chosen)?.1 };
         let [low, high] = range(&some.projections);
         let (low, high) = (low.min(0.0), high.max(0.0));
