@@ -89,7 +89,7 @@ struct Shared<'a> {
 struct Entry {
     name: String,
     spec: String,
-    run: PathBuf,
+    run: String,
     #[serde(flatten)]
     outcome: Outcome,
 }
@@ -135,7 +135,7 @@ impl CompareArgs {
         conefield_io::write_text_atomic(self.output.join("table.json"), &out::to_json(&report)?)?;
         conefield_io::write_text_atomic(self.output.join("table.md"), &table.markdown())?;
         let path = self.output.join("compare.png");
-        let drawn = pictures::slices(&path, reference.as_ref(), &shown(&report.methods), None)?;
+        let drawn = pictures::slices(&path, reference.as_ref(), &shown(&cells, &report.methods), None)?;
         lease.complete()?;
         if self.json {
             out::json(&report)?;
@@ -210,13 +210,18 @@ fn entry(cell: &Cell, start: Start, part: String, general: &General) -> Result<E
         Some(error) => Outcome::failed(error),
         None => Outcome::of_run(&cell.run)?,
     };
-    Ok(Entry { name: cell.method.name.clone(), spec: cell.method.spec.clone(), run: cell.run.clone(), outcome })
+    Ok(Entry {
+        name: cell.method.name.clone(),
+        spec: cell.method.spec.clone(),
+        run: cell.run.display().to_string(),
+        outcome,
+    })
 }
 
 /// The results, for a picture.
-fn shown(entries: &[Entry]) -> Vec<Shown> {
-    let results = entries.iter().filter_map(|e| Some((e, e.outcome.figures.as_ref()?)));
-    results.map(|(e, f)| Shown { name: e.name.clone(), psnr: f.psnr(), run: e.run.clone() }).collect()
+fn shown(cells: &[Cell], entries: &[Entry]) -> Vec<Shown> {
+    let results = cells.iter().zip(entries).filter_map(|(c, e)| Some((c, e, e.outcome.figures.as_ref()?)));
+    results.map(|(c, e, f)| Shown { name: e.name.clone(), psnr: f.psnr(), run: c.run.clone() }).collect()
 }
 
 /// The contents of a comparison's folder.

@@ -233,6 +233,20 @@ fn a_name_without_utf_8_is_reported_as_such() {
 }
 
 #[test]
+fn an_output_without_utf_8_gets_its_table() {
+    let d = Folder::after(&[SCAN]);
+    d.put("study.toml", "scans = ['scan']\nspecs = ['fdk', 'sirt']\n[protocol]\nsteps = 2\n");
+    for (line, out) in
+        [("compare scan --specs fdk,sirt --steps 2 -o", b"compared\xff"), ("study study.toml -o", b"studied_\xff")]
+    {
+        let out = std::ffi::OsStr::from_bytes(out);
+        let output = d.command(line).arg(out).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        assert!(d.at(out).join("table.json").is_file(), "{line}");
+    }
+}
+
+#[test]
 fn a_signal_leaves_no_unfinished_file() {
     let d = Folder::new();
     let data = ndarray::Array3::from_shape_fn((128, 128, 128), |(x, y, z)| ((x * 7 + y * 13 + z * 31) % 101) as f32);
