@@ -184,10 +184,8 @@ impl Shared<'_> {
         folder.may_begin(true)?;
         let input = Input::new(self.scan.clone(), vec![], Some(self.truth.clone()), Some(1.0))?;
         let mut method = session.plan(input, 0.0, &|| false)?;
-        folder.begin()?;
-        let loaded = &method.method.loaded;
-        conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
-        let mut progress = Progress::new(name, Some(folder.metrics()?));
+        let metrics = folder.begin(&to_toml(&method.method.loaded.spec)?)?;
+        let mut progress = Progress::new(name, Some(metrics));
         let solved = method.solve(None, None, &mut progress)?;
         let (written, slices) = reconstruct::write(&folder, &method, &solved, self.seed, &Cpu::new())?;
         let Solution { steps, train_s, .. } = solved.solution;

@@ -344,9 +344,7 @@ fn begin_or_go_on(
         folder.go_on();
         return folder.metrics_until(resume.standing.recorded);
     }
-    folder.begin()?;
-    conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
-    Ok((folder.metrics()?, None))
+    Ok((folder.begin(&to_toml(&loaded.spec)?)?, None))
 }
 
 /// Writes the result of a run with this `seed` to its folder, and scores it. Returns its middle slices too.
