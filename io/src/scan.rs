@@ -124,8 +124,27 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
         (.., true) => Ok(ScanFile::R2(path.to_path_buf())),
         _ if has(SCANNER) => Ok(ScanFile::Scanner(path.join(SCANNER))),
         _ => {
+            // Files in a folder without permission look as if they did not exist.
+            let file = path.join("scan.toml");
+            file.try_exists().map_err(|e| Error::io(&file, e))?;
             foreign::refuse_folder(path)?;
             Err(Error::invalid(place, "scan", "none of the files that describe one", understood))
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_description_that_cannot_be_reached_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("scan.toml");
+        // A loop stands for a folder without permission, which root may read.
+        std::os::unix::fs::symlink(&file, &file).unwrap();
+        let e = read_scan(dir.path()).unwrap_err();
+        assert!(matches!(&e, Error::Io { path, .. } if *path == file), "{e}");
     }
 }
