@@ -83,6 +83,16 @@ pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
     }
 }
 
+/// The file with the volume from which a scan was simulated, if its description names one.
+pub fn truth_file(path: impl AsRef<Path>) -> Result<Option<PathBuf>> {
+    match find(path.as_ref())? {
+        ScanFile::Own(file) => scan_folder::truth_file(&file),
+        ScanFile::R2(folder) => r2::truth_file(&folder),
+        ScanFile::Naf(file) => Ok(Some(file)),
+        ScanFile::Scanner(_) => Ok(None),
+    }
+}
+
 /// The unit that the description of conefield's own scan in `folder` states; `None` if there is no such scan.
 pub fn scan_unit(folder: impl AsRef<Path>) -> Result<Option<Unit>> {
     let folder = folder.as_ref();
