@@ -1,7 +1,7 @@
 //! A run as part of a comparison or a study: how it starts, and its process.
 
 use super::protocol::RunProtocol;
-use super::reconstruct::{conditions, identity};
+use super::reconstruct::{conditions, identity, identity_to_resume};
 use super::trial::Trial;
 use super::{EndOptions, General};
 use conefield::files;
@@ -53,8 +53,9 @@ impl Cell<'_> {
         if !run.exists() {
             return Ok(Start::Anew);
         }
-        let mut now = identity(&method.loaded, protocol, &input.held, &input.scan)?;
+        let (loaded, held, scan) = (&method.loaded, &input.held, &input.scan);
         if is_done(run) {
+            let mut now = identity(loaded, protocol, held, scan)?;
             now.insert("reference".into(), Value::from(protocol.named_reference()).to_string());
             now.insert("peak".into(), input.peak.to_string());
             now.insert("backend".into(), protocol.backend.kind().into());
@@ -63,7 +64,7 @@ impl Cell<'_> {
         }
         let checkpoint = run.join("checkpoint.safetensors");
         if checkpoint.exists() {
-            files::read_checkpoint(&checkpoint, &now)?;
+            files::read_checkpoint(&checkpoint, &identity_to_resume(loaded, protocol, held, scan)?)?;
             return Ok(Start::Resuming);
         }
         Ok(Start::Replacing)
