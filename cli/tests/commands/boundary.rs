@@ -223,6 +223,14 @@ fn what_files_say_does_not_reach_the_terminal_as_it_is() {
 }
 
 #[test]
+fn a_field_in_trouble_is_a_warning() {
+    let d = Folder::after(&[SCAN]);
+    let output = d.loud(&FAST.replace("--steps 3", "--steps 30 --set optimizer.lr=30")).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.lines().any(|line| line.contains("WARN") && line.contains("rolled back to step")), "{said}");
+}
+
+#[test]
 fn a_name_without_utf_8_is_reported_as_such() {
     let d = Folder::after(&[SCAN]);
     let init = std::ffi::OsStr::from_bytes(b"w\xff.safetensors");
