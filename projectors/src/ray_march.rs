@@ -257,7 +257,8 @@ mod tests {
     fn a_step_that_is_too_short_is_said() {
         // The ray is 100 mm long.
         let p = |step| RayMarch { step_mm: Some(step), ..RayMarch::default() };
-        assert_eq!((p(2e-3).max_samples(&ray()), p(2e-3).doubt(&ray())), (50_000, None));
+        assert!(p(2e-3).max_samples(&ray()) < MOST_SAMPLES);
+        assert_eq!(p(2e-3).doubt(&ray()), None);
         assert_eq!(p(1e-3).max_samples(&ray()), MOST_SAMPLES);
         let said = p(1e-3).doubt(&ray()).unwrap();
         assert!(said.contains("1.53e-3 mm apart and not 1.00e-3 mm"), "{said}");
