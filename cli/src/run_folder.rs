@@ -84,17 +84,21 @@ impl RunFolder {
         }
     }
 
+    /// Begins a run in the folder, emptying it; an earlier run is set aside until this one is complete. Writes the text
+    /// `spec` and opens `metrics.jsonl`, which is written line by line.
+    pub fn begin(&mut self, spec: &str) -> Result<(PathBuf, File)> {
+        self.0.replace()?;
+        let path = self.file("metrics.jsonl");
+        // Before the spec: a spec alone is the user's, and a killed run must not look like one.
+        let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
+        conefield_io::write_text_atomic(self.file("spec.toml"), spec)?;
+        Ok((path, file))
+    }
+
     /// The path of one of [`FILES`].
     pub fn file(&self, name: &str) -> PathBuf {
         debug_assert!(FILES.contains(&name));
         self.0.path().join(name)
-    }
-
-    /// Opens `metrics.jsonl`, which is written line by line.
-    pub fn metrics(&self) -> Result<(PathBuf, File)> {
-        let path = self.file("metrics.jsonl");
-        let file = File::create(&path).map_err(|e| Error::io(&path, e))?;
-        Ok((path, file))
     }
 
     /// Opens `metrics.jsonl` of an interrupted run without the records after `step`, which will be repeated. Also returns

@@ -426,6 +426,12 @@ pub trait Projector: Send + Sync {
         Ok(None)
     }
 
+    /// A warning, if `ray` gets fewer samples than the settings say.
+    fn doubt(&self, ray: &UnitRay) -> Option<String> {
+        let _ = ray;
+        None
+    }
+
     /// Returns and clears the first error since the last call; see [`Stage::fault`].
     fn fault(&self) -> Result<()> {
         Ok(())

@@ -19,7 +19,7 @@ use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
 use serde::Deserialize;
 use serde_json::{Value, json};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// The file that describes the folder.
 pub(crate) const META: &str = "meta_data.json";
@@ -75,6 +75,14 @@ pub(crate) fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
 /// The volume of [`read`], in the unit that the training views give.
 pub(crate) fn read_truth(folder: &Path) -> Result<Option<Volume>> {
     described(folder, text::read(&folder.join(META))?, false).map(|r| r.volume)
+}
+
+/// The file with the volume, if the folder names one.
+pub(crate) fn truth_file(folder: &Path) -> Result<Option<PathBuf>> {
+    let file = folder.join(META);
+    let meta: Meta = text::read(&file)?;
+    let place = file.display().to_string();
+    meta.vol.map(|name| folder::inside(folder, &place, "vol", &name)).transpose()
 }
 
 /// Keys of the scanner that are read, and those that do not move source, detector or volume, beside those of noise.

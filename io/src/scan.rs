@@ -80,6 +80,16 @@ pub fn read_truth(path: impl AsRef<Path>) -> Result<Option<Volume>> {
     }
 }
 
+/// The file with the volume from which a scan was simulated, if its description names one.
+pub fn truth_file(path: impl AsRef<Path>) -> Result<Option<PathBuf>> {
+    match find(path.as_ref())? {
+        ScanFile::Own(file) => scan_folder::truth_file(&file),
+        ScanFile::R2(folder) => r2::truth_file(&folder),
+        ScanFile::Naf(file) => Ok(Some(file)),
+        ScanFile::Scanner(_) => Ok(None),
+    }
+}
+
 /// The unit that the description of conefield's own scan in `folder` states; `None` if there is no such scan.
 pub fn scan_unit(folder: impl AsRef<Path>) -> Result<Option<Unit>> {
     let folder = folder.as_ref();
@@ -121,8 +131,27 @@ pub(crate) fn find(path: &Path) -> Result<ScanFile> {
         (.., true) => Ok(ScanFile::R2(path.to_path_buf())),
         _ if has(SCANNER) => Ok(ScanFile::Scanner(path.join(SCANNER))),
         _ => {
+            // Files in a folder without permission look as if they did not exist.
+            let file = path.join("scan.toml");
+            file.try_exists().map_err(|e| Error::io(&file, e))?;
             foreign::refuse_folder(path)?;
             Err(Error::invalid(place, "scan", "none of the files that describe one", understood))
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_description_that_cannot_be_reached_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("scan.toml");
+        // A loop stands for a folder without permission, which root may read.
+        std::os::unix::fs::symlink(&file, &file).unwrap();
+        let e = read_scan(dir.path()).unwrap_err();
+        assert!(matches!(&e, Error::Io { path, .. } if *path == file), "{e}");
     }
 }

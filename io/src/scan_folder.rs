@@ -34,7 +34,7 @@ use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::Ix3;
 use serde::{Deserialize, Serialize};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 pub(crate) const FORMAT: &str = "conefield-scan";
 const VERSION: u32 = 1;
@@ -158,6 +158,12 @@ pub(crate) fn size(file: &Path) -> Result<ScanSize> {
     let views = views(&place, &mut d)?.len();
     let pixels = product([views, d.detector.rows, d.detector.columns]);
     Ok(ScanSize { pixels, voxels: d.volume.len().unwrap_or(0) as u64, test_pixels: 0, reading: 0, views })
+}
+
+/// The file with the true volume, if the description in `file` names one.
+pub(crate) fn truth_file(file: &Path) -> Result<Option<PathBuf>> {
+    let (place, d) = (file.display().to_string(), describe(file)?);
+    d.truth.map(|name| folder::plain(folder_of(file), &place, "truth", &name)).transpose()
 }
 
 /// Reads the volume from which the scan of `file` was simulated.

@@ -111,6 +111,12 @@ impl RayMarch {
             Extent::Clipped => ray.inside,
         }
     }
+
+    /// Samples of a ray that a step of `step` mm asks for.
+    fn wanted(&self, ray: &UnitRay, step: f64) -> f64 {
+        let [near, far] = self.range(ray);
+        (f64::from(far - near) / (step * f64::from(ray.per_mm))).ceil()
+    }
 }
 
 impl Projector for RayMarch {
@@ -120,8 +126,18 @@ impl Projector for RayMarch {
             return 0;
         }
         let Some(step) = self.step_mm else { return self.count() };
-        let wanted = f64::from(far - near) / (step * f64::from(ray.per_mm));
-        (wanted.ceil() as usize).clamp(1, MOST_SAMPLES)
+        (self.wanted(ray, step) as usize).clamp(1, MOST_SAMPLES)
+    }
+
+    fn doubt(&self, ray: &UnitRay) -> Option<String> {
+        let step = self.step_mm?;
+        let wanted = self.wanted(ray, step);
+        (wanted > MOST_SAMPLES as f64).then(|| {
+            let longer = step * wanted / MOST_SAMPLES as f64;
+            format!(
+                "ray-march: samples are {longer:.2e} mm apart and not {step:.2e} mm, since a ray has at most {MOST_SAMPLES}"
+            )
+        })
     }
 
     fn sample(&self, ray: &UnitRay, seed: Option<u64>, out: &mut Samples) {
@@ -235,6 +251,18 @@ mod tests {
             let t = q[0] * 16.0;
             assert!(t >= i as f32 - 1e-4 && t <= i as f32 + 1.0001);
         }
+    }
+
+    #[test]
+    fn a_step_that_is_too_short_is_said() {
+        // The ray is 100 mm long.
+        let p = |step| RayMarch { step_mm: Some(step), ..RayMarch::default() };
+        assert!(p(2e-3).max_samples(&ray()) < MOST_SAMPLES);
+        assert_eq!(p(2e-3).doubt(&ray()), None);
+        assert_eq!(p(1e-3).max_samples(&ray()), MOST_SAMPLES);
+        let said = p(1e-3).doubt(&ray()).unwrap();
+        assert!(said.contains("1.53e-3 mm apart and not 1.00e-3 mm"), "{said}");
+        assert_eq!(RayMarch::default().doubt(&ray()), None);
     }
 
     #[test]

@@ -15,8 +15,9 @@ use conefield_projectors::simulate::DetectorNoise;
 use numpy::{PyArray3, PyReadonlyArray3};
 use pyo3::prelude::*;
 use serde::Deserialize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::SystemTime;
 
 /// Measured line integrals with their geometry. Immutable: its arrays are read-only.
 #[pyclass(frozen, module = "conefield._native")]
@@ -32,8 +33,49 @@ pub struct Scan {
 enum Truth {
     Unknown,
     Known(Arc<Volume>),
-    /// That of the scan at this path, if it has one.
-    Of(PathBuf),
+    /// That of the scan at this path.
+    Of(Arc<Stored>),
+}
+
+/// A truth that is still in its file.
+struct Stored {
+    /// The absolute path of the scan.
+    scan: PathBuf,
+    /// The file with the volume.
+    file: PathBuf,
+    /// Its size and the time of its last change when the scan was read.
+    stamp: Stamp,
+}
+
+type Stamp = Option<(u64, SystemTime)>;
+
+/// Size and time of the last change of a file.
+fn stamp(file: &Path) -> Stamp {
+    let info = file.metadata().ok()?;
+    Some((info.len(), info.modified().ok()?))
+}
+
+impl Truth {
+    /// The truth of the scan at `path`. An error of its file is one when the truth is needed.
+    fn of(path: &Path) -> conefield_core::Result<Self> {
+        let scan = std::path::absolute(path).map_err(|e| conefield_core::Error::io(path, e))?;
+        let file = match conefield_io::truth_file(&scan) {
+            Ok(None) => return Ok(Self::Unknown),
+            Ok(Some(file)) => file,
+            Err(_) => scan.clone(),
+        };
+        let stamp = stamp(&file);
+        Ok(Self::Of(Arc::new(Stored { scan, file, stamp })))
+    }
+}
+
+impl Stored {
+    /// Reads the volume. Refuses one that is no longer that of the scan.
+    fn read(&self) -> conefield_core::Result<Option<Volume>> {
+        let (file, expected) = (self.file.display().to_string(), "the file as it was when the scan was read");
+        ensure(stamp(&self.file) == self.stamp, &file, "truth", "a file that has changed", expected)?;
+        conefield_io::read_truth(&self.scan)
+    }
 }
 
 impl Scan {
@@ -46,7 +88,7 @@ impl Scan {
     pub fn truth(&self) -> conefield_core::Result<Option<Volume>> {
         match &self.truth {
             Truth::Known(truth) => Ok(Some(Volume::clone(truth))),
-            Truth::Of(path) => conefield_io::read_truth(path),
+            Truth::Of(stored) => stored.read(),
             Truth::Unknown => Ok(None),
         }
     }
@@ -133,11 +175,11 @@ impl Scan {
 /// Reads a scan in any format.
 #[pyfunction]
 pub fn read_scan(py: Python<'_>, path: PathBuf) -> PyResult<Scan> {
-    let scan = without_lock(py, |_| {
+    let (truth, scan) = without_lock(py, |_| {
         Memory::of_views(&conefield_io::scan_size(&path)?).check()?;
-        files::scan(&path)
+        Ok((Truth::of(&path)?, files::scan(&path)?))
     })?;
-    Ok(Scan { scan: Arc::new(scan), path: Some(path.clone()), truth: Truth::Of(path) })
+    Ok(Scan { scan: Arc::new(scan), path: Some(path), truth })
 }
 
 /// Writes a scan to a folder in conefield's own format.

@@ -97,6 +97,25 @@ def test_scans_are_read_only_and_come_back(scan, tmp_path):
         np.testing.assert_array_equal(part.truth.data, scan.truth.data)
 
 
+def test_a_scan_keeps_its_truth(scan, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    conefield.write_scan("s", scan)
+    back = conefield.read_scan("s")
+    part = back.split([1, 5])[0]
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    # The path was relative.
+    np.testing.assert_array_equal(part.truth.data, scan.truth.data)
+    conefield.write_scan(tmp_path / "s", conefield.simulate(2 * scan.truth.data, back.geometry))
+    for of in (back, part):
+        with pytest.raises(conefield.InvalidError, match="a file that has changed"):
+            of.truth
+    conefield.write_scan(tmp_path / "s", conefield.scan(scan.projections, scan.geometry))
+    bare = conefield.read_scan(tmp_path / "s")
+    conefield.write_scan(tmp_path / "s", scan)
+    assert bare.truth is None
+
+
 def test_a_scan_outlives_its_name():
     projections = conefield.simulate("phantom:head:8", views=2, detector=(4, 4)).projections
     junk = [np.ones(100_000) for _ in range(20)]

@@ -116,7 +116,7 @@ impl Lines {
         let place = |end: i64| if end < 0 { end.saturating_add(n as i64) } else { end };
         let (from, to) = (self.from.map_or(0, place), self.to.map_or(n as i64, place));
         let fits = 0 <= from && from < to && to <= n as i64;
-        let expected = format!("at least one of the {n} that the detector has");
+        let expected = format!("at least one, and none beyond the {n} that the detector has");
         ensure(fits, "command line", option, self, expected)?;
         Ok(from as usize..to as usize)
     }

@@ -106,6 +106,7 @@ impl FieldParts {
         let (scene, g) = (fitted.scene, &scan.geometry);
         let mut lines = surround::found(scan, self.scene.surround)?;
         lines.extend(fitted.found);
+        lines.extend(fitted.doubt);
         let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
         let samples = pipeline.field.lines().is_none().then(|| pipeline.projector.max_samples(&middle));
         Ok(Findings { lines, attenuation: Some(scene.attenuation * scan.unit.mm), samples })

@@ -191,9 +191,10 @@ impl Plan for FieldPlan {
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         job.scan.validate("scan")?;
         let (mut pipeline, settings) = (self.parts.pipeline.clone(), &self.parts.scene);
-        let Fitted { scene, solid, needed, found, changed } =
+        let Fitted { scene, solid, needed, found, doubt, changed } =
             fit(job.scan, settings, Some(job.volumes), &mut pipeline)?;
         found.iter().for_each(|line| observer.note(line));
+        doubt.iter().for_each(|line| observer.warn(line));
         let corrected = Corrected::of(job, settings.surround, solid.as_ref(), observer)?;
         let job = &Corrected::job(corrected.as_ref(), job);
         let source = RaySource::new(job.scan, &scene, &pipeline, &self.training)?;

@@ -19,6 +19,8 @@ pub struct Fitted {
     pub needed: Option<Vec<usize>>,
     /// Findings, for the log.
     pub found: Vec<String>,
+    /// A warning about the samples of rays.
+    pub doubt: Option<String>,
     /// Whether a stage changed for this scene.
     pub changed: bool,
 }
@@ -119,7 +121,10 @@ pub fn fit(
         needed = pipeline.needed(cells);
         found.push(format!("levels: {}", levels(pipeline, needed.as_deref(), cells)?));
     }
-    Ok(Fitted { scene, solid, needed, found, changed })
+    let g = &scan.geometry;
+    let middle = scene.pixel_ray(g, 0, g.detector[0] / 2, g.detector[1] / 2);
+    let doubt = pipeline.projector.doubt(&middle);
+    Ok(Fitted { scene, solid, needed, found, doubt, changed })
 }
 
 /// Finds the encoder's channels that are needed to resolve `cells`.

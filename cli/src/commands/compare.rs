@@ -18,7 +18,7 @@ use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::Table;
 use conefield_io::{Contents, Lease, Progressed};
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 use std::fs;
 use std::path::{Path, PathBuf};
 use tracing::info;
@@ -88,9 +88,15 @@ struct Shared<'a> {
 struct Entry {
     name: String,
     spec: String,
+    #[serde(serialize_with = "displayed")]
     run: PathBuf,
     #[serde(flatten)]
     outcome: Outcome,
+}
+
+/// Writes a path whose name may not be UTF-8.
+fn displayed<S: Serializer>(path: &Path, to: S) -> std::result::Result<S::Ok, S::Error> {
+    to.collect_str(&path.display())
 }
 
 impl CompareArgs {

@@ -71,6 +71,7 @@ impl ConvertArgs {
         let (selection, corrections) = (self.selection.selection(), self.corrections.corrections()?);
         if conefield_io::is_volume(&self.input) {
             let named = self.selection.named().or((!corrections.is_none()).then_some("--correct"));
+            let named = named.or((self.to != ScanFormat::Conefield).then_some("--to"));
             if let Some(option) = named {
                 let place = self.input.display().to_string();
                 let expected = "a scan: only scans have views and pixels";
@@ -94,7 +95,11 @@ impl ConvertArgs {
                 None => write_voxels_of(&self.output, &mut volume, template.as_ref())?,
             }
         } else {
-            let named = [("--hu", self.units.hu.is_some()), ("--dicom-template", self.dicom_template.is_some())];
+            let named = [
+                ("--hu", self.units.hu.is_some()),
+                ("--dicom-template", self.dicom_template.is_some()),
+                ("--values", self.values != Values::AsIs),
+            ];
             if let Some((option, _)) = named.into_iter().find(|(_, given)| *given) {
                 let expected = "a volume: a scan has line integrals";
                 return Err(Error::invalid(self.input.display().to_string(), option, "a scan", expected));

@@ -22,6 +22,7 @@ use conefield::{files, ranks, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
+use conefield_core::checksum;
 use conefield_core::method::Record;
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::{Loaded, to_toml};
@@ -31,7 +32,7 @@ use conefield_evaluation::report::MiddleSlices;
 use conefield_evaluation::report::text::bytes;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Reconstruct a volume from a scan.
@@ -187,7 +188,7 @@ impl ReconstructArgs {
         let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
         let mut run = session.plan(input, spent, &|| signals::caught().is_some())?;
         let loaded = &run.method.loaded;
-        let identity = identity(loaded, &self.protocol, &run.input.held, &scan)?;
+        let identity = identity_to_resume(loaded, &self.protocol, &run.input.held, &scan)?;
         signals::listen();
         // The parent process has ended, and nothing of this run has been written yet.
         if signals::caught().is_some() {
@@ -293,7 +294,7 @@ impl ReconstructArgs {
         let (input, record) = self.protocol.input(&self.scan, whole, reference)?;
         let resume = match session.requested() {
             Some(loaded) if self.resume => {
-                let identity = identity(loaded, &self.protocol, &input.held, &record)?;
+                let identity = identity_to_resume(loaded, &self.protocol, &input.held, &record)?;
                 Some(files::read_checkpoint(&self.output.join(CHECKPOINT), &identity)?)
             }
             _ => None,
@@ -335,9 +336,7 @@ fn begin_or_go_on(
         folder.0.go_on();
         return folder.metrics_until(resume.standing.recorded);
     }
-    folder.0.replace()?;
-    conefield_io::write_text_atomic(folder.file("spec.toml"), &to_toml(&loaded.spec)?)?;
-    Ok((folder.metrics()?, None))
+    Ok((folder.begin(&to_toml(&loaded.spec)?)?, None))
 }
 
 /// Writes the result of a run with this `seed` to its folder, and scores it.
@@ -372,6 +371,23 @@ pub fn identity(
 ) -> Result<BTreeMap<String, String>> {
     let mut all = specs::notes(loaded, protocol.seed)?;
     all.extend(conditions(scan, held, &protocol.ends, protocol.budget)?);
+    Ok(all)
+}
+
+/// The [`identity`] of a run that may be resumed: with the content of the files that its spec names.
+pub fn identity_to_resume(
+    loaded: &Loaded,
+    protocol: &RunProtocol,
+    held: &[usize],
+    scan: &ScanRecord,
+) -> Result<BTreeMap<String, String>> {
+    let mut all = identity(loaded, protocol, held, scan)?;
+    let named = loaded.data_files().into_iter().filter(|name| Path::new(name).is_file());
+    let files: Vec<String> =
+        named.map(|name| Ok(format!("{name} {}", checksum::of_file(Path::new(&name))?))).collect::<Result<_>>()?;
+    if !files.is_empty() {
+        all.insert("files".into(), files.join("\n"));
+    }
     Ok(all)
 }
 

@@ -2,7 +2,7 @@
 
 use super::General;
 use super::protocol::{RunProtocol, word};
-use super::reconstruct::{FAILED, conditions, identity};
+use super::reconstruct::{FAILED, conditions, identity, identity_to_resume};
 use crate::run_folder::Recorded;
 use crate::{program, signals};
 use conefield::tradeoff::json::LONGEST;
@@ -57,8 +57,9 @@ impl Trial<'_> {
         if !output.exists() {
             return Ok(Start::Anew);
         }
-        let mut now = identity(loaded, protocol, &input.held, &input.scan)?;
+        let (held, scan) = (&input.held, &input.scan);
         if is_done(output) {
+            let mut now = identity(loaded, protocol, held, scan)?;
             now.insert("reference".into(), Value::from(protocol.named_reference()).to_string());
             now.insert("peak".into(), input.peak.to_string());
             now.insert("backend".into(), protocol.backend.kind().into());
@@ -67,7 +68,7 @@ impl Trial<'_> {
         }
         let checkpoint = output.join("checkpoint.safetensors");
         if checkpoint.exists() {
-            files::read_checkpoint(&checkpoint, &now)?;
+            files::read_checkpoint(&checkpoint, &identity_to_resume(loaded, protocol, held, scan)?)?;
             return Ok(Start::Resuming);
         }
         Ok(Start::Replacing)

@@ -215,6 +215,14 @@ fn what_files_say_does_not_reach_the_terminal_as_it_is() {
 }
 
 #[test]
+fn a_field_in_trouble_is_a_warning() {
+    let d = Folder::after(&[SCAN]);
+    let output = d.loud(&FAST.replace("--steps 3", "--steps 30 --set optimizer.lr=30")).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.lines().any(|line| line.contains("WARN") && line.contains("rolled back to step")), "{said}");
+}
+
+#[test]
 fn a_name_without_utf_8_is_reported_as_such() {
     let d = Folder::after(&[SCAN]);
     let init = std::ffi::OsStr::from_bytes(b"w\xff.safetensors");
@@ -222,6 +230,20 @@ fn a_name_without_utf_8_is_reported_as_such() {
     let output = d.command(&format!("{FAST} --init")).arg(init).output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.code() == Some(1) && said.contains("a name in UTF-8"), "{said}");
+}
+
+#[test]
+fn an_output_without_utf_8_gets_its_table() {
+    let d = Folder::after(&[SCAN]);
+    d.put("study.toml", "scans = ['scan']\nspecs = ['fdk', 'sirt']\n[protocol]\nsteps = 2\n");
+    for (line, out) in
+        [("compare scan --specs fdk,sirt --steps 2 -o", b"compared\xff"), ("study study.toml -o", b"studied_\xff")]
+    {
+        let out = std::ffi::OsStr::from_bytes(out);
+        let output = d.command(line).arg(out).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        assert!(d.at(out).join("table.json").is_file(), "{line}");
+    }
 }
 
 #[test]

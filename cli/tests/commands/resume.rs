@@ -30,6 +30,28 @@ fn losses(d: &Folder, run: &str) -> Vec<(u64, u64)> {
 }
 
 #[test]
+fn a_mask_that_has_changed_is_noticed() {
+    let d = Folder::after(&[SCAN]);
+    d.done("convert scan/truth.nii.gz mask.nii");
+    let line = "reconstruct scan --spec sirt -o run --steps 1000000 --set 'scene.support={file=\"mask.nii\"}'";
+    d.killed_at_a_checkpoint("run", &format!("{line} --checkpoint-every 0.01s"));
+    let mut bytes = d.bytes("mask.nii");
+    let last = bytes.len() - 2;
+    bytes[last] ^= 1;
+    d.put("mask.nii", &bytes);
+    d.refused_with(1, &format!("{line} --resume"), &["--resume: files", "mask.nii"]);
+}
+
+#[test]
+fn a_run_killed_at_its_start_can_be_replaced() {
+    let d = Folder::after(&[SCAN]);
+    d.done("reconstruct scan --spec sirt -o run --steps 1");
+    // A folder with a spec and no metrics is taken for the user's.
+    let made = |file: &str| d.at("run").join(file).metadata().unwrap().created().ok();
+    assert!(made("metrics.jsonl") <= made("spec.toml"));
+}
+
+#[test]
 fn ten_kills_at_random_moments_change_nothing() {
     let d = Folder::after(&[SCAN]);
     let (begin, steps) = (Instant::now(), 600);

@@ -63,11 +63,14 @@ fn import_and_convert_take_the_same_part() {
             ("convert whole none --views 1,1", "repeats view 1"),
             ("convert whole none --rows 4:20", "the 10"),
             ("convert whole none --columns 5:5", "at least one"),
+            ("convert whole none --columns 5:9999", "none beyond the"),
             ("convert whole none --bin 99", "the detector's longer side"),
         ],
     );
     d.done("simulate phantom:head:16 -o head --views 4 --detector 8x8");
     d.refused_with(1, "convert head/truth.nii.gz v.npy --bin 2", &["--bin", "a volume"]);
+    d.refused_with(1, "convert head/truth.nii.gz v.npy --to r2", &["--to", "a volume"]);
+    d.refused_with(1, "convert head v --values hu:0.02", &["--values", "a scan"]);
 }
 
 #[test]

@@ -178,6 +178,7 @@ fn views_that_are_no_circle_are_read_drawn_and_reconstructed() {
         near(&found[key], &want[key], key);
     }
     d.refuses("r2", &[("convert free r2 --to r2", "circle")]);
+    d.refuses("g", &[("reconstruct free --spec gaussians -o g", "gaussians start from fdk")]);
     d.done(&format!("reconstruct rtk --spec fast -o run {SMALL} --steps 8"));
 }
 

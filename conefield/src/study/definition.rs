@@ -33,6 +33,7 @@ use conefield_evaluation::report::text::stem;
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use toml::Spanned;
 
 /// Longest study file, in bytes.
@@ -263,6 +264,7 @@ impl Reading<'_> {
                 noise: simulate.noise,
                 seed: None,
             },
+            preparation: OnceLock::new(),
         };
         simulation.check(protocol.hold_out.as_ref()).map_err(|e| placed(at, "volumes", e))?;
         Ok(simulation)

@@ -13,7 +13,7 @@ use conefield_core::Result;
 use conefield_evaluation::report::Table;
 use serde::Serialize;
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// The content of `table.json`.
 #[derive(Serialize)]
@@ -45,7 +45,7 @@ pub struct CaseRecord {
     /// The noise, for a simulated case, if it differs from the protocol's.
     noise: Option<String>,
     /// The scan, for an existing one.
-    scan: Option<PathBuf>,
+    scan: Option<String>,
     views: usize,
     detector: [usize; 2],
     shape: [usize; 3],
@@ -62,7 +62,8 @@ impl CaseRecord {
                 (Some(s.written.clone()), s.changes.noise.map(|n| n.to_string()), None, Some("truth".into()))
             }
             Source::Scan { path, reference } => {
-                (None, None, Some(path.clone()), reference.as_ref().map(|r| r.display().to_string()))
+                let reference = reference.as_ref().map(|r| r.display().to_string());
+                (None, None, Some(path.display().to_string()), reference)
             }
         };
         Self {
@@ -81,7 +82,7 @@ impl CaseRecord {
 
     fn line(&self) -> String {
         let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.shape);
-        let from = self.volume.clone().or(self.scan.as_ref().map(|s| s.display().to_string())).unwrap_or_default();
+        let from = self.volume.as_ref().or(self.scan.as_ref()).map_or("", |s| s);
         let reference =
             self.reference.as_ref().map_or(String::new(), |r| format!("; reference {r}, peak {}", self.peak));
         let noise = self.noise.as_ref().map_or(String::new(), |n| format!("; noise {n}"));
@@ -95,7 +96,7 @@ struct RunLine {
     case: String,
     seed: u64,
     method: String,
-    run: PathBuf,
+    run: String,
     /// The machine of the run.
     machine: Option<Machine>,
     #[serde(flatten)]
@@ -130,7 +131,7 @@ impl<'a> StudyReport<'a> {
         let summary = Summary { study, outcomes: &outcomes }.lines();
         let line = |(cell, outcome): (Cell, Outcome)| {
             let (case, method) = (study.cases[cell.case].name.clone(), study.methods[cell.method].name.clone());
-            let run = layout.run(&study.run_name(&cell));
+            let run = layout.run(&study.run_name(&cell)).display().to_string();
             let machine = outcome.figures.as_ref().and_then(|f| f.machine.clone());
             RunLine { case, seed: cell.seed, method, run, machine, outcome }
         };

@@ -4,6 +4,7 @@ use crate::files;
 use crate::memory::Memory;
 use crate::parse::{AnglesOption, HoldOut, Values};
 use crate::simulation::{self, Changes};
+use conefield_core::checksum;
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::scan::{Scan, Volume};
@@ -11,6 +12,7 @@ use conefield_core::{Error, Result, written};
 use conefield_projectors::simulate::Protocol;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 
 /// Settings of a simulated scan, except the seed of its noise.
 pub struct Simulation {
@@ -28,6 +30,8 @@ pub struct Simulation {
     pub protocol: String,
     /// Changes to the protocol.
     pub changes: Changes,
+    /// How the volume was prepared, once it has been read.
+    pub preparation: OnceLock<Value>,
 }
 
 impl Simulation {
@@ -43,6 +47,7 @@ impl Simulation {
     /// Refuses a volume that cannot be read or scanned, and held-out views that do not exist.
     pub fn check(&self, hold_out: Option<&HoldOut>) -> Result<()> {
         let volume = self.prepared()?;
+        self.preparation.get_or_init(|| self.preparation(&volume));
         let geometry = self.protocol(&volume.grid, 0)?.geometry(&volume.grid)?;
         simulation::check_memory(&volume, &geometry)?;
         let views = geometry.views.len();
@@ -57,9 +62,10 @@ impl Simulation {
     pub fn make(&self, seed: u64, folder: &Path) -> Result<()> {
         let volume = self.prepared()?;
         let protocol = self.protocol(&volume.grid, seed)?;
+        let prepared = self.preparation(&volume);
         let (mut scan, volume) = simulation::scan(volume, self.values, &protocol, &self.written)?;
         if let Some(p) = scan.provenance.as_object_mut() {
-            p.insert("prepared".into(), self.preparation());
+            p.insert("prepared".into(), prepared);
         }
         conefield_io::write_scan(folder, &scan, Some(&volume))
     }
@@ -69,9 +75,17 @@ impl Simulation {
         let now = self.protocol(&scan.geometry.volume, seed)?;
         let then = scan.provenance["simulated"]["protocol"].to_string();
         let then: Option<Protocol> = written::read("protocol.json", &then).ok();
+        let mut prepared = match self.preparation.get() {
+            Some(preparation) => preparation.clone(),
+            None => self.preparation(&self.prepared()?),
+        };
+        if scan.provenance["prepared"]["volume"].is_null() {
+            // A scan of an earlier version does not say which voxels it was made of.
+            prepared.as_object_mut().map(|how| how.remove("volume"));
+        }
         let same = then.as_ref() == Some(&now)
             && scan.provenance["source"] == self.written
-            && scan.provenance["prepared"] == self.preparation();
+            && scan.provenance["prepared"] == prepared;
         let expected = "a scan simulated as this study's file says; --force starts over";
         ensure(
             same,
@@ -100,8 +114,14 @@ impl Simulation {
         })
     }
 
-    fn preparation(&self) -> Value {
-        json!({ "values": self.values_written, "downsample": self.downsample })
+    /// How `volume` was prepared. A phantom is known by its name.
+    fn preparation(&self, volume: &Volume) -> Value {
+        let mut how = json!({ "values": self.values_written, "downsample": self.downsample });
+        if !self.volume.starts_with("phantom:") {
+            let voxels = format!("{} {:?}", checksum::of_numbers(&volume.data), volume.grid.spacing);
+            how["volume"] = json!(checksum::of_text(&voxels));
+        }
+        how
     }
 }
 
@@ -123,6 +143,7 @@ mod tests {
                 noise: "tigre:1e4,10".parse().ok(),
                 ..Changes::default()
             },
+            preparation: OnceLock::new(),
         }
     }
 
@@ -145,6 +166,27 @@ mod tests {
             let e = other.check_made(seed, &scan, &folder).unwrap_err().to_string();
             assert!(e.contains("simulated in another way"), "{e}");
         }
+    }
+
+    #[test]
+    fn a_changed_volume_is_noticed() {
+        let dir = tempfile::tempdir().unwrap();
+        let (file, folder) = (dir.path().join("volume.nii.gz"), dir.path().join("scan"));
+        let mut volume = files::volume("phantom:head:16").unwrap();
+        conefield_io::write_volume(&file, &volume).unwrap();
+        let file_name = file.to_str().unwrap();
+        of(file_name, 5).make(7, &folder).unwrap();
+        let mut scan = conefield_scans::read_scan(&folder).unwrap();
+        of(file_name, 5).check_made(7, &scan, &folder).unwrap();
+        volume.data[[8, 8, 8]] += 0.25;
+        conefield_io::write_volume(&file, &volume).unwrap();
+        let changed = of(file_name, 5);
+        changed.check(None).unwrap();
+        let e = changed.check_made(7, &scan, &folder).unwrap_err().to_string();
+        assert!(e.contains("simulated in another way"), "{e}");
+        // A scan of an earlier version.
+        scan.provenance["prepared"].as_object_mut().unwrap().remove("volume").unwrap();
+        changed.check_made(7, &scan, &folder).unwrap();
     }
 
     #[test]

@@ -149,9 +149,13 @@ impl Loaded {
 
     /// The files that its settings name ([`InputFile`](crate::input_file::InputFile)), and the libraries of its stages.
     pub fn input_files(&self) -> Vec<String> {
+        self.data_files().into_iter().chain(self.spec.plugins.paths.iter().cloned()).collect()
+    }
+
+    /// The files that its settings name.
+    pub fn data_files(&self) -> Vec<String> {
         let named = marked(&self.tree, &|schema| schema["format"] == input_file::FORMAT).into_iter();
-        let named = named.filter_map(|(_, name)| name.as_str().map(str::to_owned));
-        named.chain(self.spec.plugins.paths.iter().cloned()).collect()
+        named.filter_map(|(_, name)| name.as_str().map(str::to_owned)).collect()
     }
 
     /// The same error, with the line of the spec it refers to.

@@ -356,6 +356,10 @@ impl GaussianPlan {
         let alone = Job { seed: job.seed, ..Job::new(job.scan, job.backend) };
         let help = |e: Error| match e {
             Error::Interrupted { .. } => Error::Interrupted { step: 0 },
+            Error::Invalid { place, field, found, expected } if place == "scan" => {
+                let start = "gaussians start from fdk, or in a chain from the volume of the method before";
+                Error::invalid(place, field, found, format!("{expected} ({start})"))
+            }
             e => e.within("start"),
         };
         let solution = first().run(&alone, &mut Quiet(&|| observer.cancelled())).map_err(help)?;

@@ -112,9 +112,9 @@ impl<'a> Run<'a> {
         self.optimizer.adam(1, self.epoch(), self.clock.share(self.step))
     }
 
-    /// Reports an event, now and in the next record.
+    /// Warns of an event, now and in the next record.
     pub fn report(&mut self, said: String) {
-        self.observer.note(&said);
+        self.observer.warn(&said);
         self.tally.window.events.push(said);
     }
 
