@@ -56,8 +56,13 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
         if zarr::is_zarr(path) {
             return Ok(ZARR);
         }
-        let slices = tiff::is_stack(path) && !dicom::is_series(path);
-        return Ok(if slices { SLICES } else { SERIES });
+        if dicom::is_series(path) {
+            return Ok(SERIES);
+        }
+        // The images in the folder of a scan are no slices.
+        let expected = "a volume: a file, or a folder of DICOM or TIFF slices";
+        ensure(scan::find(path).is_err(), &path.display().to_string(), "volume", "the folder of a scan", expected)?;
+        return Ok(if tiff::is_stack(path) { SLICES } else { SERIES });
     }
     let mut input = Input::open(path)?;
     let head = input.take(nifti::HEADER)?;
@@ -348,6 +353,17 @@ pub(crate) mod tests {
             F32 f32: -1.5f32, 3.25e-3f32;
             F64 f64: -1.5f64, 0.1f64;
         }
+    }
+
+    #[test]
+    fn the_folder_of_a_scan_is_no_volume() {
+        let dir = tempfile::tempdir().unwrap();
+        let volume = Volume::centered(Array3::from_elem((2, 3, 1), 0.5), [1.0; 3]);
+        write_volume(dir.path().join("view.tif"), &volume).unwrap();
+        assert_eq!(read_volume(dir.path()).unwrap().data, volume.data);
+        std::fs::write(dir.path().join("scanner.toml"), "").unwrap();
+        let e = read_volume(dir.path()).unwrap_err().to_string();
+        assert!(e.contains("the folder of a scan"), "{e}");
     }
 
     #[test]

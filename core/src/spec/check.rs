@@ -157,7 +157,7 @@ fn object(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<(
     for key in schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str) {
         if node.get(key).is_none() {
             let want = properties.get(key).map_or("a value".into(), |s| wanted(cx.resolve(s), cx));
-            return Err(Error::invalid(&node.at, &join(path, key), "nothing", want));
+            return Err(Error::invalid(&node.at, join(path, key), "nothing", want));
         }
     }
     Ok(())

@@ -54,7 +54,7 @@ pub(super) fn check(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -
         said.sort_by_key(|e| e.at.offset());
         if let [first, second, ..] = said[..] {
             let found = format!("{} beside it", first.key);
-            return Err(Error::invalid(&second.at, &join(path, &second.key), found, listed(&group)));
+            return Err(Error::invalid(&second.at, join(path, &second.key), found, listed(&group)));
         }
     }
     Ok(())
