@@ -28,12 +28,11 @@ pub(crate) fn ssim_skimage(result: ArrayView3<f32>, reference: ArrayView3<f32>, 
     Ok(over_axes(result, reference, &|x, y| Some(slice_ssim(x, y, &window, 0, peak))).unwrap_or(0.0))
 }
 
+/// The score of two images, unless it is not defined.
+type Score<'a> = dyn Fn(ArrayView2<f32>, ArrayView2<f32>) -> Option<f64> + Sync + 'a;
+
 /// Mean over the slices with a score, then over the axes; `None` if an axis has none.
-fn over_axes(
-    result: ArrayView3<f32>,
-    reference: ArrayView3<f32>,
-    score: &(dyn Fn(ArrayView2<f32>, ArrayView2<f32>) -> Option<f64> + Sync),
-) -> Option<f64> {
+fn over_axes(result: ArrayView3<f32>, reference: ArrayView3<f32>, score: &Score) -> Option<f64> {
     // Slices across z touch every cache line of the volume: copying a few at once reads each line only once.
     const BLOCK: usize = 16;
     let mut means = 0.0;

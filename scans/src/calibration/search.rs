@@ -236,6 +236,9 @@ pub(crate) fn solved(matrix: Vec<Vec<f64>>, gradient: &[f64]) -> Option<Vec<f64>
     Some(inverse(damped(matrix))?.iter().map(|row| -inner(row, gradient)).collect())
 }
 
+/// The step in each active parameter from a correction with what was found there, or `None` at the end.
+pub(crate) type NextStep<'a, T> = dyn FnMut(&(Correction, T)) -> Result<Option<Vec<f64>>> + 'a;
+
 /// At most `rounds` steps in the parameters `active`, whose pixels are `units`.
 pub(crate) struct Steps<'a> {
     pub active: &'a [Parameter],
@@ -251,7 +254,7 @@ impl Steps<'_> {
         start: Correction,
         at: &dyn Fn(&Correction) -> Result<T>,
         error: &dyn Fn(&T) -> f64,
-        step: &mut dyn FnMut(&(Correction, T)) -> Result<Option<Vec<f64>>>,
+        step: &mut NextStep<'_, T>,
     ) -> Result<(Correction, T)> {
         let mut here = (start, at(&start)?);
         'steps: for _ in 0..self.rounds.min(self.rounds * self.active.len()) {
