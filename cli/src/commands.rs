@@ -147,7 +147,7 @@ impl General {
 }
 
 /// Limits of training; the first one reached ends it.
-#[derive(Debug, Clone, Args, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Args, Serialize, Deserialize)]
 pub struct EndOptions {
     /// Stop training after this time, such as 600s or 10m, without the time before and after training. In a chain, that of
     /// its first method.

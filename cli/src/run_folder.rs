@@ -143,32 +143,33 @@ pub struct RunOnDisk {
 }
 
 /// What other commands need of `record.json`.
+/// A record of an earlier version may lack some of it.
 #[derive(Deserialize)]
 pub struct Recorded {
+    #[serde(default)]
     pub version: String,
     pub spec: String,
+    #[serde(default)]
     pub seed: u64,
     pub scan: ScanRecord,
     pub held_out_views: Vec<usize>,
+    #[serde(default)]
     pub limits: EndOptions,
     #[serde(default)]
     pub budget_s: Option<f64>,
     pub reference: Option<String>,
     #[serde(default)]
     pub plugins: Vec<Used>,
+    #[serde(default)]
     pub backend: Value,
+    #[serde(default)]
     pub peak: f64,
 }
 
 impl Recorded {
-    /// The record in `folder`, and all of it.
-    pub fn read(folder: &Path) -> Result<(Self, Value)> {
-        let file = folder.join("record.json");
-        let record: Value = read_json(&file)?;
-        let known = serde_json::from_value(record.clone()).map_err(|e| {
-            Error::invalid(file.display().to_string(), "JSON", e, "what \"conefield reconstruct\" writes there")
-        })?;
-        Ok((known, record))
+    /// Reads the record in `folder`.
+    pub fn read(folder: &Path) -> Result<Self> {
+        read_json(&folder.join("record.json"))
     }
 }
 
@@ -181,8 +182,10 @@ impl RunOnDisk {
 
     /// Reads everything but the large files.
     pub fn read(folder: &Path) -> Result<Self> {
-        let recorded = folder.join("record.json").exists().then(|| Recorded::read(folder)).transpose()?;
-        let (known, record) = recorded.unzip();
+        let file = folder.join("record.json");
+        let there = file.exists();
+        let known = there.then(|| Recorded::read(folder)).transpose()?;
+        let record = there.then(|| read_json(&file)).transpose()?;
         let text = |name: &str| match folder.join(name) {
             path if path.exists() => read_text(&path, LONGEST),
             _ => Ok(String::new()),

@@ -31,6 +31,9 @@ impl Input {
     /// Splits `whole` into training views and the held-out views `held`. The default of `peak` comes from the
     /// reference.
     pub fn new(whole: Arc<Scan>, held: Vec<usize>, reference: Option<Volume>, peak: Option<f64>) -> Result<Self> {
+        if reference.is_none() && peak.is_some() {
+            tracing::warn!("peak: it has no effect without a reference");
+        }
         let peak = reference.as_ref().map_or(peak.unwrap_or(1.0), |r| score::peak(peak, r));
         let (scan, aside) = if held.is_empty() {
             (whole, None)

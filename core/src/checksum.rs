@@ -1,4 +1,4 @@
-//! FNV-1a checksums, to recognize a scan (G. Fowler, L. C. Noll, K.-P. Vo, 1991; 64 bits, in hexadecimal).
+//! FNV-1a checksums, to recognize a scan or a file (G. Fowler, L. C. Noll, K.-P. Vo, 1991; 64 bits, in hexadecimal).
 
 use crate::{Error, Result};
 use ndarray::Array3;

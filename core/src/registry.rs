@@ -141,7 +141,7 @@ fn resolved(kind: Kind, mut value: Value) -> Result<(&'static StageType, Value),
 }
 
 /// Reads the settings of a type from the keys of its table. It reads tables only: what `serde` derives for settings in a
-/// list is not compiled.
+/// list is not compiled. A struct without names needs `#[serde(transparent)]`.
 pub fn from_table<T: DeserializeOwned>(keys: Value) -> Result<T, String> {
     let Value::Object(keys) = keys else { return Err(format!("found {keys}, expected a table")) };
     T::deserialize(keys).map_err(|e| e.to_string())

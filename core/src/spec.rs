@@ -61,7 +61,8 @@ impl<'de> Deserialize<'de> for Spec {
         let mut method = Map::<String, Value>::deserialize(from)?;
         let mut label = Map::new();
         label.extend(LABEL.iter().filter_map(|key| method.remove_entry(*key)));
-        let Label { name, description, plugins } = serde_json::from_value(label.into()).map_err(D::Error::custom)?;
+        let Label { name, description, plugins } =
+            crate::registry::from_table(label.into()).map_err(D::Error::custom)?;
         let method = crate::registry::read(Value::Object(method)).map_err(D::Error::custom)?;
         Ok(Self { name, description, plugins, method })
     }

@@ -112,7 +112,7 @@ impl<R: Real> Located<R> {
         [near, if dense { near + 1 } else { self.far[e][i] }]
     }
 
-    /// Computes the weights of edges. Loops as in `locate`.
+    /// Computes the weights of edges, in the whole block, as `locate` does.
     #[inline(always)]
     fn weigh(&mut self) {
         let [_, fy, fz] = &self.fraction;

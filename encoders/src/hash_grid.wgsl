@@ -30,7 +30,7 @@ fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Located {
 
 fn stage_moved(at: stage_Located, d: u32, end: f32) -> stage_Located {
     var moved = at;
-    moved.fraction[d] = end;
+    moved.fraction = select(at.fraction, vec3<f32>(end), vec3<u32>(0u, 1u, 2u) == vec3<u32>(d));
     return moved;
 }
 

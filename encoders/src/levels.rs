@@ -82,8 +82,8 @@ pub struct Rows<'a, L: Level, R: Real, const F: usize> {
     pub n: usize,
 }
 
-/// A level, or a part of one: some levels have several tables, one per part. What works on rows must be
-/// `#[inline(always)]`: only then is it compiled with the instructions of `s`.
+/// A level, or a part of one: some levels have several tables, one per part. A function that takes an `S: Simd` must
+/// be `#[inline(always)]`: only then is it compiled with the instructions of `s`.
 pub trait Level: Clone + Send + Sync + 'static {
     /// The encoder's settings.
     type Settings: Grid;

@@ -1,7 +1,8 @@
 // Encoders with several levels, as in levels.rs, which adds `stage_FEATURES` and the calls level by level. A level declares
 // `stage_Level`, `stage_Located` and these functions:
 // - stage_locate(x, level): where a point lies,
-// - stage_moved(at, d, end): the same place moved to `end` 0 or 1 of the cell along axis `d`,
+// - stage_moved(at, d, end): the place changed so that the features at `end` 1 less those at `end` 0 are the derivative along
+//   axis `d` with respect to the position in cells,
 // - stage_level_value(at, level): the features there,
 // - stage_level_backward(at, level, dy): adds to the gradients of the level's parameters.
 

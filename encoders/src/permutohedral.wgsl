@@ -42,9 +42,10 @@ fn stage_moved(at: stage_Located, d: u32, end: f32) -> stage_Located {
     var moved = at;
     moved.weight = vec4<f32>(0.0);
     for (var k = 1u; k < 3u; k++) {
-        let rank = at.rank[(d + k) % 3u];
-        moved.weight[rank + 1u] += end;
-        moved.weight[rank] -= end;
+        // Not by index: DirectX 12 writes no component of a vector whose number only the data give.
+        let rank = vec4<u32>(at.rank[(d + k) % 3u]);
+        let corner = vec4<u32>(0u, 1u, 2u, 3u);
+        moved.weight += end * (vec4<f32>(corner == rank + 1u) - vec4<f32>(corner == rank));
     }
     return moved;
 }

@@ -48,7 +48,7 @@ fn stage_locate(x: vec3<f32>, level: stage_Level) -> stage_Located {
 
 fn stage_moved(at: stage_Located, d: u32, end: f32) -> stage_Located {
     var moved = at;
-    moved.t[d] = end;
+    moved.t = select(at.t, vec3<f32>(end), vec3<u32>(0u, 1u, 2u) == vec3<u32>(d));
     return moved;
 }
 

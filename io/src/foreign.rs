@@ -65,8 +65,7 @@ pub(crate) fn refuse_file(path: &Path) -> Result<()> {
 pub(crate) fn refuse_folder(folder: &Path) -> Result<()> {
     let Ok(paths) = crate::dicom::files(folder) else { return Ok(()) };
     // Pictures beside the files of another format are not the scan.
-    let picture =
-        |p: &Path| p.extension().is_some_and(|e| ["png", "jpg", "jpeg"].iter().any(|k| e.eq_ignore_ascii_case(k)));
+    let picture = |p: &Path| ["png", "jpg", "jpeg"].contains(&&extension(p)[..]);
     paths.iter().filter(|p| !picture(p)).take(MOST_FILES).try_for_each(|p| refuse_file(p))
 }
 

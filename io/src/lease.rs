@@ -199,7 +199,8 @@ impl Lease {
 
     /// Removes the known files of work without a result.
     fn clear(&self, folder: &Path) -> Result<()> {
-        for path in entries(folder)? {
+        // Backwards, so that an interruption does not leave a spec alone, which is taken for the user's.
+        for path in entries(folder)?.into_iter().rev() {
             if (self.contents.known)(&path) {
                 let gone = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
                 gone.map_err(|e| Error::io(&path, e))?;
@@ -333,8 +334,15 @@ fn await_parts(path: &Path, contents: Contents) -> Result<()> {
 
 /// Collects the folders within `path` that are `wanted`, down to `depth`.
 fn folders(path: &Path, depth: usize, wanted: fn(&Path) -> bool, found: &mut Vec<PathBuf>) -> Result<()> {
-    if depth == 0 || !path.is_dir() {
+    if depth == 0 {
         return Ok(());
+    }
+    match path.metadata() {
+        Ok(info) if info.is_dir() => {}
+        Err(e) if !matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+            return Err(Error::io(path, e));
+        }
+        _ => return Ok(()),
     }
     for inner in entries(path)?.into_iter().filter(|inner| is_folder(inner) && wanted(inner)) {
         folders(&inner, depth - 1, |_| true, found)?;

@@ -156,12 +156,15 @@ const KEYS: [&str; 3] = ["descr", "fortran_order", "shape"];
 
 /// The entries of a dict in the notation that headers use: Python's, which differs from JSON in these characters.
 fn entries(text: &str) -> Option<Map<String, Value>> {
-    let mut json: String = text.split_whitespace().collect();
+    let mut json = text.split_whitespace().collect::<Vec<_>>().join(" ");
     // The last two are Python 2's suffix of long integers.
     for (python, other) in [
         ("'", "\""),
         ("(", "["),
         (")", "]"),
+        (" ]", "]"),
+        (" }", "}"),
+        (" ,", ","),
         (",]", "]"),
         (",}", "}"),
         ("True", "true"),
@@ -249,6 +252,8 @@ mod tests {
         refused(&npy_bytes("<f4", false, "(4294967296, 4294967296, 4294967296)", &[]), &["shape", "addressed"]);
         refused(&npy_bytes("<f4", false, "(100000, 100000, 10)", &[0; 8]), &["data", "8 bytes", "400000000000"]);
         refused(&npy_bytes("<f4", false, "(-1, 1, 1)", &[0; 8]), &["header"]);
+        refused(&npy_bytes("<f4", false, "(1 2, 1, 1)", &[0; 48]), &["header"]);
+        refused(&npy_bytes("<f 4", false, "(1, 1, 1)", &[0; 4]), &["descr"]);
         refused(&npy_bytes("é", false, "(1, 1, 1)", &[0; 8]), &["descr"]);
     }
 }

@@ -18,7 +18,7 @@ use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis, Ix2, Ix3};
 use serde::Deserialize;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
 
 /// The file that describes the folder.
@@ -68,7 +68,7 @@ struct Scanner {
 pub(crate) fn read(folder: &Path, with_test: bool) -> Result<DataSet> {
     let file = folder.join(META);
     let meta = text::read(&file)?;
-    text::warn(&file.display().to_string(), unread(&others(&text::read(&file)?)));
+    text::warn(&file.display().to_string(), unread(&others(text::read(&file)?)));
     described(folder, meta, with_test)
 }
 
@@ -85,6 +85,16 @@ pub(crate) fn truth_file(folder: &Path) -> Result<Option<PathBuf>> {
     meta.vol.map(|name| folder::inside(folder, &place, "vol", &name)).transpose()
 }
 
+/// All keys of the scanner and of views.
+#[derive(Deserialize)]
+struct Keys {
+    scanner: Map<String, Value>,
+    #[serde(default)]
+    proj_train: Vec<Map<String, Value>>,
+    #[serde(default)]
+    proj_test: Vec<Map<String, Value>>,
+}
+
 /// Keys of the scanner that are read, and those that do not move source, detector or volume, beside those of noise.
 const KNOWN: [&str; 15] = [
     "mode", "DSD", "DSO", "nDetector", "sDetector", "dDetector", "nVoxel", "sVoxel", "dVoxel", "offOrigin",
@@ -93,7 +103,7 @@ const KNOWN: [&str; 15] = [
 
 /// Numbers other than 0 in a description that are not read: of the scanner (TIGRE's `rotDetector` and `COR`, say) and of
 /// single views.
-fn others(meta: &Value) -> Vec<String> {
+fn others(keys: Keys) -> Vec<String> {
     fn set(value: &Value) -> bool {
         match value {
             Value::Number(n) => n.as_f64() != Some(0.0),
@@ -103,15 +113,13 @@ fn others(meta: &Value) -> Vec<String> {
     }
     let moving = |key: &str| !KNOWN.contains(&key) && !key.to_lowercase().contains("noise");
     let mut all = Vec::new();
-    for (key, value) in
-        meta["scanner"].as_object().into_iter().flatten().filter(|(key, value)| moving(key) && set(value))
-    {
+    for (key, value) in keys.scanner.iter().filter(|(key, value)| moving(key) && set(value)) {
         all.push(format!("scanner.{key} = {}", shortened(&value.to_string()).trim_matches('"')));
     }
-    for split in ["proj_train", "proj_test"] {
-        let stranger = meta[split].as_array().into_iter().flatten().enumerate().find_map(|(i, frame)| {
-            let mut keys = frame.as_object().into_iter().flatten();
-            let (key, _) = keys.find(|(key, value)| !["file_path", "angle"].contains(&&key[..]) && set(value))?;
+    for (split, frames) in [("proj_train", &keys.proj_train), ("proj_test", &keys.proj_test)] {
+        let stranger = frames.iter().enumerate().find_map(|(i, frame)| {
+            let (key, _) =
+                frame.iter().find(|(key, value)| !["file_path", "angle"].contains(&&key[..]) && set(value))?;
             Some(format!("{split}[{i}].{key}"))
         });
         all.extend(stranger);
@@ -350,7 +358,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("r2");
         write_r2(&path, &scan(), None, None).unwrap();
-        let found = || others(&text::read(&path.join(META)).unwrap());
+        let found = || others(text::read(&path.join(META)).unwrap());
         assert_eq!(found(), Vec::<String>::new());
         changed(&path, &|meta| {
             meta["scanner"]["rotDetector"] = json!([0, 0.01, 0]);

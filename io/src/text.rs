@@ -87,9 +87,13 @@ pub(crate) fn warn(place: &str, remarks: impl IntoIterator<Item = String>) {
     remarks.into_iter().for_each(|r| tracing::warn!("{place}: {r}"));
 }
 
-/// What does not fit about the `value` of a description, as `serde` says it.
+/// The message of an unusable `value` in the form of serde's errors: what was found, then what is expected.
 pub(crate) fn misfit(value: &Value, expected: &str) -> String {
-    let shown: String = value.to_string().chars().take(80).collect();
+    let mut shown = value.to_string();
+    if let Some((at, _)) = shown.char_indices().nth(80) {
+        shown.truncate(at);
+        shown.push('…');
+    }
     format!("{shown}, expected {expected}")
 }
 

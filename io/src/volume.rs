@@ -60,7 +60,7 @@ pub(crate) fn open(path: &Path) -> Result<VolumeFile> {
             return Ok(SERIES);
         }
         // The images in the folder of a scan are no slices.
-        let expected = "a volume: a file, or a folder of DICOM or TIFF slices";
+        let expected = "a volume: a file, or a folder of DICOM or TIFF slices or of OME-Zarr";
         ensure(scan::find(path).is_err(), &path.display().to_string(), "volume", "the folder of a scan", expected)?;
         return Ok(if tiff::is_stack(path) { SLICES } else { SERIES });
     }

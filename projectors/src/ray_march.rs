@@ -133,7 +133,8 @@ impl Projector for RayMarch {
         let step = self.step_mm?;
         let wanted = self.wanted(ray, step);
         (wanted > MOST_SAMPLES as f64).then(|| {
-            let longer = step * wanted / MOST_SAMPLES as f64;
+            let [near, far] = self.range(ray);
+            let longer = f64::from(far - near) / f64::from(ray.per_mm) / MOST_SAMPLES as f64;
             format!(
                 "ray-march: samples are {longer:.2e} mm apart and not {step:.2e} mm, since a ray has at most {MOST_SAMPLES}"
             )

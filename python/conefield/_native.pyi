@@ -77,7 +77,7 @@ class Scan:
         """The origin of the scan."""
     @property
     def truth(self) -> Volume | None:
-        """The volume that it was simulated from, if known."""
+        """The volume that it was simulated from, if known. Read from its file, which must not have changed since."""
     def split(self, held: list[int]) -> tuple[Scan, Scan]:
         """The scan without these views, and one with only these."""
     def __len__(self) -> int: ...

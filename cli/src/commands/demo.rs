@@ -2,7 +2,7 @@
 
 use super::Command;
 use super::protocol::word;
-use crate::boundary::refuse_existing;
+use crate::boundary::{self, refuse_existing};
 use crate::{Cli, out};
 use clap::{Args, Parser};
 use conefield::score::{SCORES, cells_of};
@@ -70,6 +70,8 @@ struct Entry {
 impl DemoArgs {
     pub fn run(self) -> Result<()> {
         let folder = &self.output;
+        // A spec stores the path of the weights as text.
+        boundary::text(folder)?;
         refuse_existing(folder, self.force)?;
         // A method that does not fit into memory is refused before anything is created.
         [VOXELS, FIELD].into_iter().try_for_each(|spec| self.check_memory(spec))?;
@@ -93,7 +95,7 @@ impl DemoArgs {
         let field = self.compete("fast (LN, MCI)", "fast", FIELD, &timed)?;
         // At equal steps: how many fit into a time depends on what else the machine does.
         let without = ["--set=normalizers=[]".into(), "--set=initializer.type=random".into()];
-        let other = [&without[..], &[word("--steps", field.steps.to_string())]].concat();
+        let other = [&without[..], &[word("--steps", field.steps.max(1).to_string())]].concat();
         let other = self.compete("without LN, MCI", "without", FIELD, &other)?;
         let entries = [voxels, field, other];
         let methods: Vec<Value> = entries.iter().map(|e| json!({ "name": e.run })).collect();
@@ -136,9 +138,10 @@ impl DemoArgs {
         let words = words.chain([output, word("--spec", spec), word("--seed", self.seed.to_string())]);
         let line = Cli::try_parse_from(words.chain(["--".into(), self.output.join(SCAN).into()]));
         let failed = |why: String| Error::unsupported("demo", why);
-        let Command::Reconstruct(command) = line.map_err(|e| failed(e.to_string()))?.command else {
+        let Command::Reconstruct(mut command) = line.map_err(|e| failed(e.to_string()))?.command else {
             return Err(failed("no reconstruction".into()));
         };
+        command.shown_as = Some(name);
         let record = command.reconstruct()?.ok_or_else(|| failed("no record".into()))?;
         let scores = record.written.scores.ok_or_else(|| failed("the phantom is not scored".into()))?;
         let (steps, train_s, export_s) = (record.steps, record.train_s, record.written.export_s);

@@ -83,6 +83,9 @@ pub struct ReconstructArgs {
     /// it like a signal.
     #[arg(long, hide = true)]
     as_part: bool,
+    /// What the demonstration calls the run. Such a run keeps no checkpoint and uses no scratch file.
+    #[arg(skip)]
+    pub shown_as: Option<&'static str>,
 }
 
 fn spec_help() -> String {
@@ -165,7 +168,9 @@ impl ReconstructArgs {
         }
         // A spec stores this file name as text; a name that is not UTF-8 would be stored as another one.
         self.init.as_deref().map(boundary::text).transpose()?;
-        memory::allow_scratch(conefield_io::folder_of(&self.output));
+        if self.shown_as.is_none() {
+            memory::allow_scratch(conefield_io::folder_of(&self.output));
+        }
         let backend = self.protocol.backend.open_for_run(self.protocol.budget)?;
         // An invalid spec, and weights that cannot be read or do not fit, are reported before anything is created.
         let session = self.session(backend.as_ref(), begin)?;
@@ -310,8 +315,9 @@ impl ReconstructArgs {
         run: BTreeMap<String, String>,
     ) -> Result<Progress> {
         let board = self.tensorboard.then(|| Board::new(&folder.file("events.out.tfevents.conefield"), &metrics.0));
-        let mut progress = Progress::new("reconstruct", Some(metrics));
-        progress.keeper = Some(Renewed::new(folder.file(CHECKPOINT), self.protocol.checkpoint_every));
+        let mut progress = Progress::new(self.shown_as.unwrap_or("reconstruct"), Some(metrics));
+        let keeper = || Renewed::new(folder.file(CHECKPOINT), self.protocol.checkpoint_every);
+        progress.keeper = self.shown_as.is_none().then(keeper);
         progress.run = run;
         let interval = self.live.or(self.watch.map(|_| WATCHED));
         progress.live = interval.map(|seconds| Renewed::new(folder.file("live.png"), seconds));
@@ -382,11 +388,8 @@ pub fn identity_to_resume(
     scan: &ScanRecord,
 ) -> Result<BTreeMap<String, String>> {
     let mut all = identity(loaded, protocol, held, scan)?;
-    let named = loaded.data_files().into_iter().filter(|name| Path::new(name).is_file());
-    let files: Vec<String> =
-        named.map(|name| Ok(format!("{name} {}", checksum::of_file(Path::new(&name))?))).collect::<Result<_>>()?;
-    if !files.is_empty() {
-        all.insert("files".into(), files.join("\n"));
+    for name in loaded.data_files().into_iter().filter(|name| Path::new(name).is_file()) {
+        all.insert(format!("file {name}"), checksum::of_file(Path::new(&name))?);
     }
     Ok(all)
 }

@@ -53,7 +53,7 @@ impl Trained {
     /// The error of reading the field; if the run used plugins that are not loaded, it says how to load them.
     fn with_plugins(&self, error: Error) -> Error {
         let folder = if self.run.is_dir() { &self.run } else { self.run.parent().unwrap_or(Path::new("")) };
-        let Ok((Recorded { plugins, .. }, _)) = Recorded::read(folder) else { return error };
+        let Ok(Recorded { plugins, .. }) = Recorded::read(folder) else { return error };
         let missing: Vec<&Used> = plugins.iter().filter(|plugin| !plugin.is_loaded()).collect();
         if missing.is_empty() {
             return error;

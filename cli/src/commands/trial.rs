@@ -117,7 +117,7 @@ impl Trial<'_> {
 
 /// The [`identity`] of a finished run and its reference.
 fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
-    let known = Recorded::read(folder)?.0;
+    let known = Recorded::read(folder)?;
     let backend = known.backend["backend"].as_str().unwrap_or_default();
     let mut all = BTreeMap::from([
         ("conefield".into(), known.version),

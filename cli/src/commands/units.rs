@@ -51,7 +51,7 @@ impl HounsfieldOption {
 pub fn unit_of(path: &Path) -> Result<Option<Unit>> {
     let folder = folder_of(path);
     if folder.join("record.json").is_file() {
-        return Ok(Recorded::read(folder)?.0.scan.unit);
+        return Ok(Recorded::read(folder)?.scan.unit);
     }
     conefield_io::scan_unit(folder)
 }

@@ -1,7 +1,7 @@
 //! HDF5 in its layouts, and Nikon's description.
 
 use crate::case::{Case, End, changed, cut, put, replaced, table, then};
-use conefield_tests::hostile::seeds::{scanner_cil, scanner_hdf5, scanner_nxtomo, xtekct};
+use conefield_tests::hostile::seeds::{CIL, scanner_cil, scanner_hdf5, scanner_nxtomo, scanner_toml, xtekct};
 use std::path::Path;
 
 const IMPORT: &str = "import scanner.toml -o scan";
@@ -61,7 +61,7 @@ pub fn cases() -> Vec<Case> {
             scanner_nxtomo(&d.join("."));
             put(
                 d.join("scanner.toml"),
-                conefield_tests::hostile::seeds::scanner_toml(FILE, "[cil]\nfile = \"counts.h5\"\n"),
+                scanner_toml(FILE, CIL),
             );
         }, IMPORT, [FILE, "entry1/tomo_entry"];
         "CIL: no file of that name",

@@ -115,6 +115,8 @@ fn the_demonstration_compares_three_ways() {
     assert_eq!(results.len(), 3);
     assert!(results.iter().all(|r| number(&r["scores"]["psnr"]).is_finite()));
     assert!(d.at("demo/compare.png").is_file());
+    assert!(!d.has("demo/fast/checkpoint.safetensors"));
+    assert_eq!(d.read("demo/fast/record.json")["init"], "demo/fast.safetensors");
     // Both fields make the same number of steps.
     assert_eq!(results[1]["steps"], results[2]["steps"]);
     let said = d.done("report demo -o page.html");

@@ -144,6 +144,7 @@ impl Folder {
         while !ready() && child.try_wait().unwrap().is_none() && Instant::now() < until {
             sleep(Duration::from_millis(2));
         }
+        assert!(Instant::now() < until, "{line}: never ready");
         signal(&child, name);
         let output = child.wait_with_output().unwrap();
         let said = String::from_utf8(output.stderr).unwrap();

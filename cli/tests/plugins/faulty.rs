@@ -518,9 +518,5 @@ fn page(rows: &[Row]) {
             let _ = writeln!(text, "| {what} | {by} | {said} |");
         }
     }
-    if std::env::var_os("CONEFIELD_BLESS").is_some() {
-        std::fs::write(&path, &text).unwrap();
-        return;
-    }
-    assert!(found == text, "{} is not current; CONEFIELD_BLESS=1 writes it\n{text}", path.display());
+    conefield_tests::blessed::check(&path, &text);
 }

@@ -21,7 +21,7 @@
 
 use crate::parse::{self, AnglesOption};
 use crate::simulation::Changes;
-use crate::study::layout::group;
+use crate::study::layout::run_name;
 use crate::study::method::{self, Method};
 use crate::study::simulation::Simulation;
 pub use crate::study::written::Protocol;
@@ -126,7 +126,7 @@ impl Study {
 
     /// The name of a run, CASE-seedS/METHOD, which is also its path.
     pub fn run_name(&self, cell: &Cell) -> String {
-        format!("{}/{}", group(&self.cases[cell.case].name, cell.seed), self.methods[cell.method].name)
+        run_name(&self.cases[cell.case].name, cell.seed, &self.methods[cell.method].name)
     }
 
     /// Input files and folders of the study, without its specs.
@@ -180,7 +180,7 @@ impl Reading<'_> {
             return Err(Error::invalid(at, "reference", format!("{r:?} and no scans"), expected));
         }
         ensure(!specs.is_empty(), &place, "specs", "none", "at least one")?;
-        let window = window.map_or(Ok(None), |w| checked(&self.at(&w), Some(w.into_inner())))?;
+        let window = window.map_or(Ok(None), |w| window_at(&self.at(&w), Some(w.into_inner())))?;
         let views: Vec<Option<usize>> = match views {
             Some(v) => self.distinct("views", Some(v), vec![])?.into_iter().map(|n| Some(n.get())).collect(),
             None => vec![None],
@@ -190,7 +190,7 @@ impl Reading<'_> {
         for entry in &volumes {
             let (at, Entry(volume)) = (self.at(entry), entry.get_ref());
             let name = named(&at, volume.name.as_deref(), &volume_name(&volume.volume))?;
-            let window = checked(&at, volume.window)?.or(window);
+            let window = window_at(&at, volume.window)?.or(window);
             for &views in &views {
                 let name = views.map_or(name.clone(), |n| format!("{name}-{n}views"));
                 let simulation = self.simulation(&at, volume, &simulate, views, &protocol)?;
@@ -201,7 +201,7 @@ impl Reading<'_> {
         for entry in &scans {
             let (at, Entry(scan)) = (self.at(entry), entry.get_ref());
             let name = named(&at, scan.name.as_deref(), &stem(&scan.scan))?;
-            let window = checked(&at, scan.window)?.or(window);
+            let window = window_at(&at, scan.window)?.or(window);
             let source = self.scan(&at, scan, reference)?;
             add(&mut cases, &at, Case { name, source, window })?;
         }
@@ -325,6 +325,7 @@ fn named(at: &str, given: Option<&str>, own: &str) -> Result<String> {
     Ok(name.to_owned())
 }
 
+/// Adds a case. Refuses a name that is taken, or that the table needs.
 fn add(cases: &mut Vec<Case>, at: &str, case: Case) -> Result<()> {
     let free = cases.iter().all(|c| c.name.to_lowercase() != case.name.to_lowercase());
     let found = format!("{:?}, the name of another one", case.name);
@@ -335,8 +336,8 @@ fn add(cases: &mut Vec<Case>, at: &str, case: Case) -> Result<()> {
     Ok(())
 }
 
-/// A window at a place of the file.
-fn checked(at: &str, window: Option<[f32; 2]>) -> Result<Option<[f32; 2]>> {
+/// The window of an entry at a place of the file. Refuses one that is not in order.
+fn window_at(at: &str, window: Option<[f32; 2]>) -> Result<Option<[f32; 2]>> {
     if let Some(both @ [low, high]) = window {
         let fits = low.is_finite() && high.is_finite() && low < high;
         ensure(fits, at, "window", format!("{both:?}"), "two finite numbers, the first below the second")?;

@@ -90,6 +90,11 @@ pub fn group(case: &str, seed: u64) -> String {
     format!("{case}-seed{seed}")
 }
 
+/// The name of a run, CASE-seedS/METHOD, which is also its path.
+pub fn run_name(case: &str, seed: u64, method: &str) -> String {
+    format!("{}/{method}", group(case, seed))
+}
+
 /// Whether a study may have written `path`.
 fn known(path: &Path) -> bool {
     is_one_of(path, &FOLDERS, &FILES)

@@ -2,7 +2,7 @@
 
 use crate::machine::Machine;
 use crate::study::definition::{Cell, Protocol, Source, Study};
-use crate::study::layout::{Layout, group};
+use crate::study::layout::{Layout, run_name};
 use crate::study::method::Method;
 use crate::study::outcome::{COLUMNS, Column, Columns, Outcome};
 use crate::study::spread::Spread;
@@ -105,7 +105,7 @@ struct RunLine {
 
 impl RunLine {
     fn name(&self) -> String {
-        format!("{}/{}", group(&self.case, self.seed), self.method)
+        run_name(&self.case, self.seed, &self.method)
     }
 }
 

@@ -86,7 +86,7 @@ impl Simulation {
         let same = then.as_ref() == Some(&now)
             && scan.provenance["source"] == self.written
             && scan.provenance["prepared"] == prepared;
-        let expected = "a scan simulated as this study's file says; --force starts over";
+        let expected = "a scan simulated as this study's file says, from its volume as it is now; --force starts over";
         ensure(
             same,
             &place.display().to_string(),

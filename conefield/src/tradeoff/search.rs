@@ -100,8 +100,8 @@ pub struct Due<'a> {
 }
 
 impl Search {
-    /// Checks the folder: refuses one with other content, or with an earlier search that is neither to be replaced (`force`)
-    /// nor resumed. Returns the finished trials of a resumed search.
+    /// Checks the folder: refuses one with other content, or with an earlier search that is neither to be replaced
+    /// (`force`) nor resumed. Returns the finished trials of a resumed search.
     pub fn look(&self, folder: &Path, force: bool, resume: bool) -> Result<Vec<Over>> {
         let place = folder.display().to_string();
         let old = CONTENTS.entries(folder)?;

@@ -86,8 +86,9 @@ pub trait Penalty: Send {
     /// on the number of threads.
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]);
 
-    /// Where it keeps bounds and slab. `None` for a penalty that keeps coefficients from being negative and knows no
-    /// other bounds: clipping its result is no proximal map.
+    /// Where it keeps bounds and slab. A penalty that returns them keeps to all of them: [`Penalty::prox`] clips to
+    /// `bounds` and then to `each`, and [`Penalty::kernels`] is `None` with `each`. `None` for a penalty that keeps
+    /// coefficients from being negative and knows no other bounds: clipping its result is no proximal map.
     fn confines(&mut self) -> Option<&mut Confines> {
         None
     }
@@ -96,7 +97,7 @@ pub trait Penalty: Send {
     /// they are the default.
     ///
     /// # Errors
-    /// The penalty has no [`Penalty::confines`].
+    /// The penalty, or a part of a sum, has no [`Penalty::confines`].
     fn confine(&mut self, bounds: Bounds) -> Result<()> {
         let expected = "0 and no upper bound: this prior has no other bounds";
         let refused = || Error::invalid("spec", "scene.bounds", format!("{bounds} (in 1/mm)"), expected);
@@ -107,7 +108,7 @@ pub trait Penalty: Send {
     /// Gives each coefficient a lower and an upper bound of its own, within those of [`Penalty::confine`].
     ///
     /// # Errors
-    /// The penalty has no [`Penalty::confines`].
+    /// The penalty, or a part of a sum, has no [`Penalty::confines`].
     fn confine_each(&mut self, bounds: Arc<[Vec<f32>; 2]>) -> Result<()> {
         let (found, expected) =
             (format!("bounds of {} coefficients", bounds[0].len()), "none: this prior has the same bounds everywhere");

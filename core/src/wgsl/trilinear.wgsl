@@ -4,7 +4,8 @@ struct stage_Located {
     // Entry of the cell's first corner.
     base: u32,
     fraction: vec3<f32>,
-    // Derivative of the position in cells with respect to the point; 0 where it was clamped.
+    // Derivative of the position in cells with respect to the point; 0 where it was clamped. Levels of encoders have
+    // their own.
     slope: vec3<f32>,
 }
 
@@ -34,6 +35,6 @@ fn stage_trilinear_weight(l: stage_Located, c: u32) -> f32 {
 // 0, it is the derivative with respect to the position in cells.
 fn stage_moved(l: stage_Located, d: u32, end: f32) -> stage_Located {
     var moved = l;
-    moved.fraction[d] = end;
+    moved.fraction = select(l.fraction, vec3<f32>(end), vec3<u32>(0u, 1u, 2u) == vec3<u32>(d));
     return moved;
 }

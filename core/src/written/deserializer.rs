@@ -4,12 +4,12 @@ use super::node::{At, Entry, Is, Node};
 use super::suggest;
 use crate::error::Error;
 use serde::de::value::{BorrowedStrDeserializer, MapAccessDeserializer, StrDeserializer};
-use serde::de::{DeserializeSeed, MapAccess, SeqAccess, Unexpected, Visitor};
+use serde::de::{DeserializeSeed, Expected, MapAccess, SeqAccess, Unexpected, Visitor};
 use serde::{Deserializer, de, forward_to_deserialize_any};
 use serde_spanned::de::is_spanned;
 use std::fmt;
 
-/// The names of the fields of `serde_spanned`'s type. It takes borrowed names only.
+/// The names of the fields of `serde_spanned`'s type. That type takes borrowed names only.
 const SPANNED: [&str; 3] =
     ["$__serde_spanned_private_start", "$__serde_spanned_private_end", "$__serde_spanned_private_value"];
 
@@ -40,6 +40,50 @@ impl de::Error for Misfit {
     fn custom<T: fmt::Display>(message: T) -> Self {
         Self { at: None, path: vec![], message: message.to_string() }
     }
+
+    fn invalid_type(found: Unexpected<'_>, expected: &dyn Expected) -> Self {
+        let found = match found {
+            Unexpected::Bool(b) => b.to_string(),
+            Unexpected::Unsigned(n) => n.to_string(),
+            Unexpected::Signed(n) => n.to_string(),
+            Unexpected::Float(n) => n.to_string(),
+            Unexpected::Str(s) => format!("the text {s:?}"),
+            Unexpected::Seq => "a list".into(),
+            Unexpected::Map => "a table".into(),
+            Unexpected::Unit => "null".into(),
+            other => other.to_string(),
+        };
+        Self::custom(format_args!("{found}, expected {}", in_words(&expected.to_string())))
+    }
+
+    fn invalid_value(found: Unexpected<'_>, expected: &dyn Expected) -> Self {
+        Self::invalid_type(found, expected)
+    }
+
+    fn invalid_length(found: usize, expected: &dyn Expected) -> Self {
+        Self::custom(format_args!("a list of {found}, expected {}", in_words(&expected.to_string())))
+    }
+}
+
+/// What `serde` expects, without names of Rust's types.
+fn in_words(expected: &str) -> String {
+    let length = ["an array of length ", "a tuple of size "].iter().find_map(|start| expected.strip_prefix(start));
+    match (expected, length) {
+        (_, Some(length)) => return format!("a list of {length}"),
+        ("f32" | "f64", _) => "a number",
+        ("u8", _) => "a whole number from 0 to 255",
+        ("u16", _) => "a whole number from 0 to 65535",
+        ("u32", _) => "a whole number from 0 to 4294967295",
+        ("u64" | "usize", _) => "a whole number that is not negative",
+        ("i8" | "i16" | "i32" | "i64", _) => "a whole number",
+        ("a boolean", _) => "true or false",
+        ("a string", _) => "a text",
+        ("a sequence", _) => "a list",
+        ("a map", _) => "a table",
+        (other, _) if other.starts_with("struct ") => "a table",
+        (other, _) => other,
+    }
+    .into()
 }
 
 impl Misfit {
@@ -53,7 +97,7 @@ impl Misfit {
     fn below(self, at: &At, step: &dyn fmt::Display) -> Self {
         let mut new = self.at(at);
         let step = step.to_string();
-        // No key of the text.
+        // The text has no such key.
         if spanned_field(&step).is_none() {
             new.path.push(step);
         }
@@ -86,22 +130,6 @@ impl Misfit {
 }
 
 impl Node {
-    /// What errors call the value.
-    fn unexpected(&self) -> Unexpected<'_> {
-        match &self.kind {
-            Is::Null => Unexpected::Unit,
-            Is::Bool(b) => Unexpected::Bool(*b),
-            Is::Number(n) => match (n.as_u64(), n.as_i64()) {
-                (Some(n), _) => Unexpected::Unsigned(n),
-                (_, Some(n)) => Unexpected::Signed(n),
-                _ => Unexpected::Float(n.as_f64().unwrap_or(f64::NAN)),
-            },
-            Is::String(s) | Is::Date(s) => Unexpected::Str(s),
-            Is::Array(_) => Unexpected::Seq,
-            Is::Table(_) => Unexpected::Map,
-        }
-    }
-
     /// The table from which `serde_spanned` reads the value and its place.
     fn spanned(&self) -> Self {
         let offset = || Is::Number(self.at.offset().unwrap_or(0).into());
@@ -163,7 +191,7 @@ impl<'de> Deserializer<'de> for &Node {
         };
         match &node.kind {
             Is::Table(entries) => visitor.visit_map(Entries { rest: entries, value: None }),
-            _ => Err(de::Error::invalid_type(node.unexpected(), &visitor)),
+            _ => Err(de::Error::custom(format_args!("{}, expected a table", node.shown()))),
         }
     }
 

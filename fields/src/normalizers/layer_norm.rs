@@ -131,9 +131,10 @@ struct RowMoments<T> {
 impl<R: Real> Back<'_, LayerNormStage, R> {
     #[inline(always)]
     fn found<S: Simd>(&self, s: S, i: usize) -> RowMoments<V<S, R>> {
-        let n = self.pass.x.rows;
-        let [mean, root, scale] = [0, 1, 2].map(|c| &self.pass.tape.data[c * n..(c + 1) * n]);
-        let [mean, root, scale] = [load(s, mean, i), load(s, root, i), load(s, scale, i)];
+        let tape = Tile::new(&*self.pass.tape.data, self.pass.x.rows);
+        let mean = load(s, tape.channel(0), i);
+        let root = load(s, tape.channel(1), i);
+        let scale = load(s, tape.channel(2), i);
         RowMoments { first: load(s, self.pass.x.channel(0), i) * scale, mean, root, scale }
     }
 

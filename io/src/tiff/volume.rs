@@ -248,10 +248,12 @@ mod tests {
         // The folder of a scan is not a volume.
         std::fs::write(at("scanner.toml"), "").unwrap();
         assert!(!is_volume(dir.path()));
-
         let refused = |words: &[&str]| {
             says(read_volume(dir.path()), words);
         };
+        refused(&["volume", "the folder of a scan"]);
+        std::fs::remove_file(at("scanner.toml")).unwrap();
+
         write(&at("s3.tif"), 2, None);
         refused(&["slices", "4 files like s1.tif"]);
         let mut w = TiffEncoder::new(File::create(at("s3.tif")).unwrap()).unwrap();

@@ -21,6 +21,7 @@
 //! - **Determinism.** Results must not depend on threads, on time, or on how rows are divided into tiles.
 
 use std::ffi::c_void;
+use std::mem;
 
 /// Defines tables of functions, each a pointer that is NULL if the function is absent. A plugin without one that is
 /// `required` is refused. `since` gives the minor version that brought a function, where it is not the first.
@@ -40,6 +41,8 @@ macro_rules! tables {
             pub size: usize,
             $($(#[$doc])* pub $name: Option<unsafe extern "C" fn($($argument: $type),*) $(-> $result)?>,)*
         }
+
+        const _: () = assert!(mem::offset_of!($table, size) == 0 && $table::FIRST_SIZE <= size_of::<$table>());
 
         impl $table {
             /// Bytes of this table in the first minor version.

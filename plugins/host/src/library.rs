@@ -345,7 +345,7 @@ impl Drop for Handle {
 }
 
 impl Handle {
-    /// The stage's own description; its type if it has none. A panic is an error, as in every function.
+    /// The stage's own description; its type if it has none. A panic is an error.
     pub fn describe(&self) -> Result<String> {
         let mut text = Text::new();
         // SAFETY: the stage is alive.

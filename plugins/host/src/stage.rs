@@ -11,7 +11,7 @@ pub mod prior;
 pub mod projector;
 pub mod regularizer;
 
-// The adapters begin with these imports, too.
+// The modules of the kinds take these imports by `use super::*`.
 use crate::library::{Handle, Text, Type, text, whole_text};
 use crate::spec::settings;
 use crate::trial::{GUARD, Guarded, Marked, below_zero, drawn, settled, timed};

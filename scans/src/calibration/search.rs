@@ -247,8 +247,8 @@ pub(crate) struct Steps<'a> {
 }
 
 impl Steps<'_> {
-    /// From `start`, moves by the first of ever shorter parts of each `step` at which `error` falls. Ends if it falls at
-    /// none, or after a short step. Returns the last correction with what is found there.
+    /// From `start`, moves by the first of ever shorter parts of each `step` at which `error` falls. Ends if there is no
+    /// step, if the error falls at none of its parts, or after a short step. Returns the last correction with what is found there.
     pub fn down<T>(
         &self,
         start: Correction,
@@ -257,7 +257,9 @@ impl Steps<'_> {
         step: &mut NextStep<'_, T>,
     ) -> Result<(Correction, T)> {
         let mut here = (start, at(&start)?);
-        'steps: for _ in 0..self.rounds.min(self.rounds * self.active.len()) {
+        // Without parameters there is nothing to fit.
+        let rounds = if self.active.is_empty() { 0 } else { self.rounds };
+        'steps: for _ in 0..rounds {
             let Some(step) = step(&here)? else { break };
             let longest = step.iter().fold(0.0f64, |m, s| m.max(s.abs()));
             let mut share = (LONGEST / longest.max(1e-12)).min(1.0);

@@ -99,6 +99,9 @@ impl Plan for Fdk {
         check(&orbit, &upright, job.scan.geometry.volume, axis.as_ref())?;
         axis.iter().for_each(|axis| observer.note(&axis.describe()));
         observer.note(&orbit.describe());
+        if job.limits.steps.is_some() {
+            observer.note("fdk is one step: a limit of steps does not change it");
+        }
         doubts(job.scan, &orbit, &upright, axis.as_ref()).iter().for_each(|line| observer.warn(line));
         let (geometry, measured) = orbit.symmetric(&job.scan.geometry);
         let upright = &orbit.symmetric(&upright).0;

@@ -24,7 +24,8 @@ use std::time::Instant;
 pub struct Pass {
     /// `‖p − A·x‖²` over all views, each with the volume at the time of its update.
     pub residual: f64,
-    /// Root mean square change of the volume relative to its root mean square, if the method knows it.
+    /// Root mean square change of the volume relative to its root mean square. The driver adds it for a
+    /// method that does not know it, if the run can end by it.
     pub change: Option<f64>,
     /// The value of the prior, if there is one.
     pub prior: Option<f64>,
@@ -32,7 +33,8 @@ pub struct Pass {
 
 /// The state of an iterative method.
 pub trait Iteration {
-    /// Whether its passes say how much the volume changed. If not, that costs a volume where a run ends by it.
+    /// Whether every [`Pass`] has its `change`. If not, and the run can end by the change, the driver measures it, with
+    /// one more volume.
     fn knows_change(&self) -> bool {
         true
     }

@@ -82,14 +82,20 @@ impl With<'static> {
 pub const WIDTHS: [usize; 4] = [1, 3, 8, 20];
 
 /// Checks every stage type that the crate `package` registers, for the tests of a plugin: with the settings of its
-/// registration, and with the `examples` of its schema.
+/// registration, unless they are incomplete, and with the `examples` of its schema.
 pub fn check_package(package: &str) -> Result<Vec<Report>> {
     let mut reports = vec![];
     for t in stage_types() {
         if matches!(t.origin, Origin::Linked { package: own, .. } if own == package) {
-            let mut tries = vec![t.example()];
-            tries.extend(t.schema()["examples"].as_array().into_iter().flatten().cloned());
+            let (schema, own) = (t.schema(), t.example());
+            let mut needed = schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str);
+            let mut tries = vec![];
+            if needed.all(|key| own.get(key).is_some()) {
+                tries.push(own);
+            }
+            tries.extend(schema["examples"].as_array().into_iter().flatten().cloned());
             for mut settings in tries {
+                ensure(settings.is_object(), t.name, "examples", &settings, "tables of settings")?;
                 settings["type"] = t.name.into();
                 let found = check_type(t.kind, &settings, &With::ON_THE_HOST)?;
                 reports.extend(found.into_iter().map(|(_, report)| report));

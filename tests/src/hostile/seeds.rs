@@ -112,7 +112,7 @@ pub const VECTORS: &str = "[vectors]\ncone_vec = [\n  [500, 0, 0, -300, 0, 0, 0,
 pub const RTK: &str = "[rtk]\nfile = \"geometry.xml\"\npixel = { u = 2.0, v = 2.0 }\n";
 
 /// The table that names CIL's file.
-const CIL: &str = "[cil]\nfile = \"counts.h5\"\n";
+pub const CIL: &str = "[cil]\nfile = \"counts.h5\"\n";
 
 /// `scanner.toml` with `geometry` and counts in `counts`: the name of a file, or of an array in one.
 fn described(dir: &Path, counts: &str, geometry: &str) {

@@ -122,16 +122,7 @@ fn no_crate_needs_what_needs_it() {
     assert!(order.is_sorted(), "{row:?}");
     assert!(row["core"] == 0 && needs["io"].len() == 1, "file formats need only core: {:?}", needs["io"]);
     assert!(needs.len() <= 18, "sixteen library crates, the command and the Python package: {:?}", needs.keys());
-    let file = root().join("docs/images/crates.svg");
-    if std::env::var_os("CONEFIELD_BLESS").is_some() {
-        std::fs::write(&file, picture(&needs)).unwrap();
-    }
-    let drawn = std::fs::read_to_string(&file).unwrap_or_default();
-    assert_eq!(
-        drawn,
-        picture(&needs),
-        "CONEFIELD_BLESS=1 cargo test --release -p conefield-tests --test library crates"
-    );
+    conefield_tests::blessed::check(&root().join("docs/images/crates.svg"), &picture(&needs));
     // A circle is found.
     let mut wrong = needs.clone();
     wrong.get_mut("core").unwrap().insert("io".into());

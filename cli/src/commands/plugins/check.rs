@@ -174,6 +174,13 @@ impl Check {
             let expected = "--settings, or examples in its schema: it has settings without a default";
             ensure(!tries.is_empty(), &library.owner(), &t.name, "no settings to check", expected)?;
             for settings in tries {
+                ensure(
+                    settings.is_object(),
+                    &library.owner(),
+                    &t.name,
+                    &settings,
+                    "examples that are tables of settings",
+                )?;
                 let settings = with_defaults(&t.schema, settings);
                 let mut table = settings.clone();
                 table["type"] = t.name.clone().into();

@@ -10,6 +10,7 @@ use conefield_core::error::ensure;
 use conefield_core::{Result, written};
 use conefield_evaluation::report::page::{Notice, Page, PageRun, PageSpread};
 use conefield_evaluation::report::text::stem;
+use serde::Deserialize;
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -28,6 +29,14 @@ pub fn find(folders: &[PathBuf]) -> Result<Vec<RunOnDisk>> {
 }
 
 fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
+    #[derive(Deserialize)]
+    struct Comparison {
+        methods: Vec<Method>,
+    }
+    #[derive(Deserialize)]
+    struct Method {
+        name: String,
+    }
     std::fs::metadata(folder).map_err(|e| conefield_core::Error::io(folder, e))?;
     let place = folder.display().to_string();
     let table = folder.join("table.json");
@@ -36,15 +45,14 @@ fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
         ensure(RunOnDisk::is(folder), &place, "run", "no run", expected)?;
         return Ok(vec![folder.to_path_buf()]);
     }
-    let comparison: Value = read_json(&table)?;
+    let comparison: Comparison = read_json(&table)?;
     let mut runs = vec![];
     for case in cases(folder)? {
-        for method in comparison["methods"].as_array().into_iter().flatten() {
+        for method in &comparison.methods {
             // The name must be a plain folder name.
-            let name = method["name"].as_str().unwrap_or_default();
-            let plain = Path::new(name).components().count() == 1 && !name.starts_with('.');
-            ensure(plain, &table.display().to_string(), "name", format!("{name:?}"), "the name of a folder")?;
-            runs.extend(Some(case.join(name)).filter(|run| RunOnDisk::is(run)));
+            let plain = Path::new(&method.name).components().count() == 1 && !method.name.starts_with('.');
+            ensure(plain, &table.display().to_string(), "name", format!("{:?}", method.name), "the name of a folder")?;
+            runs.extend(Some(case.join(&method.name)).filter(|run| RunOnDisk::is(run)));
         }
     }
     ensure(!runs.is_empty(), &place, "runs", "none", "a comparison or a study with at least one run")?;
@@ -66,12 +74,22 @@ fn cases(folder: &Path) -> Result<Vec<PathBuf>> {
 
 /// Means and standard deviations over the seeds of the studies in `folders`.
 pub fn spreads(folders: &[PathBuf]) -> Result<Vec<PageSpread>> {
+    #[derive(Deserialize)]
+    struct Study {
+        #[serde(default)]
+        summary: Vec<Line>,
+    }
+    #[derive(Deserialize)]
+    struct Line {
+        case: String,
+        method: String,
+        figures: Value,
+    }
     let tables = folders.iter().map(|f| f.join("table.json")).filter(|t| t.is_file());
-    let studies = tables.map(|t| read_json::<Value>(&t)).collect::<Result<Vec<_>>>()?;
-    let lines = studies.iter().flat_map(|study| study["summary"].as_array()).flatten();
-    let text = |line: &Value, key: &str| line[key].as_str().unwrap_or_default().to_owned();
-    let name = |line: &Value| format!("{}/{}", text(line, "case"), text(line, "method"));
-    Ok(lines.map(|line| PageSpread { name: name(line), figures: line["figures"].clone() }).collect())
+    let studies = tables.map(|t| read_json::<Study>(&t)).collect::<Result<Vec<_>>>()?;
+    let lines = studies.into_iter().flat_map(|s| s.summary);
+    let spread = |l: Line| PageSpread { name: format!("{}/{}", l.case, l.method), figures: l.figures };
+    Ok(lines.map(spread).collect())
 }
 
 /// The runs of the page, with unique names.
@@ -121,13 +139,14 @@ fn plan(run: &RunOnDisk) -> Result<String> {
 /// Names of the specs; if these are ambiguous, of the folders, of the folders in their parents as in a study, or else
 /// full paths.
 fn names(found: &[RunOnDisk]) -> Vec<String> {
+    #[derive(Deserialize)]
+    struct Named {
+        name: String,
+    }
     // An unfinished run has no record yet.
     let own = |run: &RunOnDisk| {
         let named = run.spec_name().map(str::to_owned);
-        let named = named.or_else(|| {
-            let spec: Value = written::read("spec.toml", &run.spec).ok()?;
-            spec["name"].as_str().map(str::to_owned)
-        });
+        let named = named.or_else(|| written::read("spec.toml", &run.spec).ok().map(|n: Named| n.name));
         named.unwrap_or_else(|| stem(&run.folder.display().to_string()))
     };
     let whole = |run: &RunOnDisk| run.folder.canonicalize().unwrap_or_default();

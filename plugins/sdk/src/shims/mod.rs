@@ -15,7 +15,7 @@ pub mod prior;
 pub mod projector;
 pub mod regularizer;
 
-// The shims of each kind begin with these imports, too.
+// The modules of the kinds take these imports by `use super::*`.
 use crate::built::{Named, OnGrid, Part, settings};
 use conefield_core::prelude::*;
 use conefield_core::registry::{Kind, StageType};
@@ -26,7 +26,7 @@ use std::ffi::c_void;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::{mem, ptr, slice};
 
-/// Defines the table of a kind, with these functions; the constructors of its kinds, each called as its kind; and the
+/// Defines the table of a kind, with these functions; a constructor for each of its kinds, with the kind's name; and the
 /// parts that the functions take, each with its name in errors.
 macro_rules! table {
     (

@@ -34,7 +34,7 @@ fn kind(buffer: &str) -> &'static str {
     }
 }
 
-/// A program that reads uniform values and buffers, and writes others: atomic numbers, if that is the word before the name.
+/// A program that reads uniform values and buffers, and writes others. `atomic NAME` is the buffer NAME of atomic numbers.
 fn program(label: &str, uniforms: &[&str], read: &[&str], write: &[&str], pieces: &[(&str, &str)]) -> Program {
     let mut source = Source::default();
     for (names, access) in [(uniforms, Access::Uniform), (read, Access::Read), (write, Access::Write)] {
