@@ -39,7 +39,7 @@ fn a_mask_that_has_changed_is_noticed() {
     let last = bytes.len() - 2;
     bytes[last] ^= 1;
     d.put("mask.nii", &bytes);
-    d.refused_with(1, &format!("{line} --resume"), &["--resume: files", "mask.nii"]);
+    d.refused_with(1, &format!("{line} --resume"), &["--resume: file mask.nii"]);
 }
 
 #[test]

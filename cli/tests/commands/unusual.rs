@@ -180,10 +180,10 @@ fn views_that_are_no_circle_are_read_drawn_and_reconstructed() {
     d.refuses("r2", &[("convert free r2 --to r2", "circle")]);
     // Too far from a circle for the start from FDK.
     for (i, view) in scan.geometry.views.iter_mut().enumerate() {
-        (0..2).for_each(|k| view.source[k] *= 1.0 + 0.02 * i as f64);
+        (view.source[2], view.detector[2]) = (view.source[2] + 40.0 * i as f64, view.detector[2] + 40.0 * i as f64);
     }
-    write_scan(d.at("spiral"), &scan, None).unwrap();
-    d.refuses("g", &[("reconstruct spiral --spec gaussians -o g", "gaussians start from fdk")]);
+    write_scan(d.at("helix"), &scan, None).unwrap();
+    d.refuses("g", &[("reconstruct helix --spec gaussians -o g", "gaussians start from fdk")]);
     d.done(&format!("reconstruct rtk --spec fast -o run {SMALL} --steps 8"));
 }
 
