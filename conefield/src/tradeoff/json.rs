@@ -17,9 +17,12 @@ pub fn to_json(value: &impl Serialize) -> Result<String> {
 pub fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T> {
     let text = conefield_core::files::read_text(path, LONGEST)?;
     written::read(&path.display().to_string(), &text).map_err(|e| match e {
-        Error::Invalid { place, field, found, expected } => {
-            Error::invalid(place, field, found, expected + ", as conefield writes it; --force starts over")
-        }
+        Error::Invalid { place, field, found, expected } => Error::invalid(
+            place,
+            field,
+            found,
+            expected + ", as conefield writes it; the command that wrote it starts over with --force",
+        ),
         other => other,
     })
 }
