@@ -18,7 +18,7 @@ use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::Table;
 use conefield_io::{Contents, Lease, Progressed};
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 use std::fs;
 use std::path::{Path, PathBuf};
 use tracing::info;
@@ -88,15 +88,9 @@ struct Shared<'a> {
 struct Entry {
     name: String,
     spec: String,
-    #[serde(serialize_with = "displayed")]
-    run: PathBuf,
+    run: String,
     #[serde(flatten)]
     outcome: Outcome,
-}
-
-/// Writes a path whose name may not be UTF-8.
-fn displayed<S: Serializer>(path: &Path, to: S) -> std::result::Result<S::Ok, S::Error> {
-    to.collect_str(&path.display())
 }
 
 impl CompareArgs {
@@ -128,7 +122,7 @@ impl CompareArgs {
         conefield_io::write_text_atomic(self.output.join("table.json"), &out::to_json(&report)?)?;
         conefield_io::write_text_atomic(self.output.join("table.md"), &table.markdown())?;
         let path = self.output.join("compare.png");
-        let drawn = pictures::slices(&path, reference.as_ref(), &shown(&report.methods), None)?;
+        let drawn = pictures::slices(&path, reference.as_ref(), &self.shown(&report.methods), None)?;
         lease.complete()?;
         if self.json {
             out::json(&report)?;
@@ -173,7 +167,21 @@ impl CompareArgs {
         info!("{part}{}", if start == Start::Done { " is already finished" } else { "" });
         let trial = self.trial(method);
         let outcome = Outcome::of_run(&trial.output, trial.run(start, part, general)?)?;
-        Ok(Entry { name: method.name.clone(), spec: method.spec.clone(), run: trial.output, outcome })
+        Ok(Entry {
+            name: method.name.clone(),
+            spec: method.spec.clone(),
+            run: trial.output.display().to_string(),
+            outcome,
+        })
+    }
+
+    /// The results, for a picture.
+    fn shown(&self, entries: &[Entry]) -> Vec<Shown> {
+        let shown = |e: &Entry| {
+            let (psnr, run) = (e.outcome.figures.as_ref()?.psnr(), self.output.join(&e.name));
+            Some(Shown { name: e.name.clone(), psnr, run })
+        };
+        entries.iter().filter_map(shown).collect()
     }
 
     /// Refuses to replace an input.
@@ -208,12 +216,6 @@ impl CompareArgs {
             memory_limit: general.memory,
         }
     }
-}
-
-/// The results, for a picture.
-fn shown(entries: &[Entry]) -> Vec<Shown> {
-    let results = entries.iter().filter_map(|e| Some((e, e.outcome.figures.as_ref()?)));
-    results.map(|(e, f)| Shown { name: e.name.clone(), psnr: f.psnr(), run: e.run.clone() }).collect()
 }
 
 /// The contents of a comparison's folder.

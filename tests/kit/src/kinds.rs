@@ -87,15 +87,7 @@ pub fn check_package(package: &str) -> Result<Vec<Report>> {
     let mut reports = vec![];
     for t in stage_types() {
         if matches!(t.origin, Origin::Linked { package: own, .. } if own == package) {
-            let (schema, own) = (t.schema(), t.example());
-            let mut needed = schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str);
-            let mut tries = vec![];
-            if needed.all(|key| own.get(key).is_some()) {
-                tries.push(own);
-            }
-            tries.extend(schema["examples"].as_array().into_iter().flatten().cloned());
-            for mut settings in tries {
-                ensure(settings.is_object(), t.name, "examples", &settings, "tables of settings")?;
+            for mut settings in tried(t.name, &t.schema(), t.example())? {
                 settings["type"] = t.name.into();
                 let found = check_type(t.kind, &settings, &With::ON_THE_HOST)?;
                 reports.extend(found.into_iter().map(|(_, report)| report));
@@ -104,6 +96,20 @@ pub fn check_package(package: &str) -> Result<Vec<Report>> {
     }
     ensure(!reports.is_empty(), package, "stages", "none", "at least one registered stage type")?;
     Ok(reports)
+}
+
+/// The settings with which a type called `name` is tried: `own`, unless some that its `schema` requires are missing, and
+/// the schema's `examples`, which must be tables.
+pub fn tried(name: &str, schema: &Value, own: Value) -> Result<Vec<Value>> {
+    let mut required = schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str);
+    let mut all = vec![];
+    if required.all(|key| own.get(key).is_some()) {
+        all.push(own);
+    }
+    all.extend(schema["examples"].as_array().into_iter().flatten().cloned());
+    let other = all.iter().find(|settings| !settings.is_object());
+    other.map_or(Ok(()), |found| Err(Error::invalid(name, "examples", found, "tables of settings")))?;
+    Ok(all)
 }
 
 /// Builds a stage of `kind` from `settings`, which include its type and are checked as those in a spec are, and runs the

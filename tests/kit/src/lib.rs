@@ -32,7 +32,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 pub use bases::check_basis;
 pub use data_terms::check_data_term;
-pub use kinds::{WIDTHS, With, check_package, check_type};
+pub use kinds::{WIDTHS, With, check_package, check_type, tried};
 pub use losses::{check_loss, check_loss_wgsl};
 pub use priors::{check_prior, check_prior_wgsl};
 pub use rays::check_projector;

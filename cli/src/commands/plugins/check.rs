@@ -4,7 +4,7 @@ use crate::{out, program};
 use clap::Args;
 use conefield::{parse, plugins};
 use conefield_backend_wgpu::Wgpu;
-use conefield_conformance::{Options, Report, WIDTHS, With, check_type};
+use conefield_conformance::{Options, Report, WIDTHS, With, check_type, tried};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::Kind;
 use conefield_core::runner::Runner;
@@ -167,20 +167,11 @@ impl Check {
         for t in library.types.iter().filter(|t| self.name.as_ref().is_none_or(|n| *n == t.name)) {
             let mut tries: Vec<Value> = self.settings.clone();
             if tries.is_empty() {
-                let needed = t.schema["required"].as_array().is_some_and(|r| !r.is_empty());
-                tries.extend((!needed).then(|| serde_json::json!({})));
-                tries.extend(t.schema["examples"].as_array().into_iter().flatten().cloned());
+                tries = tried(&t.name, &t.schema, serde_json::json!({}))?;
             }
             let expected = "--settings, or examples in its schema: it has settings without a default";
             ensure(!tries.is_empty(), &library.owner(), &t.name, "no settings to check", expected)?;
             for settings in tries {
-                ensure(
-                    settings.is_object(),
-                    &library.owner(),
-                    &t.name,
-                    &settings,
-                    "examples that are tables of settings",
-                )?;
                 let settings = with_defaults(&t.schema, settings);
                 let mut table = settings.clone();
                 table["type"] = t.name.clone().into();
