@@ -74,7 +74,7 @@ fn in_words(expected: &str) -> String {
         ("u8", _) => "a whole number from 0 to 255",
         ("u16", _) => "a whole number from 0 to 65535",
         ("u32", _) => "a whole number from 0 to 4294967295",
-        ("u64" | "usize", _) => "a whole number that is not negative",
+        ("u64" | "usize", _) => "a whole number from 0 to 18446744073709551615",
         ("i8" | "i16" | "i32" | "i64", _) => "a whole number",
         ("a boolean", _) => "true or false",
         ("a string", _) => "a text",
