@@ -15,6 +15,7 @@ use conefield_evaluation::report::text::bytes;
 use conefield_io::{Contents, Lease, Progressed};
 use serde::Deserialize;
 use serde_json::Value;
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -158,6 +159,10 @@ pub struct Recorded {
     #[serde(default)]
     pub budget_s: Option<f64>,
     pub reference: Option<String>,
+    #[serde(default)]
+    pub reference_fnv1a64: Option<String>,
+    #[serde(default)]
+    pub files: BTreeMap<String, String>,
     #[serde(default)]
     pub plugins: Vec<Used>,
     #[serde(default)]

@@ -7,7 +7,7 @@ use conefield_core::backend::Backend;
 use conefield_core::error::ensure;
 use conefield_core::method::{Job, Limits};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, checksum};
 use conefield_io::{DataSet, Parts};
 use conefield_scans::diagnosis::survey;
 use std::path::Path;
@@ -23,6 +23,8 @@ pub struct Input {
     pub held: Vec<usize>,
     /// The reference volume, if known.
     pub reference: Option<Volume>,
+    /// Checksum of the voxels of the reference.
+    pub reference_fnv1a64: Option<String>,
     /// The data range of scores.
     pub peak: f64,
 }
@@ -41,7 +43,8 @@ impl Input {
             let (scan, aside) = whole.split(&held)?;
             (Arc::new(scan), Some(aside))
         };
-        Ok(Self { scan, aside, held, reference, peak })
+        let reference_fnv1a64 = reference.as_ref().map(|r| checksum::of_numbers(&r.data));
+        Ok(Self { scan, aside, held, reference, reference_fnv1a64, peak })
     }
 
     /// The job of a method, with the limits of `schedule` in addition to `limits`.

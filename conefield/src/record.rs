@@ -14,6 +14,7 @@ use conefield_evaluation::hounsfield::Levels;
 use conefield_evaluation::metrics::Scores;
 use conefield_evaluation::report::text::stem;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Everything needed to repeat a run, and its result.
@@ -42,6 +43,12 @@ pub struct RunRecord {
     pub init: Option<String>,
     /// The reference.
     pub reference: Option<String>,
+    /// Checksum of the voxels of the reference.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reference_fnv1a64: Option<String>,
+    /// Checksums of the files that the spec names.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub files: BTreeMap<String, String>,
     /// Water and air of volume-hu.nii.gz, per unit of the scan.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hounsfield: Option<Levels>,

@@ -24,6 +24,7 @@ use conefield_core::{Error, Result};
 use conefield_evaluation::metrics::Scores;
 use conefield_evaluation::report::text::bytes;
 use std::cell::Cell;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
@@ -266,6 +267,8 @@ impl<'a> Run<'a> {
             plan: self.schedule.clone(),
             init: None,
             reference: None,
+            reference_fnv1a64: self.input.reference_fnv1a64.clone(),
+            files: BTreeMap::new(),
             hounsfield: None,
             plugins: plugins::used(&method.loaded.tree),
             backend,

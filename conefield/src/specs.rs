@@ -5,8 +5,9 @@ pub use crate::shipped::{FAST_WEIGHTS, SHIPPED};
 use conefield_core::method::Plan;
 use conefield_core::registry;
 use conefield_core::spec::load::{Draft, Loaded, to_toml};
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, checksum};
 use std::collections::BTreeMap;
+use std::path::Path;
 
 /// All names of specs: built-in ones, and methods that need no settings.
 pub fn names() -> Vec<&'static str> {
@@ -51,6 +52,12 @@ pub fn notes(loaded: &Loaded, seed: u64) -> Result<BTreeMap<String, String>> {
     ]);
     notes.extend(plugins::identity(&plugins::used(&loaded.tree)));
     Ok(notes)
+}
+
+/// Checksums of the files, not folders, that a spec names.
+pub fn checksums(loaded: &Loaded) -> Result<BTreeMap<String, String>> {
+    let files = loaded.data_files().into_iter().filter(|name| Path::new(name).is_file());
+    files.map(|name| Ok((name.clone(), checksum::of_file(Path::new(&name))?))).collect()
 }
 
 /// Refuses a setting that needs held-out views if `held` is empty.

@@ -116,7 +116,7 @@ impl CompareArgs {
             let why: Vec<String> = entries.iter().map(why).collect();
             return Err(Error::unsupported("compare: every method failed", why.join("; ")));
         }
-        let TrialInput { scan, held, reference, peak } = input;
+        let TrialInput { scan, held, reference, peak, .. } = input;
         let report = Report { protocol: self.shared(scan, held, peak, general), methods: entries };
         let table = table(&report);
         conefield_io::write_text_atomic(self.output.join("table.json"), &out::to_json(&report)?)?;

@@ -22,7 +22,6 @@ use conefield::{files, ranks, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
-use conefield_core::checksum;
 use conefield_core::method::Record;
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::{Loaded, to_toml};
@@ -32,7 +31,7 @@ use conefield_evaluation::report::MiddleSlices;
 use conefield_evaluation::report::text::bytes;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 /// Reconstruct a volume from a scan.
@@ -140,7 +139,8 @@ impl ReconstructArgs {
         memory::allow_scratch(conefield_io::folder_of(&self.output));
         let backend = self.protocol.backend.open()?;
         let session = self.session(backend.as_ref(), begin)?;
-        let (input, _, resume) = self.input(&session)?;
+        let (input, _, earlier) = self.input(&session)?;
+        let resume = earlier.map(|(resume, _)| resume);
         let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
         let mut run = session.plan(input, spent, &|| false)?;
         signals::listen();
@@ -184,7 +184,8 @@ impl ReconstructArgs {
             _ => inputs,
         };
         inputs.spare_folder(&self.output)?;
-        let (input, scan, resume) = self.input(&session)?;
+        let (input, scan, earlier) = self.input(&session)?;
+        let (resume, files) = earlier.unzip();
         conefield_io::check_shape(folder.file("volume.nii.gz"), input.scan.geometry.volume.shape)?;
         let affine = input.reference.as_ref().and_then(|r| r.affine);
         let (unit, grid) = (&input.scan.unit, &input.scan.geometry.volume);
@@ -193,7 +194,8 @@ impl ReconstructArgs {
         let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
         let mut run = session.plan(input, spent, &|| signals::caught().is_some())?;
         let loaded = &run.method.loaded;
-        let identity = identity_to_resume(loaded, &self.protocol, &run.input.held, &scan)?;
+        let files = files.map_or_else(|| specs::checksums(loaded), Ok)?;
+        let identity = identity(loaded, &self.protocol, &run.input.held, &scan, &files)?;
         signals::listen();
         // The parent process has ended, and nothing of this run has been written yet.
         if signals::caught().is_some() {
@@ -218,7 +220,7 @@ impl ReconstructArgs {
         drop(progress);
 
         let (record, failed) =
-            self.results(&folder, &run, &solved, hu.as_ref(), &scan, last.as_ref(), backend.as_ref())?;
+            self.results(&folder, &run, &solved, hu.as_ref(), &scan, files, last.as_ref(), backend.as_ref())?;
         let picture = folder.file("slices.png");
         if let Some(Err(e)) = board.map(|mut board| board.picture(solved.solution.steps, "slices", &picture)) {
             tracing::warn!("{e}");
@@ -240,6 +242,7 @@ impl ReconstructArgs {
         solved: &Solved,
         hu: Option<&Calibration>,
         scan: &ScanRecord,
+        files: BTreeMap<String, String>,
         last: Option<&Record>,
         backend: &dyn Backend,
     ) -> Result<(RunRecord, Option<Error>)> {
@@ -257,6 +260,7 @@ impl ReconstructArgs {
             scan: Some(scan.clone()),
             init: self.init.as_ref().map(|init| init.display().to_string()),
             reference: self.protocol.named_reference(),
+            files,
             hounsfield,
             ..run.record(solved, last, written)
         };
@@ -293,18 +297,19 @@ impl ReconstructArgs {
         Session::open(request, backend, run, begin)
     }
 
-    /// Reads all inputs, and the checkpoint that a resumed run continues from.
-    fn input(&self, session: &Session<'_>) -> Result<(Input, ScanRecord, Option<Resume>)> {
+    /// Reads all inputs, and the checkpoint that a resumed run continues from, with the checksums of its spec's files.
+    fn input(&self, session: &Session<'_>) -> Result<(Input, ScanRecord, Option<Earlier>)> {
         let (whole, reference) = session.reading(|| input::read(&self.scan, self.protocol.reference.as_deref()))?;
         let (input, record) = self.protocol.input(&self.scan, whole, reference)?;
-        let resume = match session.requested() {
+        let earlier = match session.requested() {
             Some(loaded) if self.resume => {
-                let identity = identity_to_resume(loaded, &self.protocol, &input.held, &record)?;
-                Some(files::read_checkpoint(&self.output.join(CHECKPOINT), &identity)?)
+                let files = specs::checksums(loaded)?;
+                let identity = identity(loaded, &self.protocol, &input.held, &record, &files)?;
+                Some((files::read_checkpoint(&self.output.join(CHECKPOINT), &identity)?, files))
             }
             _ => None,
         };
-        Ok((input, record, resume))
+        Ok((input, record, earlier))
     }
 
     /// Display and recording of the run.
@@ -331,6 +336,9 @@ impl ReconstructArgs {
         self.spec.clone().or_else(|| self.resume.then(chosen))
     }
 }
+
+/// A checkpoint, and the checksums of the files that its spec names.
+type Earlier = (Resume, BTreeMap<String, String>);
 
 /// Begins a run in its folder, or resumes it. Returns its file of metrics, and the last record that it keeps.
 fn begin_or_go_on(
@@ -368,29 +376,16 @@ fn write(folder: &RunFolder, run: &Run<'_>, solved: &Solved, seed: u64, backend:
     Ok(Written { parameters, export_s, picture_s, score_s, scores })
 }
 
-/// Properties that must match to resume a run or to count it as finished.
+/// Properties that must match to resume a run or to count it as finished; `files` are the checksums of the spec's files.
 pub fn identity(
     loaded: &Loaded,
     protocol: &RunProtocol,
     held: &[usize],
     scan: &ScanRecord,
+    files: &BTreeMap<String, String>,
 ) -> Result<BTreeMap<String, String>> {
     let mut all = specs::notes(loaded, protocol.seed)?;
-    all.extend(conditions(scan, held, &protocol.ends, protocol.budget)?);
-    Ok(all)
-}
-
-/// The [`identity`] of a run that may be resumed: with the content of the files that its spec names.
-pub fn identity_to_resume(
-    loaded: &Loaded,
-    protocol: &RunProtocol,
-    held: &[usize],
-    scan: &ScanRecord,
-) -> Result<BTreeMap<String, String>> {
-    let mut all = identity(loaded, protocol, held, scan)?;
-    for name in loaded.data_files().into_iter().filter(|name| Path::new(name).is_file()) {
-        all.insert(format!("file {name}"), checksum::of_file(Path::new(&name))?);
-    }
+    all.extend(conditions(scan, held, &protocol.ends, protocol.budget, files)?);
     Ok(all)
 }
 
@@ -400,12 +395,14 @@ pub fn conditions(
     held: &[usize],
     ends: &EndOptions,
     budget: Option<f64>,
-) -> Result<[(String, String); 5]> {
-    Ok([
+    files: &BTreeMap<String, String>,
+) -> Result<impl Iterator<Item = (String, String)>> {
+    let conditions = [
         ("projections".into(), scan.projections_fnv1a64.clone()),
         ("geometry".into(), scan.geometry_fnv1a64.clone()),
         ("held_out_views".into(), format!("{held:?}")),
         ("limits".into(), out::to_json(ends)?),
         ("budget".into(), budget.map_or("none".into(), |s| s.to_string())),
-    ])
+    ];
+    Ok(conditions.into_iter().chain(files.iter().map(|(name, sum)| (format!("file {name}"), sum.clone()))))
 }

@@ -2,12 +2,12 @@
 
 use super::General;
 use super::protocol::{RunProtocol, word};
-use super::reconstruct::{FAILED, conditions, identity, identity_to_resume};
+use super::reconstruct::{FAILED, conditions, identity};
 use crate::run_folder::Recorded;
 use crate::{program, signals};
 use conefield::tradeoff::json::LONGEST;
 use conefield::tradeoff::trial::TrialInput;
-use conefield::{files, input, plugins};
+use conefield::{files, input, plugins, specs};
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::Loaded;
 use conefield_core::{Error, Result};
@@ -16,6 +16,9 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
+
+/// What a changed reference is called in errors.
+const REFERENCE: &str = "voxels of the reference";
 
 /// One run.
 pub struct Trial<'a> {
@@ -57,10 +60,11 @@ impl Trial<'_> {
         if !output.exists() {
             return Ok(Start::Anew);
         }
-        let (held, scan) = (&input.held, &input.scan);
+        let now = || identity(loaded, protocol, &input.held, &input.scan, &specs::checksums(loaded)?);
         if is_done(output) {
-            let mut now = identity(loaded, protocol, held, scan)?;
+            let mut now = now()?;
             now.insert("reference".into(), Value::from(protocol.named_reference()).to_string());
+            now.insert(REFERENCE.into(), Value::from(input.reference_fnv1a64.clone()).to_string());
             now.insert("peak".into(), input.peak.to_string());
             now.insert("backend".into(), protocol.backend.kind().into());
             files::same_run(&output.join("record.json").display().to_string(), &recorded(output)?, &now)?;
@@ -68,7 +72,7 @@ impl Trial<'_> {
         }
         let checkpoint = output.join("checkpoint.safetensors");
         if checkpoint.exists() {
-            files::read_checkpoint(&checkpoint, &identity_to_resume(loaded, protocol, held, scan)?)?;
+            files::read_checkpoint(&checkpoint, &now()?)?;
             return Ok(Start::Resuming);
         }
         Ok(Start::Replacing)
@@ -124,10 +128,11 @@ fn recorded(folder: &Path) -> Result<BTreeMap<String, String>> {
         ("seed".into(), known.seed.to_string()),
         ("spec".into(), conefield_core::files::read_text(&folder.join("spec.toml"), LONGEST)?),
         ("reference".into(), Value::from(known.reference).to_string()),
+        (REFERENCE.into(), Value::from(known.reference_fnv1a64).to_string()),
         ("peak".into(), known.peak.to_string()),
         ("backend".into(), backend.split(',').next().unwrap_or_default().into()),
     ]);
-    all.extend(conditions(&known.scan, &known.held_out_views, &known.limits, known.budget_s)?);
+    all.extend(conditions(&known.scan, &known.held_out_views, &known.limits, known.budget_s, &known.files)?);
     all.extend(plugins::identity(&known.plugins));
     Ok(all)
 }

@@ -101,6 +101,27 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
 }
 
 #[test]
+fn changed_files_of_a_finished_run_are_noticed() {
+    let convert = "convert scan/truth.nii.gz";
+    let d = Folder::after(&[SCAN, &format!("{convert} mask.nii"), &format!("{convert} reference.nii")]);
+    let line = compare("sirt", "--reference reference.nii --set 'scene.support={file=\"mask.nii\"}'");
+    d.done(&line);
+    let line = format!("{line} --resume");
+    let before = d.times("out/sirt");
+    for (file, want) in [("mask.nii", "file mask.nii"), ("reference.nii", "voxels of the reference")] {
+        let whole = d.bytes(file);
+        let mut changed = whole.clone();
+        let last = changed.len() - 2;
+        changed[last] ^= 1;
+        d.put(file, &changed);
+        d.refused_with(1, &line, &[&format!("--resume: {want}"), "--force starts over"]);
+        d.put(file, &whole);
+    }
+    d.done(&line);
+    assert_eq!(d.times("out/sirt"), before);
+}
+
+#[test]
 fn a_method_that_fails_leaves_the_others_their_rows() {
     let d = Folder::after(&[SCAN]);
     d.put("wild.toml", "extends = \"fast\"\nname = \"wild\"\n[optimizer]\nlr = 1e30\n");

@@ -15,6 +15,8 @@ pub struct TrialInput {
     pub held: Vec<usize>,
     /// The middle slices of the reference volume.
     pub reference: Option<MiddleSlices>,
+    /// Checksum of the voxels of the reference volume.
+    pub reference_fnv1a64: Option<String>,
     /// The data range of the scores.
     pub peak: f64,
 }
@@ -22,8 +24,8 @@ pub struct TrialInput {
 impl TrialInput {
     /// What is kept of `input` on the scan with this record.
     pub fn of(input: Input, scan: ScanRecord) -> Self {
-        let Input { held, reference, peak, .. } = input;
-        Self { scan, held, reference: reference.as_ref().map(MiddleSlices::of), peak }
+        let Input { held, reference, reference_fnv1a64, peak, .. } = input;
+        Self { scan, held, reference: reference.as_ref().map(MiddleSlices::of), reference_fnv1a64, peak }
     }
 }
 
