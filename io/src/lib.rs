@@ -79,5 +79,7 @@ pub use scan::{DataSet, Parts, read_data_set, read_scan, read_truth, scan_unit, 
 pub use scan_folder::write_scan;
 pub use scanner::{Conversion, Counts, I0, OpenBeam, Stored, read_scanner};
 pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};
-pub use volume::{check_shape, is_volume, packed_bytes, read_volume, write_volume, write_voxels, write_voxels_of};
+pub use volume::{
+    check_shape, is_volume, is_volume_name, packed_bytes, read_volume, write_volume, write_voxels, write_voxels_of,
+};
 pub use weights::{Tensor, read_weights, write_weights};

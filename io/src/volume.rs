@@ -135,6 +135,11 @@ pub fn is_volume(path: impl AsRef<Path>) -> bool {
     })
 }
 
+/// Whether the name is that of a volume that [`write_voxels`] can write.
+pub fn is_volume_name(path: impl AsRef<Path>) -> bool {
+    format_of(path.as_ref()).is_some()
+}
+
 /// Refuses a name or a number of voxels that [`write_voxels`] would refuse, before the voxels are computed.
 pub fn check_shape(path: impl AsRef<Path>, shape: [usize; 3]) -> Result<()> {
     let path = path.as_ref();

@@ -10,6 +10,7 @@ use conefield::files;
 use conefield::hounsfield::How;
 use conefield::memory::Memory;
 use conefield::parse::{self, Values};
+use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use conefield_io::{DataSet, DicomTemplate, Parts, write_voxels_of};
 use conefield_scans::diagnosis::survey;
@@ -104,7 +105,11 @@ impl ConvertArgs {
                 let expected = "a volume: a scan has line integrals";
                 return Err(Error::invalid(self.input.display().to_string(), option, "a scan", expected));
             }
-            let size = corrected_size(conefield_io::scan_size(&self.input)?, &corrections);
+            let size = conefield_io::scan_size(&self.input)?;
+            let place = self.output.display().to_string();
+            let expected = "the name of a folder, or of a file with --to naf: a scan does not become a volume";
+            ensure(!conefield_io::is_volume_name(&self.output), &place, "OUT", "the end of a volume's name", expected)?;
+            let size = corrected_size(size, &corrections);
             Memory::of_data_set(&size).check()?;
             let DataSet { train, test, volume } = conefield_scans::read_data_set(&self.input, Parts::ALL)?;
             let place = self.input.display().to_string();

@@ -41,6 +41,17 @@ fn settings_are_checked_where_they_stand() {
     d.refuses("out", &[("explain naf --set encoder.levels.x=1", "which is 16")]);
 }
 
+#[test]
+fn a_scan_is_not_written_under_the_name_of_a_volume() {
+    let d = Folder::after(&[SCAN]);
+    for out in ["out.nii", "out.nii.gz", "out.TIF", "out.zarr"] {
+        for to in ["", " --to r2", " --to naf"] {
+            d.refuses(out, &[(&format!("convert scan {out}{to}"), "OUT: found the end of a volume's name")]);
+        }
+    }
+    d.done("convert scan out.pickle --to naf");
+}
+
 /// Another command may be about to finish a file there.
 #[test]
 fn a_folder_with_other_files_is_left_as_it_is() {
