@@ -75,7 +75,7 @@ pub use naf::write_naf;
 pub use r2::write_r2;
 pub use rtk::read_rtk_geometry;
 pub use rtk_folder::write_rtk;
-pub use scan::{DataSet, Parts, read_data_set, read_scan, read_truth, scan_unit, truth_file};
+pub use scan::{DataSet, Parts, read_data_set, read_scan, read_truth, scan_unit, scanner_file, truth_file};
 pub use scan_folder::write_scan;
 pub use scanner::{Conversion, Counts, I0, OpenBeam, Stored, read_scanner};
 pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};

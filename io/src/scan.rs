@@ -97,6 +97,12 @@ pub fn scan_unit(folder: impl AsRef<Path>) -> Result<Option<Unit>> {
     file.map(|file| scan_folder::unit(&file)).transpose()
 }
 
+/// The description of a scanner that `path` names: in a folder its `scanner.toml`, if there is one.
+pub fn scanner_file(path: &Path) -> PathBuf {
+    let file = path.join(SCANNER);
+    if file.is_file() { file } else { path.to_path_buf() }
+}
+
 pub(crate) fn find(path: &Path) -> Result<ScanFile> {
     let place = path.display().to_string();
     let understood = "a folder with scan.toml or scan.json (conefield), scanner.toml (a scanner's images) or \

@@ -28,7 +28,7 @@ use std::path::PathBuf;
 #[derive(Args)]
 pub struct ImportArgs {
     /// The description of the scanner, or a vendor's: Nikon's .xtekct, SkyScan's .log, Varian's Scan.xml or
-    /// ProjectionInfo.xml, Elekta's _Frames.xml, Zeiss' .txrm.
+    /// ProjectionInfo.xml, Elekta's _Frames.xml, Zeiss' .txrm. Or a folder with scanner.toml.
     #[arg(value_name = "SCANNER.toml")]
     scanner: PathBuf,
     /// The folder for the scan.
@@ -57,14 +57,15 @@ pub struct ImportArgs {
 impl ImportArgs {
     pub fn run(self, general: &General) -> Result<()> {
         refuse_existing(&self.output, self.force)?;
-        Inputs::default().and_description(&self.scanner).spare_folder(&self.output)?;
+        let scanner = &conefield_io::scanner_file(&self.scanner);
+        Inputs::default().and_description(scanner).spare_folder(&self.output)?;
         let corrections = self.corrections.corrections()?;
-        let size = corrected_size(conefield_io::scanner_size(&self.scanner)?, &corrections);
+        let size = corrected_size(conefield_io::scanner_size(scanner)?, &corrections);
         Memory::of_views(&size).check()?;
         let selection = self.selection.selection();
         let options = ImportOptions { i0: self.i0, floor: self.floor, corrections, selection };
-        let imported = conefield_scans::import(&self.scanner, &options)?;
-        log_applied(&self.scanner, &imported.corrections);
+        let imported = conefield_scans::import(scanner, &options)?;
+        log_applied(scanner, &imported.corrections);
         conefield_io::write_scan(&self.output, &imported.scan, None)?;
         let survey = survey(&imported.scan);
         let found = self.understood(&imported, &survey);

@@ -37,7 +37,8 @@ pub fn cases() -> Vec<Case> {
         "an empty file", |d| put(d.join("scanner.toml"), ""), IMPORT, ["scanner.toml", "format"];
         "no UTF-8", |d| put(d.join("scanner.toml"), b"format = \"\xff\""), IMPORT, ["scanner.toml", "UTF-8"];
         "UTF-16", |d| put(d.join("scanner.toml"), b"\xff\xfef\0o\0"), IMPORT, ["scanner.toml", "UTF-16", "UTF-8"];
-        "a folder", scanner_npy, "import . -o scan", ["SCANNER.toml", "a folder", "a text file"];
+        "a folder", |d| std::fs::create_dir(d.join("views")).unwrap(),
+            "import views -o scan", ["SCANNER.toml", "a folder", "a text file"];
         "an image", |d| put(d.join("view.TIF"), ""),
             "import view.TIF -o scan", ["SCANNER.toml", "a .tif file of projections", "a text file"];
         "another format", circle("conefield-scanner", "conefield-scan"), IMPORT, ["format", "conefield-scan"];

@@ -31,6 +31,17 @@ fn counts_become_a_scan_that_the_other_commands_read() {
     let info = d.json("info scan --json");
     assert_eq!((&info["views"], &info["detector"]), (&found["views"], &found["detector"]));
 
+    // A folder stands for its description, as in info, and is kept.
+    fs::create_dir(d.at("s")).unwrap();
+    fs::rename(d.at("s.toml"), d.at("s/scanner.toml")).unwrap();
+    fs::copy(d.at("counts.npy"), d.at("s/counts.npy")).unwrap();
+    d.done("import s -o s/scan --i0 10000");
+    assert!(d.bytes("s/scan/projections.npy") == d.bytes("scan/projections.npy"));
+    for out in ["s", "."] {
+        d.refused_with(1, &format!("import s -o {out} --i0 10000 --force"), &["which this command reads"]);
+    }
+    d.put("s.toml", toml);
+
     // An existing scan is replaced only with --force; air gives the same open beam as the number.
     assert!(d.refused(1, "import s.toml -o scan --i0 air").contains("--force"));
     let said = d.done("import s.toml -o scan --i0 air --force");
