@@ -66,6 +66,7 @@ pub mod trained;
 pub mod trilinear;
 pub mod voxel;
 pub mod wgsl;
+pub mod words;
 pub mod written;
 
 pub use error::{Error, Result};

@@ -24,6 +24,7 @@ use crate::{affine, folder, foreign};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm, sub};
 use conefield_core::scan::Volume;
+use conefield_core::words::plural;
 use conefield_core::{Error, Result, allowance};
 use ndarray::{Array3, s};
 use slice::Slice;
@@ -67,14 +68,16 @@ fn slices(folder: &Path) -> Result<Vec<Slice>> {
     }
     let place = folder.display().to_string();
     if series.len() > 1 {
-        let list: Vec<String> =
-            series.iter().map(|(uid, s)| format!("{uid} ({}, {} files)", s[0].about, s.len())).collect();
+        let list: Vec<String> = series
+            .iter()
+            .map(|(uid, s)| format!("{uid} ({}, {} {})", s[0].about, s.len(), plural(s.len(), "file")))
+            .collect();
         let expected = "one series: move the others to folders of their own";
         return Err(Error::invalid(place, "SeriesInstanceUID", list.join("; "), expected));
     }
     let Some(slices) = series.into_values().next() else {
         foreign::refuse_folder(folder)?;
-        let found = format!("none among {others} files (subfolders are not searched)");
+        let found = format!("none among {others} {} (subfolders are not searched)", plural(others, "file"));
         return Err(Error::invalid(place, "DICOM slices", found, "the files of one series"));
     };
     Ok(slices)

@@ -11,6 +11,7 @@ use conefield::simulation::{self, Changes};
 use conefield::{files, input};
 use conefield_core::error::ensure;
 use conefield_core::scan::{self, Unit, Volume};
+use conefield_core::words::plural;
 use conefield_projectors::simulate::DetectorNoise;
 use numpy::{PyArray3, PyReadonlyArray3};
 use pyo3::prelude::*;
@@ -169,7 +170,8 @@ impl Scan {
         let h = self.scan.header();
         let ([rows, columns], [x, y, z]) = (h.detector, h.volume);
         let unit = &self.scan.unit.name;
-        format!("Scan({} views of {rows} x {columns}, volume {x} x {y} x {z}, unit {unit:?})", h.views)
+        let views = plural(h.views, "view");
+        format!("Scan({} {views} of {rows} x {columns}, volume {x} x {y} x {z}, unit {unit:?})", h.views)
     }
 }
 

@@ -93,7 +93,8 @@ impl CalibrateArgs {
         if let Some(output) = &self.output {
             if let Some(test) = test {
                 let n = test.geometry.views.len();
-                tracing::warn!("{}: {n} test views are left out: this format cannot hold them", output.display());
+                let views = out::plural(n, "test view");
+                tracing::warn!("{}: left out: {n} {views}, which this format cannot hold", output.display());
             }
             conefield_io::write_scan(output, &corrected, volume.as_ref())?;
         }

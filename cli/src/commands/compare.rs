@@ -136,7 +136,8 @@ impl CompareArgs {
         match failed.len() {
             0 => Ok(()),
             n => {
-                let why = format!("{n} of {} methods failed: {}", methods.len(), failed.join(", "));
+                let all = methods.len();
+                let why = format!("{n} of {all} {} failed: {}", out::plural(all, "method"), failed.join(", "));
                 Err(Error::unsupported("compare", why))
             }
         }
@@ -257,15 +258,16 @@ impl Shared<'_> {
         let mut parts = vec![self.scan.line()];
         match self.held_out_views.len() {
             0 => {}
-            n => parts.push(format!("{n} views held out")),
+            n => parts.push(format!("{n} {} held out", out::plural(n, "view"))),
         }
         parts.extend(self.reference.as_ref().map(|r| format!("reference {r}, peak {}", self.peak)));
-        parts.extend(self.limits.steps.map(|n| format!("{} steps", out::number(n))));
+        parts.extend(self.limits.steps.map(|n| format!("{} {}", out::number(n), out::plural(n, "step"))));
         parts.extend(self.limits.seconds.map(|t| format!("{} of training", out::duration(t))));
         parts.extend(self.budget_s.map(|t| format!("budget {}", out::duration(t))));
         parts.extend(self.limits.at_most.map(|t| format!("at most {}", out::duration(t))));
         parts.extend(self.sets.iter().map(|s| format!("`{s}`")));
-        parts.push(format!("seed {}, {} threads, conefield {}", self.seed, self.threads, self.version));
+        let (threads, version) = (self.threads, self.version);
+        parts.push(format!("seed {}, {threads} {}, conefield {version}", self.seed, out::plural(threads, "thread")));
         parts.join("; ")
     }
 }

@@ -136,7 +136,7 @@ impl ConvertArgs {
         let lost = |what: String| tracing::warn!("{}: {what}", self.output.display());
         if let Some(test) = data.test.as_ref().filter(|_| matches!(self.to, ScanFormat::Conefield | ScanFormat::Rtk)) {
             let n = test.geometry.views.len();
-            lost(format!("{n} test views are left out: this format cannot hold them; r2 and naf can"));
+            lost(format!("left out: {n} {}, which r2 and naf can hold", out::plural(n, "test view")));
         }
         if data.volume.is_some() && self.to == ScanFormat::Rtk {
             lost("the true volume is left out: RTK's format cannot hold it".into());

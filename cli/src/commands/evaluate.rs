@@ -174,7 +174,10 @@ fn dice_lines(d: &Dice) -> String {
     let mean = d.mean.map_or("not defined: no label but background in either".into(), |m| format!("{m:.4}"));
     let mut all = match d.labels.len() {
         0 => format!("mean dice  {mean}"),
-        n => format!("{}\nmean dice of {n} labels  {mean}", out::table(&rows, &[0, 1, 2, 3])),
+        n => {
+            let labels = out::plural(n, "label");
+            format!("{}\nmean dice of {n} {labels}  {mean}", out::table(&rows, &[0, 1, 2, 3]))
+        }
     };
     for (where_, labels) in [("volume", &d.only_in_result), ("reference", &d.only_in_reference)] {
         if !labels.is_empty() {

@@ -78,11 +78,12 @@ impl PretrainArgs {
             }));
         }
         out::say(&format!(
-            "{}: {} tensors, {} parameters, after {} steps in {}{}",
+            "{}: {} tensors, {} parameters, after {} {} in {}{}",
             self.output.display(),
             weights.tensors.len(),
             out::number(numbers as u64),
             last.step,
+            out::plural(last.step, "step"),
             out::duration(last.seconds),
             last.loss.map_or(String::new(), |l| format!(", loss {l:.3e}")),
         ))

@@ -123,9 +123,10 @@ impl ProjectArgs {
         let worst = residual.views.iter().copied().enumerate().max_by(|a, b| a.1.total_cmp(&b.1));
         let worst = worst.map_or(String::new(), |(v, rms)| format!(", {rms:.5} in view {v}, the worst"));
         out::say(&format!(
-            "{}: {n} views of {rows} x {columns} in {}\nmeasured minus predicted: root mean square {:.5}, {:.5} of the \
+            "{}: {n} {} of {rows} x {columns} in {}\nmeasured minus predicted: root mean square {:.5}, {:.5} of the \
              largest line integral{worst}",
             self.output.display(),
+            out::plural(n, "view"),
             out::duration(project_s),
             residual.rms,
             residual.relative,

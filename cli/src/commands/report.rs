@@ -114,7 +114,7 @@ impl ReportArgs {
                 "warnings": page.warnings.iter().map(|w| &w.found).collect::<Vec<_>>(),
             }));
         }
-        let count = |n: usize, what: &str| format!("{n} {what}{}", if n == 1 { "" } else { "s" });
+        let count = |n: usize, what: &str| format!("{n} {}", out::plural(n, what));
         let mut lines = vec![format!(
             "{}: {}, {}, {} in {}",
             self.output.display(),

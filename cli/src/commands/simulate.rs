@@ -131,9 +131,10 @@ impl SimulateArgs {
         }
         let ([rows, columns], [x, y, z]) = (g.detector, g.volume.shape);
         out::say(&format!(
-            "{}: {} views of {rows} x {columns}, of {x} x {y} x {z} voxels, noise {}",
+            "{}: {} {} of {rows} x {columns}, of {x} x {y} x {z} voxels, noise {}",
             self.output.display(),
             g.views.len(),
+            out::plural(g.views.len(), "view"),
             protocol.noise,
         ))
     }

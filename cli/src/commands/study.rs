@@ -148,8 +148,9 @@ impl StudyArgs {
             out::json(&json!({ "done": done, "failed": failed, "table": null }))?;
         } else {
             out::say(&format!(
-                "{done} of {} runs of this share done; the last share to finish writes the table",
-                cells.len()
+                "{done} of {} {} of this share done; the last share to finish writes the table",
+                cells.len(),
+                out::plural(cells.len(), "run")
             ))?;
         }
         refuse_failures(&failed, cells.len())
@@ -173,7 +174,8 @@ impl StudyArgs {
         };
         refuse_existing(file, self.force)?;
         conefield_io::write_text_atomic(file, &jobs.script()?)?;
-        out::say(&format!("{}: {count} jobs for {runs} runs; sbatch {} submits them", file.display(), file.display()))
+        let (jobs, all) = (out::plural(count, "job"), out::plural(runs, "run"));
+        out::say(&format!("{0}: {count} {jobs} for {runs} {all}; sbatch {0} submits the script", file.display()))
     }
 }
 
@@ -181,7 +183,10 @@ impl StudyArgs {
 fn refuse_failures(failed: &[String], all: usize) -> Result<()> {
     match failed.len() {
         0 => Ok(()),
-        n => Err(Error::unsupported("study", format!("{n} of {all} runs failed, the first: {}", failed[0]))),
+        n => {
+            let why = format!("{n} of {all} {} failed, the first: {}", out::plural(all, "run"), failed[0]);
+            Err(Error::unsupported("study", why))
+        }
     }
 }
 

@@ -12,10 +12,12 @@ const USED: f64 = 0.8;
 pub fn summary(r: &RunRecord, output: &Path) -> String {
     let ([x, y, z], views) = r.scan.as_ref().map_or(([0; 3], 0), |scan| (scan.volume, scan.views));
     let speed = r.samples_per_s.map(|s| format!(" ({:.2} M samples/s)", s / 1e6)).unwrap_or_default();
+    let used = views - r.held_out_views.len();
     let mut lines = vec![format!(
-        "{x} x {y} x {z} voxels from {} views: {} in {}{speed}, export {}",
-        views - r.held_out_views.len(),
-        if r.steps == 1 { "1 step".into() } else { format!("{} steps", r.steps) },
+        "{x} x {y} x {z} voxels from {used} {}: {} {} in {}{speed}, export {}",
+        out::plural(used, "view"),
+        r.steps,
+        out::plural(r.steps, "step"),
         out::duration(r.train_s),
         out::duration(r.written.export_s),
     )];
@@ -38,7 +40,10 @@ pub fn summary(r: &RunRecord, output: &Path) -> String {
         let best =
             r.best_step.map_or(String::new(), |n| format!(", the smallest: the state after step {n} is the result"));
         let views = r.held_out_views.len();
-        lines.push(format!("held-out error  {h:.5} of the largest line integral ({views} views){best}"));
+        lines.push(format!(
+            "held-out error  {h:.5} of the largest line integral ({views} {}){best}",
+            out::plural(views, "view")
+        ));
     }
     if let Some(s) = &r.written.scores {
         lines.push(evaluate::lines(s));

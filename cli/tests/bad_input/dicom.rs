@@ -84,6 +84,6 @@ pub fn cases() -> Vec<Case> {
         "no DICOM in the folder", |d| {
             std::fs::create_dir(d.join("series")).unwrap();
             put(d.join("series/a.txt"), "x");
-        }, "evaluate series series", ["DICOM slices", "none among 1 files"];
+        }, "evaluate series series", ["DICOM slices", "none among 1 file "];
     }
 }

@@ -119,8 +119,17 @@ fn test_views_are_kept_or_their_loss_is_reported() {
     for to in ["conefield", "rtk"] {
         let output = d.loud(&format!("convert r2 {to} --to {to}")).assert().success().get_output().clone();
         let said = String::from_utf8(output.stderr).unwrap();
-        assert!(said.contains("3 test views are left out"), "{said}");
+        assert!(said.contains("left out: 3 test views"), "{said}");
     }
+}
+
+#[test]
+fn one_view_and_one_step_take_no_s() {
+    let d = Folder::new();
+    let said = d.done("simulate phantom:head:16 -o scan --views 1 --detector 16x16");
+    assert!(said.starts_with("scan: 1 view of 16 x 16"), "{said}");
+    let said = d.done("reconstruct scan --spec sirt -o run --steps 1");
+    assert!(said.starts_with("16 x 16 x 16 voxels from 1 view: 1 step in "), "{said}");
 }
 
 #[test]

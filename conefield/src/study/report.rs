@@ -10,6 +10,7 @@ use crate::tradeoff::json::to_json;
 use crate::tradeoff::statistics::mean;
 use crate::tradeoff::trial::TrialInput;
 use conefield_core::Result;
+use conefield_core::words::plural;
 use conefield_evaluation::report::Table;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -86,7 +87,8 @@ impl CaseRecord {
         let reference =
             self.reference.as_ref().map_or(String::new(), |r| format!("; reference {r}, peak {}", self.peak));
         let noise = self.noise.as_ref().map_or(String::new(), |n| format!("; noise {n}"));
-        format!("{from}: {views} views of {rows} x {columns} pixels, {x} x {y} x {z} voxels{noise}{reference}")
+        let of = plural(views, "view");
+        format!("{from}: {views} {of} of {rows} x {columns} pixels, {x} x {y} x {z} voxels{noise}{reference}")
     }
 }
 

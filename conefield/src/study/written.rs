@@ -2,6 +2,7 @@
 
 use crate::backend::BackendChoice;
 use crate::parse::{self, AnglesOption, HoldOut};
+use conefield_core::words::plural;
 use conefield_projectors::simulate::DetectorNoise;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::value::MapAccessDeserializer;
@@ -177,7 +178,7 @@ impl Protocol {
         use conefield_evaluation::report::text::{duration, number};
         let mut words: Vec<String> = vec![];
         words.extend(self.hold_out.as_ref().map(|h| format!("views {h} held out")));
-        words.extend(self.steps.map(|n| format!("{} steps", number(n.get()))));
+        words.extend(self.steps.map(|n| format!("{} {}", number(n.get()), plural(n.get(), "step"))));
         words.extend(self.seconds.map(|t| format!("{} of training", duration(t))));
         words.extend(self.budget.map(|t| format!("budget {}", duration(t))));
         words.extend(self.at_most.map(|t| format!("at most {}", duration(t))));

@@ -31,10 +31,10 @@ impl Unknowns {
     }
 
     /// The name of its steps.
-    pub fn steps(self) -> &'static str {
+    pub fn step(self) -> &'static str {
         match self {
-            Self::Field => "steps",
-            Self::Voxels => "passes",
+            Self::Field => "step",
+            Self::Voxels => "pass",
         }
     }
 }

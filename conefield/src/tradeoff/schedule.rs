@@ -5,6 +5,7 @@ use crate::tradeoff::calibrate::{Bench, Costs, calibrate, picture, score};
 use crate::tradeoff::front::{Expected, Front, Size, Unknowns};
 use crate::tradeoff::speed::pass_s;
 use conefield_core::method::Plan;
+use conefield_core::words::plural;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::text::{duration, number};
 use serde::Serialize;
@@ -245,7 +246,7 @@ impl Schedule {
             Some(point) => format!("{point} (spec {spec})"),
             None => format!("spec {spec}"),
         };
-        let (e, steps) = (&self.expected, self.kind.steps());
+        let (e, steps) = (&self.expected, plural(self.steps, self.kind.step()));
         let mut lines = vec![format!("method: {named}, {}", self.why)];
         lines.extend(self.passed_over.iter().map(|line| format!("passed over: {line}")));
         if e.then_s > 0.0 {

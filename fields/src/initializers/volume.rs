@@ -4,6 +4,7 @@
 use conefield_core::input_file::InputFile;
 use conefield_core::prelude::*;
 use conefield_core::settings::KnownVolume;
+use conefield_core::words::plural;
 
 /// Settings of `volume`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -53,6 +54,6 @@ impl Initializer for FromVolume {
     }
 
     fn describe(&self) -> String {
-        format!("volume: {} learned in {} steps", self.path, self.steps)
+        format!("volume: {} learned in {} {}", self.path, self.steps, plural(self.steps, "step"))
     }
 }

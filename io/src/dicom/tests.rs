@@ -131,7 +131,7 @@ fn series_that_are_no_volume_are_refused() {
     refused(&put(POSITION, VR::DS, 4, "-10\\29\\30"), &["slices missing: 2 between 6.dcm and 5.dcm", "1.5000 mm"]);
     refused(&put(POSITION, VR::DS, 4, "-10\\26"), &["5.dcm", "ImagePositionPatient", "2 numbers"]);
     refused(&put(POSITION, VR::DS, 4, "a\\b\\c"), &["5.dcm", "ImagePositionPatient"]);
-    let words = ["SeriesInstanceUID", "1.2.3 (CT, thin, 4 files)", "1.2.4 (CT, thin, 1 files)"];
+    let words = ["SeriesInstanceUID", "1.2.3 (CT, thin, 4 files)", "1.2.4 (CT, thin, 1 file)"];
     refused(&put(Tag(0x0020, 0x000e), VR::UI, 3, "1.2.4"), &words);
     let e = "ImageOrientationPatient";
     refused(&put(Tag(0x0020, 0x0037), VR::DS, 3, "1\\0\\0\\0\\1\\0"), &["6.dcm", e, "as in"]);

@@ -2,6 +2,7 @@
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::stream;
+use conefield_core::words::plural;
 use rand::seq::SliceRandom;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -80,10 +81,6 @@ pub fn summary(subsets: &[Vec<usize>]) -> String {
     let (least, most) = (sizes().min().unwrap_or(0), sizes().max().unwrap_or(0));
     let views = if least == most { format!("{most}") } else { format!("{least} or {most}") };
     format!("{} {} of {views} {}", subsets.len(), plural(subsets.len(), "subset"), plural(most, "view"))
-}
-
-fn plural(n: usize, word: &str) -> String {
-    if n == 1 { word.into() } else { format!("{word}s") }
 }
 
 impl Order {
