@@ -13,7 +13,7 @@ const VIEWS: usize = 360;
 /// Shares of the volume's voxels by the share of views that see them, from a regular sample.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct VolumeCoverage {
-    /// The sufficient share of views: all, or half for an offset detector on a full circle.
+    /// The sufficient share of views: all, half for an offset detector on a full circle, those of half a turn of a helix.
     pub needed: f64,
     /// Voxels seen by enough views.
     pub complete: f64,
@@ -39,7 +39,11 @@ pub fn share_of_views(geometry: &Geometry, points: &[Vec3]) -> Vec<f64> {
 
 /// Computes how many views see each part of the volume.
 pub(crate) fn volume_coverage(geometry: &Geometry, setup: &Setup) -> VolumeCoverage {
-    let needed = if setup.half_is_enough() { 0.5 } else { 1.0 };
+    let needed = match setup.helix_turns {
+        Some(turns) => (0.5 / turns).min(1.0),
+        None if setup.half_is_enough() => 0.5,
+        None => 1.0,
+    };
     let grid = &geometry.volume;
     let along = |k: usize| {
         let n = grid.shape[k];

@@ -4,6 +4,7 @@ use crate::diagnosis::arc::{ScanArc, scan_arc};
 use crate::diagnosis::shadow::Shadow;
 use conefield_core::geometry::{Geometry, Vec3, View, norm, sub};
 use serde::Serialize;
+use std::f64::consts::{PI, TAU};
 
 /// A scan's lengths and angles; medians if views differ. The axis is z; the isocentre is its point at the source's
 /// height.
@@ -30,6 +31,9 @@ pub struct Setup {
     pub field_of_view: FieldOfView,
     /// Angular positions of the views.
     pub angles: ScanArc,
+    /// Number of turns of a source that moves along the axis by more than half of what a view sees of it, as on a helix.
+    #[serde(skip)]
+    pub helix_turns: Option<f64>,
 }
 
 /// The cylinder about the axis that the views see.
@@ -83,6 +87,8 @@ pub fn setup(geometry: &Geometry) -> Setup {
     let most = |k: usize| reach.iter().map(|r: &[f64; 4]| r[k]).fold(f64::NEG_INFINITY, f64::max);
     let finite = |x: f64| if x.is_finite() { x.max(0.0) } else { 0.0 };
     let [dso, dsd, magnification, pv, pu, ov, ou] = std::array::from_fn(middle);
+    let heights = || geometry.views.iter().map(|v| v.source[2]);
+    let rise = heights().fold(f64::NEG_INFINITY, f64::max) - heights().fold(f64::INFINITY, f64::min);
     Setup {
         circle: turns_about_the_axis(&geometry.views),
         source_to_axis_mm: dso,
@@ -98,7 +104,17 @@ pub fn setup(geometry: &Geometry) -> Setup {
             height_mm: finite(least(3) - most(2)),
         },
         angles: scan_arc(&geometry.views),
+        helix_turns: (rise * magnification > 0.5 * pv * rows).then(|| turns(&geometry.views)),
     }
+}
+
+/// Number of turns of the source about the axis, each step the shorter way.
+fn turns(views: &[View]) -> f64 {
+    let position = |v: &View| v.source[1].atan2(v.source[0]);
+    let step = |pair: &[View]| (position(&pair[1]) - position(&pair[0]) + PI).rem_euclid(TAU) - PI;
+    let steps: f64 = views.windows(2).map(|pair| step(pair).abs()).sum();
+    // The last view makes a step, too.
+    steps / TAU * views.len() as f64 / (views.len() - 1).max(1) as f64
 }
 
 /// Tolerance of a view's deviation from the turned first view, relative to the distance from source to detector.

@@ -145,7 +145,11 @@ fn covered(scan: &Scan, s: &Survey, warn: Warn) {
     let size = scan.geometry.volume.size();
     let radius = if c.needed < 1.0 { fov.one_sided_radius_mm } else { fov.radius_mm };
     let none = if c.unseen > 0.0 { format!(", no view sees {}", percent(c.unseen)) } else { String::new() };
-    let enough = if c.needed < 1.0 { "half the views" } else { "all views" };
+    let (enough, height) = match s.setup.helix_turns {
+        Some(_) => ("the views of half a turn", "that moves along the axis".to_owned()),
+        None if c.needed < 1.0 => ("half the views", format!("and height {:.1} mm", fov.height_mm)),
+        None => ("all views", format!("and height {:.1} mm", fov.height_mm)),
+    };
     // A smaller volume would leave out even more of the object.
     let advice = match s.outside.is_seen() || s.truncation.views > 0.02 {
         true => "trust the parts outside less; conefield info --png shows them",
@@ -155,13 +159,12 @@ fn covered(scan: &Scan, s: &Survey, warn: Warn) {
         WarningKind::Coverage,
         format!(
             "{enough} see {} of the volume{none}, and the worst voxel is seen by {} of the views; the volume is {:.1} x \
-             {:.1} x {:.1} mm and the field of view a cylinder of radius {radius:.1} mm and height {:.1} mm",
+             {:.1} x {:.1} mm and the field of view a cylinder of radius {radius:.1} mm {height}",
             percent(c.complete),
             percent(c.least),
             size[0],
             size[1],
-            size[2],
-            fov.height_mm
+            size[2]
         ),
         advice.into(),
     );

@@ -20,6 +20,8 @@ struct Setting {
     radius: f64,
     at: [f64; 2],
     mu: f64,
+    /// Movement along the axis from view to view.
+    rise: f64,
 }
 
 fn even(n: usize, range: f64) -> Vec<f64> {
@@ -39,6 +41,7 @@ fn clean() -> Setting {
         radius: 24.0,
         at: [0.0, 0.0],
         mu: 0.02,
+        rise: 0.0,
     }
 }
 
@@ -48,7 +51,13 @@ impl Setting {
         let view = |a: &f64| {
             View::circular(Radians(*a), Millimetres(self.dso), Millimetres(self.dsd), mm(self.pixel), mm(self.offset))
         };
-        self.angles.iter().map(view).collect()
+        let mut views: Vec<View> = self.angles.iter().map(view).collect();
+        let middle = (views.len() - 1) as f64 / 2.0;
+        for (i, view) in views.iter_mut().enumerate() {
+            let z = self.rise * (i as f64 - middle);
+            (view.source[2], view.detector[2]) = (view.source[2] + z, view.detector[2] + z);
+        }
+        views
     }
 
     fn scan(&self) -> Scan {
@@ -157,6 +166,23 @@ fn unusual_but_complete_scans_give_no_warning() {
     let noise = |i: usize| 0.04 * (((i * 7919) % 101) as f32 / 50.0 - 1.0);
     noisy.projections.iter_mut().enumerate().for_each(|(i, x)| *x += noise(i));
     assert_eq!(survey(&noisy).warnings, []);
+}
+
+#[test]
+fn a_helix_covers_what_no_view_sees_as_a_whole() {
+    let tall = |n: usize| VoxelGrid { shape: [48, 48, n], ..clean().volume };
+    let helix = |n: usize, turns: f64| Setting {
+        angles: even((60.0 * turns) as usize, turns * TAU),
+        rise: 100.0 / (60.0 * turns),
+        volume: tall(n),
+        ..clean()
+    };
+    for turns in [4.0, 2.0] {
+        assert_eq!(helix(48, turns).kinds(), [], "{turns}");
+    }
+    // The ends of a volume that is longer than the helix.
+    let words = ["the views of half a turn see ", "no view sees", "moves along the axis", "smaller"];
+    helix(160, 4.0).warns(WarningKind::Coverage, &words);
 }
 
 #[test]
