@@ -13,7 +13,7 @@ pub use conefield_evaluation::report::result_png as picture;
 pub use conefield_evaluation::report::text::stem;
 pub use conefield_io::read_weights;
 use conefield_projectors::simulate::{PhantomKind, phantom_of};
-use conefield_scans::diagnosis::{Survey, survey};
+use conefield_scans::diagnosis::{Survey, WarningKind, survey};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -50,13 +50,13 @@ fn phantom(name: &str) -> Result<Option<(PhantomKind, usize)>> {
 /// Reads a scan and logs warnings about problems for a reconstruction.
 pub fn scan(path: &Path) -> Result<Scan> {
     let scan = conefield_scans::read_scan(path)?;
-    warn_of(path, &survey(&scan));
+    warn_of(path, &survey(&scan), false);
     Ok(scan)
 }
 
-/// Logs warnings about problems for a reconstruction.
-pub fn warn_of(path: &Path, survey: &Survey) {
-    for warning in &survey.warnings {
+/// Logs warnings about problems for a reconstruction; `surrounded`: not of an object that extends beyond the volume.
+pub fn warn_of(path: &Path, survey: &Survey, surrounded: bool) {
+    for warning in survey.warnings.iter().filter(|w| !(surrounded && w.kind == WarningKind::Outside)) {
         tracing::warn!("{}: {warning}", path.display());
     }
 }

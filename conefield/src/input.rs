@@ -70,14 +70,14 @@ impl Input {
 }
 
 /// The scan at `path` and the reference volume, if one is asked for: a file, or the scan's own volume for "truth". Logs
-/// warnings about problems for a reconstruction. Refuses a reference with another shape than the scan's volume.
-pub fn read(path: &Path, reference: Option<&Path>) -> Result<(Scan, Option<Volume>)> {
+/// warnings about problems for a reconstruction, but if `surrounded` not of an object beyond the volume. Refuses a reference with another shape than the scan's volume.
+pub fn read(path: &Path, reference: Option<&Path>, surrounded: bool) -> Result<(Scan, Option<Volume>)> {
     let own = reference.is_some_and(is_truth);
     let DataSet { train: scan, volume, .. } =
         conefield_scans::read_data_set(path, Parts { tests: false, volume: own })?;
     // A volume that came unasked is not held beside the reference.
     let volume = volume.filter(|_| own);
-    files::warn_of(path, &survey(&scan));
+    files::warn_of(path, &survey(&scan), surrounded);
     let volume = match reference {
         None => None,
         Some(_) if own => Some(volume.ok_or_else(|| no_truth(path))?),

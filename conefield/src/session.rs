@@ -97,6 +97,12 @@ impl<'a> Session<'a> {
         }
     }
 
+    /// Whether the requested method models what lies beyond the volume.
+    pub fn surrounded(&self) -> bool {
+        let Wish::Method(Planned { plan, .. }) = &self.wish else { return false };
+        plan.needs(&self.run.scan.header()).surround > 0
+    }
+
     /// Reads the inputs by `read`. A device meanwhile compiles the kernels of the requested method.
     pub fn reading<T>(&self, read: impl FnOnce() -> Result<T>) -> Result<T> {
         let Wish::Method(Planned { loaded, plan, .. }) = &self.wish else { return read() };

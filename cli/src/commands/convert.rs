@@ -118,7 +118,7 @@ impl ConvertArgs {
             let test = test.map(|test| corrections.apply(test, &place)).transpose()?.map(|(test, _)| test);
             let test = test.map(|test| selection.of_detector(test)).transpose()?;
             let data = DataSet { train: selection.of(train)?, test, volume };
-            files::warn_of(&self.input, &survey(&data.train));
+            files::warn_of(&self.input, &survey(&data.train), false);
             self.warn_of_lost(&data);
             let (scan, test, truth) = (&data.train, data.test.as_ref(), data.volume.as_ref());
             match self.to {

@@ -7,6 +7,7 @@ use conefield::explain::Explanation;
 use conefield::memory::{self, Memory};
 use conefield::{files, method, specs};
 use conefield_core::Result;
+use conefield_scans::diagnosis::survey;
 use std::path::PathBuf;
 
 /// Show what a spec builds: stages, widths, parameters, memory, work.
@@ -37,7 +38,8 @@ impl ExplainArgs {
             Some(path) => {
                 let size = conefield_io::scan_size(path)?;
                 Memory::of_views(&size).check()?;
-                let scan = files::scan(path)?;
+                let scan = conefield_scans::read_scan(path)?;
+                files::warn_of(path, &survey(&scan), plan.needs(&scan.header()).surround > 0);
                 Explanation::new(&loaded, plan.as_ref(), Some((&scan, memory::Run::on(size))))?
             }
         };

@@ -299,7 +299,8 @@ impl ReconstructArgs {
 
     /// Reads all inputs, and the checkpoint that a resumed run continues from, with the checksums of its spec's files.
     fn input(&self, session: &Session<'_>) -> Result<(Input, ScanRecord, Option<Earlier>)> {
-        let (whole, reference) = session.reading(|| input::read(&self.scan, self.protocol.reference.as_deref()))?;
+        let (surrounded, reference) = (session.surrounded(), self.protocol.reference.as_deref());
+        let (whole, reference) = session.reading(|| input::read(&self.scan, reference, surrounded))?;
         let (input, record) = self.protocol.input(&self.scan, whole, reference)?;
         let earlier = match session.requested() {
             Some(loaded) if self.resume => {

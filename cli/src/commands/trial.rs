@@ -150,7 +150,8 @@ pub fn begin(lease: &mut Lease, goes_on: bool) -> Result<()> {
 /// Reads scan and reference to check that they fit together and that `check` accepts the scan, and keeps a summary.
 pub fn input(path: &Path, protocol: &RunProtocol, check: &dyn Fn(&Scan) -> Result<()>) -> Result<TrialInput> {
     protocol.memory(conefield_io::scan_size(path)?).reading().check()?;
-    let (scan, reference) = input::read(path, protocol.reference.as_deref())?;
+    // The run, which knows its spec, warns of what lies beyond the volume.
+    let (scan, reference) = input::read(path, protocol.reference.as_deref(), true)?;
     check(&scan)?;
     protocol.input(path, scan, reference).map(|(input, record)| TrialInput::of(input, record))
 }

@@ -124,6 +124,21 @@ fn test_views_are_kept_or_their_loss_is_reported() {
 }
 
 #[test]
+fn what_lies_beyond_the_volume_is_no_warning_where_the_spec_models_it() {
+    let d = Folder::after(&["simulate phantom:head:16 -o scan --views 12 --detector 32x32"]);
+    let mut scan = read_scan(d.at("scan")).unwrap();
+    scan.geometry.volume.shape = [10; 3];
+    write_scan(d.at("part"), &scan, None).unwrap();
+    for line in ["explain fast --scan part", "reconstruct part --spec sirt --steps 1 -o run --force"] {
+        for (set, warned) in [("", true), (" --set scene.surround.coarse.cells=8", false)] {
+            let output = d.loud(&format!("{line}{set}")).assert().success().get_output().clone();
+            let said = String::from_utf8(output.stderr).unwrap();
+            assert_eq!(said.contains("the object extends beyond it along"), warned, "{line}{set}: {said}");
+        }
+    }
+}
+
+#[test]
 fn one_view_and_one_step_take_no_s() {
     let d = Folder::new();
     let said = d.done("simulate phantom:head:16 -o scan --views 1 --detector 16x16");
