@@ -9,7 +9,6 @@ use conefield_core::parallel;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Unit};
 use conefield_core::{Error, Result, written};
-use conefield_scans::diagnosis::quantiles::median;
 use ndarray::{Array3, ArrayViewMut3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -300,7 +299,18 @@ fn median_in(voxels: &mut dyn Voxels, region: &Region) -> Result<f64> {
             values.extend(inside.iter().map(|[x, y, _]| read[[*x, *y, 0]]));
         }
     }
-    Ok(median(&mut values).map_or(f64::NAN, f64::from))
+    Ok(median(&mut values))
+}
+
+/// The median; of an even number the mean of the middle two, of none not a number.
+fn median(values: &mut [f32]) -> f64 {
+    let n = values.len();
+    if n == 0 {
+        return f64::NAN;
+    }
+    let (below, upper, _) = values.select_nth_unstable_by(n / 2, f32::total_cmp);
+    let lower = if n.is_multiple_of(2) { below.iter().copied().max_by(f32::total_cmp) } else { None };
+    (f64::from(lower.unwrap_or(*upper)) + f64::from(*upper)) / 2.0
 }
 
 /// Water and air of a volume, in its unit.
@@ -409,6 +419,14 @@ mod tests {
         let how: How = "water=box:1,-2,-1,3,2,1,air=box:-3,-2,-1,-1,2,1".parse().unwrap();
         let levels = how.open("a.nii", None, &volume.grid, None).unwrap().measure(&mut &volume).unwrap();
         assert_eq!([levels.water as f32, levels.air as f32], [0.021, 0.001]);
+    }
+
+    #[test]
+    fn the_median_of_an_even_number_lies_between_the_middle_two() {
+        let (_, note) = converted("water=box:-3,-2,-1,3,2,1,air=0", None).unwrap();
+        assert_eq!(note, "HU: water 0.011, air 0");
+        assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
+        assert!(median(&mut []).is_nan());
     }
 
     #[test]
