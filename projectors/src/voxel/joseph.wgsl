@@ -1,10 +1,9 @@
 // Bilinear interpolation from plane to plane of voxel centres across the main direction (Joseph 1982).
 
 fn stage_corner(plane: i32, a: i32, b: i32, main: u32, shape: vec3<i32>, weight: f32) {
-    var at: vec3<i32>;
-    at[main] = plane;
-    at[(main + 1u) % 3u] = a;
-    at[(main + 2u) % 3u] = b;
+    // DirectX's compiler refuses to write a component that data chooses.
+    let across = select(vec3<i32>(a, b, plane), vec3<i32>(b, plane, a), main == 1u);
+    let at = select(across, vec3<i32>(plane, a, b), main == 0u);
     if all(at >= vec3<i32>(0)) && all(at < shape) {
         stage_visit(vec3<u32>(at), weight);
     }
@@ -19,11 +18,8 @@ fn stage_walk(ray: VoxelRay) {
     } else if size.y >= size.z {
         main = 1u;
     }
-    var lower = vec3<f32>(-1.0);
-    var upper = vec3<f32>(shape);
-    // One more plane on both sides: positions on the edge are tested voxel by voxel.
-    upper[main] = f32(shape[main]);
-    let inside = stage_clip(ray, lower, upper);
+    // One more plane on all sides: positions on the edge are tested voxel by voxel.
+    let inside = stage_clip(ray, vec3<f32>(-1.0), vec3<f32>(shape));
     if inside.y <= inside.x {
         return;
     }

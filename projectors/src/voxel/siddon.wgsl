@@ -35,11 +35,12 @@ fn stage_walk(ray: VoxelRay) {
         if next[k] >= inside.y {
             return;
         }
-        let onwards = select(-1, 1, ray.ahead[k] > 0.0);
-        voxel[k] += onwards;
+        // DirectX's compiler refuses to write a component that data chooses.
+        let own = vec3<u32>(k) == vec3<u32>(0u, 1u, 2u);
+        voxel += select(vec3<i32>(0), vec3<i32>(select(-1, 1, ray.ahead[k] > 0.0)), own);
         if voxel[k] < 0 || voxel[k] > last[k] {
             return;
         }
-        next[k] = stage_wall(ray, k, voxel[k]);
+        next = select(next, vec3<f32>(stage_wall(ray, k, voxel[k])), own);
     }
 }
