@@ -48,7 +48,7 @@ pub fn room() -> u64 {
 
 /// `bytes` for an error message.
 pub(crate) fn mib(bytes: u64) -> String {
-    format!("{} MiB", bytes.div_ceil(1 << 20))
+    if bytes < 1 << 20 { format!("{bytes} B") } else { format!("{} MiB", bytes.div_ceil(1 << 20)) }
 }
 
 /// Checks that `bytes` more may be allocated for `field` of the file `place`. This is a check, not a reservation: a
@@ -115,5 +115,6 @@ mod tests {
         for want in ["a.nii", "data", "1025 MiB", "2048 MiB", "3072 MiB", "--memory"] {
             assert!(e.contains(want), "{want}: {e}");
         }
+        assert_eq!([1, 1 << 20, (1 << 20) + 1].map(mib), ["1 B", "1 MiB", "2 MiB"]);
     }
 }
