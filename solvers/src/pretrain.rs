@@ -163,8 +163,9 @@ fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
         let k = ((sums.len() as f64 * 0.995) as usize).min(sums.len() - 1);
         Ok(*sums.select_nth_unstable_by(k, f64::total_cmp).1)
     })?;
-    let absorbs = attenuation.is_finite() && attenuation > 0.0;
-    ensure(absorbs, "volume", "values", "no attenuation", "a volume of an object that absorbs")?;
+    let expected = "values whose sums along a line are below 3.4e38";
+    ensure(attenuation.is_finite(), "volume", "values", "values that are too large", expected)?;
+    ensure(attenuation > 0.0, "volume", "values", "no attenuation", "a volume of an object that absorbs")?;
     Scene::with_attenuation(volume.grid, settings, attenuation)
 }
 
@@ -182,6 +183,15 @@ fn draw(volume: &Volume, scene: &Scene, seed: u64, step: u64, count: usize, out:
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn values_without_a_scale_are_named() {
+        for (value, want) in [(1e38, "too large"), (0.0, "no attenuation")] {
+            let volume = Volume::centered(ndarray::Array3::from_elem((4, 4, 4), value), [1.0; 3]);
+            let e = scene(&volume, &SceneSettings::default()).unwrap_err().to_string();
+            assert!(e.contains(want), "{e}");
+        }
+    }
 
     #[test]
     fn settings_that_train_nothing_are_refused() {
