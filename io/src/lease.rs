@@ -148,7 +148,11 @@ impl Lease {
             let slot = aside.join(waiting(&aside)?.len().to_string());
             fs::create_dir_all(&slot).map_err(at)?;
             let new = own(&slot)?;
-            swap(&self.path, &slot, &aside).map_err(at)?;
+            swap(&self.path, &slot, &aside).map_err(|e| {
+                // A folder that may not be moved is where it was, and the place for it is empty.
+                let _ = fs::remove_dir(&slot).and_then(|()| fs::remove_dir(&aside));
+                at(e)
+            })?;
             sync_folder(folder_of(&self.path));
             self.locks.extend(new);
         }

@@ -75,6 +75,36 @@ fn a_run_without_room_says_so() {
     failed(&after(&d, "exec >/dev/full", "info scan"), &["standard output", "No space left"]);
 }
 
+/// What runs a command as a user who may not write the folder `locked`: the superuser ignores permissions.
+fn user(d: &Folder, locked: &str) -> Option<&'static str> {
+    let probe = d.at(locked).join("probe");
+    if fs::write(&probe, "").is_err() {
+        return Some("");
+    }
+    fs::remove_file(probe).unwrap();
+    let other = "setpriv --reuid=65534 --regid=65534 --clear-groups ";
+    let runs = d.shell(&format!("{other} \"$0\" \"$@\""), "backends").status.success();
+    if !runs {
+        eprintln!("skipped: this is the superuser, and the command cannot be run as another one");
+    }
+    runs.then_some(other)
+}
+
+#[test]
+fn a_folder_that_may_not_be_moved_leaves_nothing_beside_it() {
+    let d = inputs();
+    d.done("reconstruct scan --spec fdk -o kept");
+    for (name, mode) in [("", 0o777), ("kept", 0o555)] {
+        fs::set_permissions(d.at(name), fs::Permissions::from_mode(mode)).unwrap();
+    }
+    let Some(other) = user(&d, "kept") else { return };
+    let before = d.names("");
+    let line = "reconstruct scan --spec fdk -o kept --force";
+    failed(&d.shell(&format!("exec {other}\"$0\" --quiet \"$@\""), line), &["kept", "Permission denied"]);
+    assert_eq!(d.names(""), before);
+    fs::set_permissions(d.at("kept"), fs::Permissions::from_mode(0o755)).unwrap();
+}
+
 #[test]
 fn a_folder_that_may_not_be_written_is_named() {
     let d = inputs();
@@ -82,15 +112,7 @@ fn a_folder_that_may_not_be_written_is_named() {
     for path in [d.at(""), d.at("locked")] {
         fs::set_permissions(path, fs::Permissions::from_mode(0o555)).unwrap();
     }
-    // The superuser ignores permissions: the command then runs as another user.
-    let mut other = "";
-    if fs::write(d.at("locked/probe"), "").is_ok() {
-        fs::remove_file(d.at("locked/probe")).unwrap();
-        other = "setpriv --reuid=65534 --regid=65534 --clear-groups ";
-        if !d.shell(&format!("{other} \"$0\" \"$@\""), "backends").status.success() {
-            return eprintln!("skipped: this is the superuser, and the command cannot be run as another one");
-        }
-    }
+    let Some(other) = user(&d, "locked") else { return };
     for (line, name) in WRITERS {
         let path = text(&d.at("locked").join(name));
         let output = d.shell(&format!("exec {other}\"$0\" --quiet \"$@\""), &format!("{line} {path}"));
