@@ -20,7 +20,7 @@ pub struct TrialInput {
 }
 
 impl TrialInput {
-    /// What is kept of `input` on the scan with this record.
+    /// The parts of `input` that are kept; `scan` is the record of its scan.
     pub fn of(input: Input, scan: ScanRecord) -> Self {
         let Input { held, reference, peak, .. } = input;
         Self { scan, held, reference: reference.as_ref().map(MiddleSlices::of), peak }
