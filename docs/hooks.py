@@ -1,7 +1,7 @@
 """Pages that are generated when the site is built, so that they are never out of date.
 
-The command's help and the JSON Schemas come from the program: the one that CONEFIELD names, else target/release/conefield, else
-target/release/conefield. The Python page comes from the docstrings, the C page from the header.
+The command's help and the JSON Schemas come from the program: the one that CONEFIELD names, else target/release/conefield. The Python page
+comes from the docstrings, the C page from the header.
 """
 
 import ast

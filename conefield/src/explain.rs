@@ -37,7 +37,7 @@ struct ForScan {
     #[serde(flatten)]
     findings: Findings,
     memory: Memory,
-    /// What is read how often if the memory is too small.
+    /// How often views and volume are read if the memory is too small.
     reads: Vec<String>,
 }
 

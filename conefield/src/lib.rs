@@ -12,7 +12,7 @@
 //! # }
 //! ```
 //!
-//! The command and the Python package stand on the other modules:
+//! The command and the Python package use the other modules:
 //!
 //! - [`specs`]: the shipped specs by name; [`method`]: a spec, built, with its memory.
 //! - [`files`]: volumes, scans and weights by file name; [`plugins`]: libraries with stages; [`parse`]: parsers of
@@ -26,8 +26,8 @@
 //! - [`simulation`], [`pretraining`], [`projection`]: the work of the commands of these names.
 //! - `study`: many runs under one protocol; [`tradeoff`]: time, memory and accuracy of methods.
 //!
-//! The feature `wgpu` adds GPUs; the feature `mpi` adds runs of several processes; the feature `plots` adds pictures, plots and pages, and the studies and searches that
-//! draw them.
+//! The feature `wgpu` adds GPUs, and `mpi` adds runs of several processes. The feature `plots` adds pictures, plots and
+//! pages, and the studies and searches that draw them.
 
 pub mod backend;
 mod devices;

@@ -182,7 +182,7 @@ pub enum Values {
 /// Attenuation is not negative. The noise of a reconstruction stays above this; Hounsfield units of air are far below.
 const LEAST: f32 = -50.0;
 
-/// Refuses a volume whose values are no attenuation, but probably Hounsfield units.
+/// Refuses a volume whose values are not attenuation, but probably Hounsfield units.
 pub fn must_be_attenuation(volume: &Volume) -> conefield_core::Result<()> {
     let [low, high] = range(&volume.data);
     let expected = "attenuation, which is not negative (Hounsfield units? --values hu:0.02 of simulate and convert makes \
@@ -191,8 +191,8 @@ pub fn must_be_attenuation(volume: &Volume) -> conefield_core::Result<()> {
 }
 
 impl Values {
-    /// Maps a volume that is to be projected to attenuation: refuses values as they are that are none, and warns of
-    /// negative ones.
+    /// Maps a volume that is to be projected to attenuation. Refuses values taken as they are that are not attenuation,
+    /// and warns of negative ones.
     pub fn attenuation(self, volume: Volume) -> conefield_core::Result<Volume> {
         let volume = self.apply(volume)?;
         if self == Self::AsIs {

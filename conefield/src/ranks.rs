@@ -26,8 +26,8 @@ static PLACE: OnceLock<Arc<Ranks>> = OnceLock::new();
 /// Number of processes on this machine.
 static ON_MACHINE: OnceLock<u64> = OnceLock::new();
 
-/// From now on, runs of this process are those of all processes that `peers` connects. Waits for all of them: each must
-/// join.
+/// Makes every later run of this process a run of all processes that `peers` connects. Waits until all of them have
+/// joined.
 pub fn join(peers: Arc<dyn Peers>) {
     let _ = ON_MACHINE.set(namesakes(peers.as_ref(), &System::host_name().unwrap_or_default()));
     let _ = PEERS.set(peers);

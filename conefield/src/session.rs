@@ -30,12 +30,12 @@ use std::sync::Arc;
 use std::time::Instant;
 use tracing::info;
 
-/// What is asked of a run, besides the scan.
+/// The request for a run, without the scan.
 #[derive(Default)]
 pub struct Request<'a> {
     /// Reads the requested spec with overriding settings. Without it, the budget chooses.
     pub spec: Option<Read<'a>>,
-    /// What the budget chooses from; the shipped front if `None`.
+    /// The front from which the budget chooses; the shipped front if `None`.
     pub front: Option<Front>,
     /// Overriding settings, as for `--set`.
     pub sets: Vec<String>,

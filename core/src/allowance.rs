@@ -25,8 +25,8 @@ pub fn set_memory(most: u64, held: fn() -> u64) {
     let _ = HELD.set(held);
 }
 
-/// Says that memory holds only `bytes` of the arrays at once; the others are on the disk meanwhile, and `trim` gives
-/// their pages back if the process holds too many.
+/// Sets the bytes of arrays that memory holds at once; the other arrays are on the disk. `trim` frees their pages if the
+/// process holds too many.
 pub fn set_room(bytes: u64, trim: fn()) {
     ROOM.store(bytes, Ordering::Relaxed);
     let _ = TRIM.set(trim);

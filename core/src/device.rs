@@ -1,5 +1,5 @@
-//! A device that runs kernels in WGSL on buffers of its own: the way in which a field with its own line integrals trains on
-//! a GPU. Stages without such needs give WGSL of one row instead ([`crate::wgsl`]).
+//! A device that runs kernels in WGSL on its buffers. A field with its own line integrals uses it to train on a GPU.
+//! Other stages give WGSL of one row instead ([`crate::wgsl`]).
 
 use crate::error::{Error, Result};
 use crate::wgsl::{self, Fragment};

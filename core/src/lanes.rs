@@ -8,7 +8,7 @@ use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Neg, Sub, SubAssign};
 /// widest instructions that it has. Everything acts row by row: `a + b` adds the numbers of each row, and `a * w` with a
 /// single number `w`, such as a parameter, multiplies all of them.
 ///
-/// What has no function here is written for one number: `x.each(f)`.
+/// `x.each(f)` applies any other function `f`, number by number.
 pub trait Lanes:
     Copy
     + Add<Output = Self>
@@ -66,8 +66,8 @@ pub trait Lanes:
     fn sum(self, rows: usize) -> Self::Real;
 }
 
-/// [`Lanes`] as `K` vectors of the instructions `S`. With several side by side, what is done once for all rows costs
-/// less, and the processor has more to do at a time.
+/// [`Lanes`] as `K` vectors of the instructions `S`. With several vectors, work that is done once for all rows costs
+/// less per row, and the processor has more independent work.
 #[derive(Clone, Copy)]
 pub(crate) struct Vectors<S: Simd, R: Real, const K: usize>([V<S, R>; K]);
 

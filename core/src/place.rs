@@ -262,13 +262,13 @@ pub trait Place: Send + Sync {
         u64::MAX
     }
 
-    /// Whether `flag` is true in any of the processes that share the arrays. All of them stop, and write, together.
+    /// Whether `flag` is true in any process that shares the arrays, so that all of them stop and write together.
     fn agree(&self, flag: bool) -> bool {
         flag
     }
 
-    /// How a penalty of a volume of this many planes is divided, if several processes share the arrays. Each needs `halo`
-    /// planes of its neighbours.
+    /// The slab of this process in a penalty of a volume with this many planes, if several processes share the arrays.
+    /// Each process needs `halo` planes of its neighbours.
     fn slab(&self, planes: usize, halo: usize) -> Option<Slab> {
         let _ = (planes, halo);
         None

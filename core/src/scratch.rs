@@ -2,9 +2,9 @@
 //!
 //! [`Allocator`] is the program's allocator, and counts what it holds. After [`begin`], an allocation of at least
 //! [`LARGE`] bytes that does not fit beside the others gets a file of its own. Its pages come into memory when they are
-//! used. A thread takes all such pages out of the process when they and the rest exceed the limit; the system keeps
-//! them in its cache, and writes them to the disk when it needs the memory. Kernels and their order do not depend on
-//! where a number lives, so results do not either.
+//! used. When the process exceeds the limit, a thread frees these pages: the system keeps them in its cache, and writes
+//! them to the disk when it needs the memory. Kernels and their order do not depend on where a number is, so results do
+//! not either.
 //!
 //! The files have no name: no other process can open them, and the system removes them however this process ends. Their
 //! space is reserved at the start, so that a disk that fills up later is no error.

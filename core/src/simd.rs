@@ -343,7 +343,8 @@ fn numbers<S: Simd>(x: S::f32s) -> S::u32s {
     signed.bitcast()
 }
 
-/// Whether registers are shuffled faster than memory is read lane by lane. The baseline of x86-64 has no such instruction.
+/// Whether a shuffle of registers is faster than reading memory lane by lane. The baseline of x86-64 has no such
+/// shuffle.
 #[inline(always)]
 fn shuffles<S: Simd>(s: S) -> bool {
     #[cfg(target_arch = "x86_64")]

@@ -20,11 +20,11 @@ use std::path::PathBuf;
 
 /// Convert the files of a scanner to a scan.
 ///
-/// SCANNER.toml names the files with the projections (TIFF, HDF5, .npy, .npz, .mha) and describes the geometry (in mm)
-/// and the array layout; docs/guide/formats.md has all keys. The file of a vendor can take its place. Raw counts become
-/// line integrals; dead and hot pixels are interpolated. --correct then corrects faults; other options select part of
-/// the scan; --bin averages counts. The command prints a summary of the scan; with -v it also prints what conefield
-/// info prints, and the first and the last view.
+/// SCANNER.toml names the files with the projections (TIFF, HDF5, .npy, .npz, .mat, .mha) and describes the geometry
+/// (in mm) and the array layout; docs/guide/formats.md has all keys. The file of a vendor can take its place. Raw
+/// counts become line integrals; dead and hot pixels are interpolated. --correct then corrects faults; other options
+/// select part of the scan; --bin averages counts. The command prints a summary of the scan; with -v it also prints
+/// what conefield info prints, and the first and the last view.
 #[derive(Args)]
 pub struct ImportArgs {
     /// The description of the scanner, or a vendor's: Nikon's .xtekct, SkyScan's .log, Varian's Scan.xml or

@@ -10,18 +10,18 @@ use mpi::topology::SimpleCommunicator;
 use mpi::traits::{Communicator, CommunicatorCollectives};
 use std::sync::Arc;
 
-/// The connection to the other processes. Dropped, it waits for them.
+/// The connection to the other processes. Its drop waits for them.
 pub struct Joined(Option<Universe>);
 
 impl Joined {
-    /// Ends the other processes with this one: the launcher does, when one ends without leave.
+    /// Lets the launcher end all processes: it does so when one ends without closing the connection.
     pub fn abandon(self) {
         std::mem::forget(self);
     }
 }
 
 impl Drop for Joined {
-    /// After a panic the others wait in vain: they are ended.
+    /// After a panic, the others would wait for ever: the launcher ends them.
     fn drop(&mut self) {
         if std::thread::panicking() {
             std::mem::forget(self.0.take());
@@ -65,7 +65,7 @@ impl Peers for World {
         self.count
     }
 
-    /// In rounds: MPI counts with 32 bits, and a part may be a plane for each of many processes.
+    /// Works in rounds: MPI counts with 32 bits, and a part may be a plane for each of many processes.
     fn exchange(&self, out: &[Vec<f32>], into: &mut [Vec<f32>]) {
         let world = SimpleCommunicator::world();
         let longest = out.iter().chain(&*into).map(Vec::len).max().unwrap_or(0) as u64;

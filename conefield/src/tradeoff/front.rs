@@ -206,14 +206,14 @@ impl Front {
         near
     }
 
-    /// Whether one of its scans is about as large. The front then predicts the cost of methods, given the speeds of
-    /// both machines.
+    /// Whether one of its scans is about as large as `size`. The front then predicts the cost of methods from the
+    /// speeds of both machines.
     pub fn close(&self, size: Size) -> bool {
         let within = |a: f64, b: f64| (a / b).ln().abs() < NEAR.ln();
         self.sizes().any(|then| within(then.pixels, size.pixels) && within(then.voxels, size.voxels))
     }
 
-    /// Whether all of its scans are larger: a method then takes less time than there.
+    /// Whether all of its scans are larger than `size`: a method then takes less time than on them.
     pub fn larger(&self, size: Size) -> bool {
         self.sizes().all(|then| then.pixels > size.pixels && then.voxels > size.voxels)
     }

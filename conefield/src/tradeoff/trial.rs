@@ -22,7 +22,7 @@ pub struct TrialInput {
 }
 
 impl TrialInput {
-    /// What is kept of `input` on the scan with this record.
+    /// The parts of `input` that are kept; `scan` is the record of its scan.
     pub fn of(input: Input, scan: ScanRecord) -> Self {
         let Input { held, reference, reference_fnv1a64, peak, .. } = input;
         Self { scan, held, reference: reference.as_ref().map(MiddleSlices::of), reference_fnv1a64, peak }

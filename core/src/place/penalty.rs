@@ -43,7 +43,7 @@ impl std::fmt::Display for Bounds {
     }
 }
 
-/// What a penalty's coefficients keep to, and its part of a volume that several processes share.
+/// The bounds of a penalty's coefficients, and its slab of a volume that several processes share.
 #[derive(Default)]
 pub struct Confines {
     /// Bounds of all coefficients.
@@ -86,15 +86,15 @@ pub trait Penalty: Send {
     /// on the number of threads.
     fn prox(&mut self, v: &[f32], tau: f32, u: &mut [f32]);
 
-    /// Where it keeps bounds and slab. A penalty that returns them keeps to all of them: [`Penalty::prox`] clips to
-    /// `bounds` and then to `each`, and [`Penalty::kernels`] is `None` with `each`. `None` for a penalty that keeps
-    /// coefficients from being negative and knows no other bounds: clipping its result is no proximal map.
+    /// Its bounds and its slab. A penalty that returns them must respect all of them: [`Penalty::prox`] clips to
+    /// `bounds` and then to `each`, and [`Penalty::kernels`] is `None` if there is `each`. `None` for a penalty whose
+    /// only bound is 0: its result with another bound, clipped, would not be the proximal map.
     fn confines(&mut self) -> Option<&mut Confines> {
         None
     }
 
-    /// Makes `bounds` those of `u` in [`Penalty::prox`], in place of `u ≥ 0`. Called before the first update, unless
-    /// they are the default.
+    /// Sets the bounds of `u` in [`Penalty::prox`], in place of `u ≥ 0`. Called before the first update, unless
+    /// `bounds` are the default.
     ///
     /// # Errors
     /// The penalty, or a part of a sum, has no [`Penalty::confines`].
@@ -105,7 +105,7 @@ pub trait Penalty: Send {
         Ok(())
     }
 
-    /// Gives each coefficient a lower and an upper bound of its own, within those of [`Penalty::confine`].
+    /// Sets a lower and an upper bound of each coefficient, within those of [`Penalty::confine`].
     ///
     /// # Errors
     /// The penalty, or a part of a sum, has no [`Penalty::confines`].
@@ -117,8 +117,8 @@ pub trait Penalty: Send {
         Ok(())
     }
 
-    /// Tells the unit vector along the middle of an arc of less than half a turn, if the views cover such an arc: edges
-    /// across it are the ones that no ray is tangent to. Called before the first update.
+    /// Receives the unit vector along the middle of the arc, if the views cover less than half a turn: no ray is
+    /// tangent to edges across it. Called before the first update.
     fn limited(&mut self, middle: Vec3) {
         let _ = middle;
     }
@@ -128,7 +128,7 @@ pub trait Penalty: Send {
         let _ = shares;
     }
 
-    /// Tells that its grid is a slab of a volume that several processes share. [`Penalty::value`] and
+    /// Makes its grid a slab of a volume that several processes share. [`Penalty::value`] and
     /// [`Penalty::adapt`] then return the sums over [`Slab::own`]. Called at once, if
     /// [`crate::regularizer::Regularizer::halo`] admits slabs.
     fn divide(&mut self, slab: Slab) {

@@ -3,7 +3,7 @@
 //!
 //! Each process projects its slab of the volume; the partial line integrals are summed where their images are kept.
 //! Images go to every process for the adjoint. A penalty works on a slab with copies of its neighbours' planes, which
-//! are renewed before each proximal map. What has no method of its own here works on whole arrays, in every process.
+//! are renewed before each proximal map. An operation without a method here works on whole arrays, in every process.
 //!
 //! Sums over processes are taken in the order of their ranks, so that a number of processes always gives the same bits.
 
@@ -155,7 +155,7 @@ impl Ranks {
         Ok(())
     }
 
-    /// The planes of `x` that this process wants. `wanted` says it for each process.
+    /// The planes of `x` that this process wants. `wanted` has the planes that each process wants.
     fn collected(&self, x: &Array, wanted: &[Vec<usize>]) -> Result<Array3<f32>> {
         let [planes, rows, columns] = x.shape();
         let (size, me) = (rows * columns, self.rank());
@@ -368,7 +368,7 @@ impl Place for Ranks {
         Some(Arc::new(Self { wire: self.wire.clone(), here }))
     }
 
-    /// By the process with the least memory, so that all of them divide their work alike.
+    /// The room of the process with the least memory, so that all of them divide their work alike.
     fn room(&self) -> u64 {
         let least = self.wire.all(self.here.room() as f64).into_iter().fold(f64::INFINITY, f64::min);
         (least as u64).saturating_mul(self.count() as u64)
