@@ -14,10 +14,10 @@ pub fn product(a: &[Vec<f64>], b: &[Vec<f64>]) -> Vec<Vec<f64>> {
 /// The inverse of a small matrix by Gauss-Jordan elimination; `None` if a pivot vanishes.
 pub fn inverse(mut a: Vec<Vec<f64>>) -> Option<Vec<Vec<f64>>> {
     let n = a.len();
+    let scale = a.iter().flatten().fold(0.0f64, |m, x| m.max(x.abs()));
     for (i, row) in a.iter_mut().enumerate() {
         row.extend((0..n).map(|j| f64::from(u8::from(i == j))));
     }
-    let scale = a.iter().flatten().fold(0.0f64, |m, x| m.max(x.abs()));
     for k in 0..n {
         let pivot = (k..n).max_by(|&i, &j| a[i][k].abs().total_cmp(&a[j][k].abs()))?;
         a.swap(k, pivot);
@@ -48,6 +48,7 @@ mod tests {
                 assert!((x - f64::from(u8::from(i == j))).abs() < 1e-12, "{unit:?}");
             }
         }
+        assert_eq!(inverse(vec![vec![0.5f64.powi(60)]]), Some(vec![vec![2f64.powi(60)]]));
         assert_eq!(inverse(vec![vec![1.0, 2.0], vec![2.0, 4.0]]), None);
     }
 }

@@ -81,7 +81,8 @@ impl CircularOrbit {
         self.angles.iter().map(|&a| self.view(a)).collect()
     }
 
-    /// The orbit of `views`, or `None` if they do not lie on one circle to a relative 1e-9.
+    /// The orbit of `views`, or `None` if they do not lie on one circle to a relative 1e-9, and their detectors to at
+    /// most 1e-5 of a pixel.
     ///
     /// Angles increase or decrease monotonically, without jumps of more than half a turn.
     pub fn fit(views: &[View]) -> Option<Self> {
@@ -109,13 +110,15 @@ impl CircularOrbit {
         };
         let scale = dso.abs().max(orbit.dsd.abs());
         let pixel = orbit.pixel[0].max(orbit.pixel[1]);
+        // The source of parallel rays is so far away that its share of rounding would hide a pixel's shift.
+        let fine = scale.min(1e4 * pixel);
         let near = |a: [f64; 3], b: [f64; 3], scale: f64| norm(sub(a, b)) <= TOLERANCE * scale;
         let fits = dso > 0.0
             && orbit.dsd > 0.0
             && views.iter().zip(&orbit.angles).all(|(v, &a)| {
                 let w = orbit.view(a);
                 near(v.source, w.source, scale)
-                    && near(v.detector, w.detector, scale)
+                    && near(v.detector, w.detector, fine)
                     && near(v.u, w.u, pixel)
                     && near(v.v, w.v, pixel)
             });
@@ -155,8 +158,14 @@ impl Arcs {
         order.sort_unstable_by(|&a, &b| angles[a].total_cmp(&angles[b]).then(a.cmp(&b)));
         let n = order.len();
         // The gap after each view, in the order of angles.
-        let gaps: Vec<f64> = (0..n).map(|i| (angles[order[(i + 1) % n]] - angles[order[i]]).rem_euclid(TAU)).collect();
-        let gaps = if n == 1 { vec![TAU] } else { gaps };
+        let mut gaps: Vec<f64> =
+            (0..n).map(|i| (angles[order[(i + 1) % n]] - angles[order[i]]).rem_euclid(TAU)).collect();
+        // Views at one angle stand for the whole turn.
+        if gaps.iter().all(|g| *g == 0.0)
+            && let Some(last) = gaps.last_mut()
+        {
+            *last = TAU;
+        }
         let ends = ends(&gaps);
         let within = |g: &usize| !ends.contains(g);
         let [sum, squares] = (0..n).filter(within).fold([0.0, 0.0], |[s, q], g| [s + gaps[g], q + gaps[g] * gaps[g]]);
@@ -268,6 +277,19 @@ mod tests {
         assert_eq!(CircularOrbit::fit(&[]), None);
     }
 
+    /// Its source is far away, but part of a pixel is a shift for the detector.
+    #[test]
+    fn a_parallel_beam_with_a_shifted_detector_is_no_orbit() {
+        let volume = VoxelGrid { shape: [512; 3], spacing: [1.0; 3], center: [0.0; 3] };
+        let mut views: Vec<View> = circle().iter().map(|v| v.parallel(v.normal().0, &volume)).collect();
+        views.iter_mut().for_each(|v| v.detector[2] = 0.0);
+        views.iter_mut().for_each(|v| v.source[2] = 0.0);
+        assert!(CircularOrbit::fit(&views).is_some());
+        views[2].source[2] += 0.05;
+        views[2].detector[2] += 0.05;
+        assert_eq!(CircularOrbit::fit(&views), None);
+    }
+
     /// Angles of `n` views from `start` over `arc` degrees.
     fn degrees(start: f64, arc: f64, n: usize) -> Vec<f64> {
         (0..n).map(|i| (start + arc * i as f64 / n as f64).to_radians()).collect()
@@ -289,6 +311,9 @@ mod tests {
         };
         near(found(&degrees(20.0, 360.0, 90)), &[]);
         near(found(&degrees(20.0, -360.0, 3)), &[]);
+        // One view, and views at one angle.
+        near(found(&[1.0]), &[]);
+        near(found(&[1.0; 3]), &[]);
         near(found(&degrees(10.0, 200.0, 200)), &[[9.5, 200.0]]);
         let two = [degrees(0.0, 60.0, 60), degrees(180.0, 100.0, 100)].concat();
         near(found(&two), &[[-0.5, 60.0], [179.5, 100.0]]);

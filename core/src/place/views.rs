@@ -67,9 +67,9 @@ impl Weighing<'_> {
     ) -> Option<f64> {
         let misfits = self.term.map(|term| self.each_image(views, images, |view, p, r| term.differentiate(view, p, r)));
         if let Some(weights) = weights {
-            for (mut image, &v) in images.axis_iter_mut(Axis(0)).zip(views) {
+            parallel::over(images.axis_iter_mut(Axis(0)).zip(views), |_, (mut image, &v)| {
                 image.zip_mut_with(&weights.index_axis(Axis(0), v), |r, w| *r *= w);
-            }
+            });
         }
         misfits.map(|m| m.iter().sum())
     }
