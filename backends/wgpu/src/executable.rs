@@ -299,7 +299,8 @@ impl Wgpu {
             let piece = &points[at..(at + self.pace.size() as usize).min(points.len())];
             let rows = piece.len() as u32;
             self.reserve_rows(rows)?;
-            let stride = self.room;
+            // Whole workgroups, since all of their invocations may write.
+            let stride = rows.next_multiple_of(GROUP).min(self.room);
             let bytes = 4 * u64::from(stride) * width as u64;
             self.programs.reserve_as(result, bytes, U::STORAGE | U::COPY_SRC)?;
             // The result ends with the last channel's rows.
