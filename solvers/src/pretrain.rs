@@ -169,13 +169,17 @@ fn scene(volume: &Volume, settings: &SceneSettings) -> Result<Scene> {
     Scene::with_attenuation(volume.grid, settings, attenuation)
 }
 
-/// Draws random voxel centres with their values.
+/// Draws random voxels' centres inside the object's support, with their values.
 fn draw(volume: &Volume, scene: &Scene, seed: u64, step: u64, count: usize, out: &mut Vec<([f32; 3], f32)>) {
     let mut rng = stream(seed ^ 0x70_7265, step);
     let shape = volume.grid.shape;
     out.clear();
     for _ in 0..count {
-        let index: [usize; 3] = std::array::from_fn(|k| rng.random_range(0..shape[k]));
+        let mut any = || -> [usize; 3] { std::array::from_fn(|k| rng.random_range(0..shape[k])) };
+        let first = any();
+        // A support that is a tiny part of the volume must not cause a long loop.
+        let held = std::iter::once(first).chain((0..1000).map(|_| any())).find(|i| scene.holds(volume.grid.voxel(*i)));
+        let index = held.unwrap_or(first);
         out.push((scene.voxel(index), (f64::from(volume.data[index]) / scene.attenuation) as f32));
     }
 }
@@ -183,11 +187,31 @@ fn draw(volume: &Volume, scene: &Scene, seed: u64, step: u64, count: usize, out:
 #[cfg(test)]
 mod tests {
     use super::*;
+    use conefield_core::geometry::VoxelGrid;
+    use conefield_core::support::{Cylinder, Support};
+    use ndarray::Array3;
+
+    /// The unit cube fits the support: voxels outside would all lie on its sides.
+    #[test]
+    fn only_voxels_of_the_support_are_drawn() {
+        let grid = VoxelGrid { shape: [16; 3], spacing: [1.0; 3], center: [0.0; 3] };
+        let inside = |i: usize, j: usize| (i as f64 - 7.5).hypot(j as f64 - 7.5) < 4.0;
+        let data = Array3::from_shape_fn(grid.shape, |(x, y, _)| f32::from(u8::from(inside(x, y))));
+        let scene = Scene::with_attenuation(grid, &SceneSettings::default(), 1.0).unwrap();
+        let mut points = vec![];
+        let volume = Volume { grid, data, affine: None };
+        draw(&volume, &scene, 1, 0, 500, &mut points);
+        assert!(points.iter().any(|p| p.1 == 0.0));
+        let cylinder = Support::cylinder(Cylinder { center: [0.0; 2], radius: 4.0 }, &grid).unwrap();
+        let scene = scene.within(cylinder, &SceneSettings::default());
+        draw(&volume, &scene, 1, 0, 500, &mut points);
+        assert!(points.len() == 500 && points.iter().all(|p| p.1 == 1.0));
+    }
 
     #[test]
     fn values_without_a_scale_are_named() {
         for (value, want) in [(1e38, "too large"), (0.0, "no attenuation")] {
-            let volume = Volume::centered(ndarray::Array3::from_elem((4, 4, 4), value), [1.0; 3]);
+            let volume = Volume::centered(Array3::from_elem((4, 4, 4), value), [1.0; 3]);
             let e = scene(&volume, &SceneSettings::default()).unwrap_err().to_string();
             assert!(e.contains(want), "{e}");
         }

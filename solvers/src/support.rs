@@ -7,7 +7,8 @@
 //! unknown. Neighbours of remaining cells stay too.
 
 use crate::shadow::{dark_differences, dilated};
-use conefield_core::geometry::{Vec3, VoxelGrid, norm};
+use conefield_core::error::{Result, ensure};
+use conefield_core::geometry::{Geometry, Vec3, VoxelGrid, norm};
 use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use conefield_core::support::Support;
@@ -25,6 +26,14 @@ const TOGETHER: usize = 8;
 /// Share of the views that see a cell and must show air there, and their minimum number.
 const SHARE: f64 = 0.15;
 const VIEWS: usize = 2;
+
+/// Refuses a scan no ray of which meets the volume.
+pub(crate) fn meets_the_volume(g: &Geometry) -> Result<()> {
+    let (bounds, [rows, columns]) = (g.volume.bounds(), g.detector);
+    let meets = |v, p: usize| g.ray(v, p / columns, p % columns).clip(bounds).is_some();
+    let met = (0..g.views.len()).any(|v| (0..rows * columns).any(|p| meets(v, p)));
+    ensure(met, "scan", "geometry", "rays that all miss the volume", "rays through the volume")
+}
 
 /// The result of carving.
 pub struct CarvedSupport {

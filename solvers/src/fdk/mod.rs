@@ -11,7 +11,7 @@ pub mod weights;
 
 use crate::iterative::drive::finite;
 use crate::iterative::monitor::VolumeMonitor;
-use crate::support::{Blocks, corners};
+use crate::support::{Blocks, corners, meets_the_volume};
 use crate::surround::{self, Corrected};
 use axis::{Axis as OrbitAxis, upright};
 use conefield_core::Error;
@@ -91,6 +91,8 @@ impl Plan for Fdk {
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let start = Instant::now();
         job.scan.validate("scan")?;
+        // Otherwise the columns that the detector lacks beside the volume have no limit.
+        meets_the_volume(&job.scan.geometry)?;
         let corrected = Corrected::of(job, self.scene.surround, None, observer)?;
         let job = &Corrected::job(corrected.as_ref(), job);
         let axis = OrbitAxis::of(&job.scan.geometry);

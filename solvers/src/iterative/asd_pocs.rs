@@ -96,7 +96,9 @@ impl Iteration for AsdPocsIterate {
             descend(place, &mut self.sweep.x, anisotropy(grid), self.length, 1e-3 * mean as f32, &mut self.sweep.work)?;
             problem.outside(&mut self.sweep.x, 0.0)?;
         }
-        self.sweep.confine(problem)?;
+        // The descents leave the bounds.
+        let bounds = self.sweep.bounds(problem);
+        problem.clip(&mut self.sweep.x, bounds)?;
         let prior = distance(place, &self.sweep.x, &self.fitted)?;
         if prior > RATIO * data && residual.sqrt() > self.target {
             self.length *= ALPHA_DECAY;

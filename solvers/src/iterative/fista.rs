@@ -169,7 +169,7 @@ impl Iterative for FistaMethod {
         observer.note(&iterate.description());
         if problem.place.device().is_some() {
             iterate.elsewhere().into_iter().for_each(|what| {
-                observer.note(&format!("{what} runs on the CPU: what it works on is moved in every pass"));
+                observer.note(&format!("{what} runs on the CPU: what it works on is moved in every update"));
             });
         }
         drive(job, &self.shared.stop, begun, &problem, buffers, Box::new(iterate), observer)
@@ -451,7 +451,7 @@ impl FistaIterate {
         format!("{}: the prior's weight is {:.3e}", self.data.describe(), self.lambda / side)
     }
 
-    /// The stages that run on the host in every pass, wherever the arrays are.
+    /// The stages that run on the host in every update, wherever the arrays are.
     fn elsewhere(&mut self) -> Vec<&'static str> {
         let Arrays { model, penalty, .. } = &mut self.arrays;
         let stages = [
@@ -502,7 +502,8 @@ impl Iteration for FistaIterate {
             self.objective = self.misfit + self.lambda * value;
         }
         let (mut residual, mut misfit) = (0.0, 0.0);
-        let subsets = split(self.views, self.subsets as usize);
+        // A checkpoint says how many there are, and may be wrong.
+        let subsets = split(self.views, (self.subsets as usize).clamp(1, self.views));
         for s in self.order.of(subsets.len(), problem.seed, pass) {
             let [r, m] = self.update(problem, &subsets[s])?;
             residual += r;

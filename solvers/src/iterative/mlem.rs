@@ -148,6 +148,10 @@ impl Misfit for Likelihood {
                 *r = 0.0;
                 continue;
             }
+            if *p < 0.0 {
+                // Noise can make a line integral negative; the likelihood takes it as 0.
+                *r = -a;
+            }
             let p = f64::from(p.max(0.0));
             let logarithm = if p > 0.0 { p * (p / f64::from(a)).ln() } else { 0.0 };
             sum += logarithm - p + f64::from(a);
@@ -176,5 +180,23 @@ impl Misfit for Likelihood {
 
     fn describe(&self) -> String {
         "Poisson's likelihood of the line integrals".into()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Noise makes line integrals negative. Value and slope take them as 0, so that no factor of an update is negative.
+    #[test]
+    fn a_negative_line_integral_counts_as_zero() {
+        let of = |p: f32| {
+            let mut residuals = [p - 2.0];
+            let value = Likelihood { least: 1e-6 }.differentiate(0, &[p], &mut residuals);
+            (value, residuals[0])
+        };
+        assert_eq!(of(-3.0), (2.0, -1.0));
+        assert_eq!(of(-3.0), of(0.0));
+        assert_eq!(of(1.0).1, -0.5);
     }
 }

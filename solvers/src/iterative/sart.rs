@@ -114,12 +114,12 @@ impl Sweep {
         Ok(square)
     }
 
-    fn bounds(&self, problem: &Problem<'_>) -> Bounds {
+    pub(super) fn bounds(&self, problem: &Problem<'_>) -> Bounds {
         Bounds { low: if self.updates.nonnegative { problem.bounds.low } else { f32::MIN }, ..problem.bounds }
     }
 
     /// Clips the volume to what an update does not keep to by itself: the upper bound, and bounds of regions.
-    pub(super) fn confine(&mut self, problem: &Problem<'_>) -> Result<()> {
+    fn confine(&mut self, problem: &Problem<'_>) -> Result<()> {
         let bounds = self.bounds(problem);
         if bounds.high < f32::INFINITY || !problem.regions.is_empty() {
             problem.clip(&mut self.x, bounds)?;

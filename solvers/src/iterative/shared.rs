@@ -6,6 +6,7 @@ use super::problem::Problem;
 use super::regions::Regions;
 use super::stop::Stop;
 use crate::fit::{Object, object};
+use crate::support::meets_the_volume;
 use crate::surround::Corrected;
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
@@ -172,10 +173,7 @@ impl Shared {
     ) -> Result<Opened> {
         job.scan.validate("scan")?;
         let g = &job.scan.geometry;
-        let (bounds, [rows, columns]) = (g.volume.bounds(), g.detector);
-        let meets = |v, p: usize| g.ray(v, p / columns, p % columns).clip(bounds).is_some();
-        let met = (0..g.views.len()).any(|v| (0..rows * columns).any(|p| meets(v, p)));
-        ensure(met, "scan", "geometry", "rays that all miss the volume", "rays through the volume")?;
+        meets_the_volume(g)?;
         let place = self.place(method, job, observer)?;
         let on = place.device().map(|device| format!(", on {device}")).unwrap_or_default();
         observer.note(&format!("{text}; {}{on}", self.projector.describe()));
@@ -188,6 +186,8 @@ impl Shared {
             parallel::over(inside.outer_iter_mut(), |x, mut plane| {
                 plane.indexed_iter_mut().for_each(|((y, z), i)| *i = support.holds(grid.voxel([x, y, z])));
             });
+            let some = inside.iter().any(|held| *held);
+            ensure(some, "spec", "scene.support", "a region that holds no centre of a voxel", "a region with voxels")?;
             place.mask(inside)
         });
         let inside = inside.transpose()?;

@@ -54,8 +54,8 @@ pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) 
             callbacks.0.iter_mut().for_each(|c| c.masked());
         }
         step(run, task, callbacks)?;
-        let share = run.clock.done(run.step);
-        let left = run.clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9);
+        let share = run.clock.done(run.step).min(1.0);
+        let left = run.clock.seconds() * (1.0 - share) / share.max(1e-9);
         run.observer.progress(run.step, share, left);
     }
     run.clock.pause();

@@ -189,7 +189,8 @@ struct PatchesPenalty {
 impl PatchesPenalty {
     /// Replaces the groups. The dual starts anew, since it belongs to those of before.
     fn regroup(&mut self, groups: Vec<[u32; MANY]>) {
-        let Self { lattice: Lattice { offsets, .. }, sum, .. } = self;
+        let Self { lattice, sum, .. } = self;
+        let (chunk, offsets) = (lattice.chunk(), &lattice.offsets);
         // For a moment, the sum is the number of patches that cover a voxel.
         sum.fill(0.0);
         let reads =
@@ -200,7 +201,8 @@ impl PatchesPenalty {
             let most = reads(at).map(|i| sum[i]).fold(1.0, f32::max);
             Similar { at, weight: 1.0 / mean, rate: mean / most }
         };
-        self.groups = groups.into_iter().map(weighted).collect();
+        let part = |_, part: &[[u32; MANY]]| part.iter().map(|at| weighted(*at)).collect::<Vec<_>>();
+        self.groups = parallel::map(groups.chunks(chunk), part).into_iter().flatten().collect();
         self.sum.fill(0.0);
         self.dual.fill(0.0);
     }
