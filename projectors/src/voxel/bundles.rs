@@ -10,7 +10,6 @@ use super::layout::main_axis;
 use super::walk::VoxelRay;
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
 use conefield_core::parallel;
-use conefield_core::scan::ScanHeader;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
 use std::ops::Range;
@@ -219,13 +218,6 @@ impl<R: Real> Op for BundlesForward<'_, R> {
             }
         }
     }
-}
-
-/// Bytes that [`adjoint`] needs in single precision: the bundles, as found and as one list, and each thread's planes.
-pub fn scratch(header: &ScanHeader) -> u64 {
-    let mut sides = header.volume;
-    sides.sort_unstable();
-    (2 * HELD + rayon::current_num_threads() * TILE * sides[1] * sides[2] * size_of::<f32>()) as u64
 }
 
 /// Adds the adjoint of [`forward`] to `volume`.

@@ -97,7 +97,7 @@ impl VoxelProjector for Joseph {
         Some(Fragment::new(&[include_str!("walk.wgsl"), include_str!("joseph.wgsl")]))
     }
     fn scratch(&self, header: &ScanHeader, views: usize) -> u64 {
-        columns::scratch(header, views).max(bundles::scratch(header))
+        columns::scratch(header, views)
     }
     fn describe(&self) -> String {
         "joseph: bilinear from plane to plane".into()
