@@ -125,5 +125,6 @@ impl Peers for Thread {
             into.copy_from_slice(&lock(from)[self.rank]);
         }
         self.threads.meet();
+        lock(&self.threads.sent[self.rank]).clear();
     }
 }
