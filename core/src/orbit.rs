@@ -281,9 +281,9 @@ mod tests {
     #[test]
     fn a_parallel_beam_with_a_shifted_detector_is_no_orbit() {
         let volume = VoxelGrid { shape: [512; 3], spacing: [1.0; 3], center: [0.0; 3] };
-        let mut views: Vec<View> = circle().iter().map(|v| v.parallel(v.normal().0, &volume)).collect();
-        views.iter_mut().for_each(|v| v.detector[2] = 0.0);
-        views.iter_mut().for_each(|v| v.source[2] = 0.0);
+        let (mm, none) = (Millimetres, [Millimetres(0.0); 2]);
+        let view = |i: i32| View::circular(Radians(0.3 + f64::from(i)), mm(500.0), mm(800.0), [mm(1.0); 2], none);
+        let mut views: Vec<View> = (0..5).map(view).map(|v| v.parallel(v.normal().0, &volume)).collect();
         assert!(CircularOrbit::fit(&views).is_some());
         views[2].source[2] += 0.05;
         views[2].detector[2] += 0.05;

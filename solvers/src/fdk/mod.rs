@@ -91,14 +91,14 @@ impl Plan for Fdk {
     fn run(&mut self, job: &Job<'_>, observer: &mut dyn Observer) -> Result<Solution> {
         let start = Instant::now();
         job.scan.validate("scan")?;
-        // Otherwise the columns that the detector lacks beside the volume have no limit.
-        meets_the_volume(&job.scan.geometry)?;
         let corrected = Corrected::of(job, self.scene.surround, None, observer)?;
         let job = &Corrected::job(corrected.as_ref(), job);
         let axis = OrbitAxis::of(&job.scan.geometry);
         let upright = upright(&job.scan.geometry, axis.as_ref());
         let orbit = FdkOrbit::of(&upright);
         check(&orbit, &upright, job.scan.geometry.volume, axis.as_ref())?;
+        // Otherwise the columns that the detector lacks beside the volume have no limit.
+        meets_the_volume(&job.scan.geometry)?;
         axis.iter().for_each(|axis| observer.note(&axis.describe()));
         observer.note(&orbit.describe());
         if job.limits.steps.is_some() {
