@@ -67,7 +67,9 @@ impl ViewChoice {
             Self::Every(k) => return Ok((0..n).step_by(*k).collect()),
             Self::Pieces(pieces) => pieces,
         };
-        if let Some(last) = pieces.iter().map(|&[first, last, step]| last - (last - first) % step).find(|last| *last >= n) {
+        if let Some(last) =
+            pieces.iter().map(|&[first, last, step]| last - (last - first) % step).find(|last| *last >= n)
+        {
             return refused(
                 format!("{self}, which includes view {last}"),
                 format!("numbers below {n}, the views of the scan"),

@@ -57,7 +57,8 @@ impl Windows {
     pub fn validate(&self, rays: usize) -> Result<()> {
         ensure((2..=256).contains(&self.side), "spec", "side", self.side, "2 to 256 pixels")?;
         let most = rays / (self.side * self.side);
-        let room = format!("windows of at most {rays} pixels, the rays of a step, or at least {} rays", self.side * self.side);
+        let room =
+            format!("windows of at most {rays} pixels, the rays of a step, or at least {} rays", self.side * self.side);
         ensure(most > 0, "spec", "side", self.side, room)?;
         ensure((1..=most).contains(&self.count), "spec", "count", self.count, format!("1 to {most} for {rays} rays"))
     }
