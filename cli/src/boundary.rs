@@ -29,6 +29,13 @@ impl Inputs {
         if path.exists() {
             self.0.push(path.to_path_buf());
         }
+        // A header names the file with its voxels.
+        if has_extension(path, &["nhdr", "mhd"]) {
+            let text = conefield_core::files::read_text(path, 16 << 20).unwrap_or_default();
+            let named = text.lines().filter_map(|line| line.split_once([':', '=']));
+            let named = named.map(|(_, name)| folder_of(path).join(name.trim_start_matches('=').trim()));
+            self.0.extend(named.filter(|file| file.is_file()));
+        }
     }
 
     /// Adds a spec with everything it extends and names.
@@ -55,6 +62,9 @@ impl Inputs {
 
     /// Refuses to write a file that is an input or lies in an input folder.
     pub fn spare_file(&self, output: &Path) -> Result<()> {
+        if has_extension(output, &["mhd"]) {
+            self.spare_file(&output.with_extension("raw"))?;
+        }
         if output.symlink_metadata().is_err() {
             return Ok(());
         }
@@ -78,6 +88,10 @@ impl Inputs {
         }
         Ok(())
     }
+}
+
+fn has_extension(path: &Path, ends: &[&str]) -> bool {
+    path.extension().is_some_and(|e| ends.iter().any(|end| e.eq_ignore_ascii_case(end)))
 }
 
 fn place(path: &Path) -> String {
@@ -136,4 +150,23 @@ pub fn text(path: &Path) -> Result<&str> {
             "a name in UTF-8, which a spec can hold: rename or link it",
         )
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_data_file_of_a_header_is_spared() {
+        let d = tempfile::tempdir().unwrap();
+        let at = |name: &str| d.path().join(name);
+        for (header, line) in [("a.nhdr", "data file: a.raw"), ("b.mhd", "ElementDataFile = a.raw")] {
+            std::fs::write(at(header), format!("{line}\n")).unwrap();
+            std::fs::write(at("a.raw"), "voxels").unwrap();
+            let inputs = Inputs::of([at(header)]);
+            for (output, free) in [("a.mhd", false), ("a.raw", false), ("c.mhd", true)] {
+                assert_eq!(inputs.spare(&at(output), true).is_ok(), free, "{header} {output}");
+            }
+        }
+    }
 }

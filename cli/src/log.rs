@@ -37,7 +37,10 @@ pub fn start(verbose: u8, quiet: bool) {
         .with_target(false);
     let kept = match &filter {
         Some(Ok(targets)) => targets.clone(),
-        _ => Targets::new().with_default(level),
+        // These crates write hundreds of lines about one start of a GPU.
+        _ => Targets::new()
+            .with_default(level)
+            .with_targets(["wgpu_core", "wgpu_hal", "naga"].map(|name| (name, level.min(LevelFilter::WARN)))),
     };
     let _ = tracing_subscriber::registry().with(written.with_filter(kept)).try_init();
     if let Some(Err(e)) = filter {

@@ -136,6 +136,12 @@ mod tests {
     }
 
     #[test]
+    fn numbers_above_0_are_named_in_words() {
+        let e = read::<std::collections::BTreeMap<String, std::num::NonZeroUsize>>("a.toml", "k = 0").unwrap_err();
+        assert_eq!(e.to_string(), "a.toml:1:5: k: found 0, expected a whole number of at least 1");
+    }
+
+    #[test]
     fn a_changed_type_drops_the_keys_of_the_old_one() {
         let mut base = parse_toml("base", "[a]\ntype = 'one'\nk = 1\n[b]\ntype = 'one'\nk = 1\n", 1).unwrap();
         base.merge(parse_toml("over", "[a]\ntype = 'two'\n[b]\nl = 2\n", 1).unwrap());

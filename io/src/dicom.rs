@@ -141,8 +141,8 @@ fn even(place: &str, slices: &[Slice], normal: [f64; 3]) -> Result<()> {
     let mut missing = Vec::new();
     for (pair, &step) in slices.windows(2).zip(&steps) {
         let names = format!("{} and {}", pair[0].name(), pair[1].name());
-        // Files give positions to about a micrometre.
-        if step < 1e-3 {
+        // Files give positions to about a thousandth of a pixel.
+        if step < 1e-3 * slices[0].spacing[0].min(slices[0].spacing[1]) {
             let found = format!("{:?} in {names}", pair[0].position);
             return Err(Error::invalid(place, "ImagePositionPatient", found, "another position for every slice"));
         }

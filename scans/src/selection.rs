@@ -67,7 +67,9 @@ impl ViewChoice {
             Self::Every(k) => return Ok((0..n).step_by(*k).collect()),
             Self::Pieces(pieces) => pieces,
         };
-        if let Some(last) = pieces.iter().map(|p| p[1]).find(|last| *last >= n) {
+        if let Some(last) =
+            pieces.iter().map(|&[first, last, step]| last - (last - first) % step).find(|last| *last >= n)
+        {
             return refused(
                 format!("{self}, which includes view {last}"),
                 format!("numbers below {n}, the views of the scan"),
@@ -267,6 +269,7 @@ mod tests {
     fn views_are_named_in_words() {
         assert_eq!(choice("0-719:10").of(720).unwrap(), (0..720).step_by(10).collect::<Vec<_>>());
         assert_eq!(choice("0-6:3").of(8).unwrap(), [0, 3, 6]);
+        assert_eq!(choice("0-6:10").of(6).unwrap(), [0]);
         assert_eq!(choice("9, 3,7").of(10).unwrap(), [9, 3, 7]);
         assert_eq!(choice("5,0-2").of(6).unwrap(), [5, 0, 1, 2]);
         assert_eq!(choice("every:3").of(8).unwrap(), [0, 3, 6]);

@@ -57,6 +57,9 @@ impl Windows {
     pub fn validate(&self, rays: usize) -> Result<()> {
         ensure((2..=256).contains(&self.side), "spec", "side", self.side, "2 to 256 pixels")?;
         let most = rays / (self.side * self.side);
+        let room =
+            format!("windows of at most {rays} pixels, the rays of a step, or at least {} rays", self.side * self.side);
+        ensure(most > 0, "spec", "side", self.side, room)?;
         ensure((1..=most).contains(&self.count), "spec", "count", self.count, format!("1 to {most} for {rays} rays"))
     }
 
@@ -285,6 +288,8 @@ mod tests {
     fn windows_that_do_not_fit_are_refused() {
         assert!(Windows { count: 16, side: 8 }.validate(2048).is_ok());
         // If there are fewer rays, as many windows as fit.
+        let error = Windows { count: 16, side: 8 }.validate(32).unwrap_err().to_string();
+        assert!(error.contains("side: found 8") && error.contains("at least 64 rays"), "{error}");
         assert_eq!(Windows { count: 16, side: 8 }.fitting(1000), 15);
         for (windows, named) in [((33, 8), "count"), ((0, 8), "count"), ((1, 1), "side"), ((1, 257), "side")] {
             let error = Windows { count: windows.0, side: windows.1 }.validate(2048).unwrap_err().to_string();

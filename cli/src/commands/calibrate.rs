@@ -80,7 +80,7 @@ impl CalibrateArgs {
         let watch = Shown::new();
         let directions = directions(&scan, backend.as_ref(), &watch)?;
         drop(watch);
-        let mut corrected = scan.clone();
+        let mut corrected = scan;
         found.correct(&mut corrected, &self.scan.display().to_string());
         let jitter =
             self.jitter.then(|| jitter(&corrected, self.pixels.into(), backend.as_ref(), &Shown::new())).transpose()?;

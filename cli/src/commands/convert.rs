@@ -11,8 +11,10 @@ use conefield::hounsfield::How;
 use conefield::memory::Memory;
 use conefield::parse::{self, Values};
 use conefield_core::error::ensure;
+use conefield_core::scan::Unit;
 use conefield_core::{Error, Result};
 use conefield_io::{DataSet, DicomTemplate, Parts, write_voxels_of};
+use conefield_projectors::simulate::HuMapping;
 use conefield_scans::diagnosis::survey;
 use std::path::PathBuf;
 
@@ -78,6 +80,10 @@ impl ConvertArgs {
                 let expected = "a scan: only scans have views and pixels";
                 return Err(Error::invalid(place, option, "a volume", expected));
             }
+            // Mapped values are no Hounsfield units.
+            if self.values != Values::AsIs {
+                self.units.of_attenuation()?;
+            }
             let template = self.dicom_template.as_ref().map(DicomTemplate::read).transpose()?;
             let voxels = conefield_io::volume_voxels(&self.input)?;
             Memory::of_volumes(&[voxels]).check()?;
@@ -88,8 +94,12 @@ impl ConvertArgs {
             if self.units.hu.as_ref().is_some_and(|how| *how != How::Already) {
                 parse::must_be_attenuation(volume)?;
             }
-            let wanted = self.units.hu.is_some() && self.values == Values::AsIs;
-            let unit = if wanted { unit_of(&self.input)? } else { None };
+            let unit = match self.values {
+                _ if self.units.hu.is_none() => None,
+                Values::AsIs => unit_of(&self.input)?,
+                Values::Hu(HuMapping::Mu { .. }) => None,
+                Values::Hu(HuMapping::Clip { .. }) => Some(Unit { name: "clipped range".into(), mm: 1.0 }),
+            };
             let hu = self.units.open(&self.input, unit.as_ref(), &volume.grid, volume.affine.as_ref())?;
             match hu.map(|hu| hu.measure(&mut volume)).transpose()? {
                 Some(levels) => write_voxels_of(&self.output, &mut levels.of(&mut volume), template.as_ref())?,

@@ -69,7 +69,7 @@ impl ProjectArgs {
 
         let volume = conefield_io::read_volume(&self.volume)?;
         parse::must_be_attenuation(&volume)?;
-        let scan = self.chosen(files::scan(&self.like)?)?;
+        let (scan, chosen) = self.chosen(files::scan(&self.like)?)?;
         let mut geometry = scan.geometry.clone();
         // Of the readable formats only NumPy arrays have no affine.
         geometry.volume = projection::placed(&volume, &scan.geometry.volume, volume.affine.is_some());
@@ -97,30 +97,30 @@ impl ProjectArgs {
         if let Some(folder) = &self.residual {
             conefield_io::write_scan(folder, &of(predicted.projections, "residual"), None)?;
         }
-        self.report(&scan, &residual, project_s, memory)
+        self.report(&scan, &chosen, &residual, project_s, memory)
     }
 
-    /// The scan with the requested views.
-    fn chosen(&self, scan: Scan) -> Result<Scan> {
+    /// The scan with the requested views, and their indices.
+    fn chosen(&self, scan: Scan) -> Result<(Scan, Vec<usize>)> {
         let n = scan.geometry.views.len();
         match conefield::input::chosen(self.views.as_ref(), n)? {
-            all if all.is_empty() || all.len() == n => Ok(scan),
-            some => Ok(scan.split(&some)?.1),
+            all if all.is_empty() || all.len() == n => Ok((scan, (0..n).collect())),
+            some => Ok((scan.split(&some)?.1, some)),
         }
     }
 
     /// Prints the result.
-    fn report(&self, scan: &Scan, residual: &Residual, project_s: f64, memory: Memory) -> Result<()> {
+    fn report(&self, scan: &Scan, chosen: &[usize], residual: &Residual, project_s: f64, memory: Memory) -> Result<()> {
         let (n, [rows, columns]) = (scan.geometry.views.len(), scan.geometry.detector);
         if self.json {
             return out::json(&json!({
                 "predicted": self.output, "residual": self.residual, "views": n, "detector": [rows, columns],
                 "residual_rms": residual.rms, "residual_relative": residual.relative,
-                "residual_rms_of_views": residual.views, "project_s": project_s, "memory": memory,
+                "residual_rms_of_views": residual.views, "indices_of_views": chosen, "project_s": project_s, "memory": memory,
                 "peak_bytes": memory::peak(),
             }));
         }
-        let worst = residual.views.iter().copied().enumerate().max_by(|a, b| a.1.total_cmp(&b.1));
+        let worst = chosen.iter().zip(residual.views.iter().copied()).max_by(|a, b| a.1.total_cmp(&b.1));
         let worst = worst.map_or(String::new(), |(v, rms)| format!(", {rms:.5} in view {v}, the worst"));
         out::say(&format!(
             "{}: {n} {} of {rows} x {columns} in {}\nmeasured minus predicted: root mean square {:.5}, {:.5} of the \

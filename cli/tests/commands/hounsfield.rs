@@ -61,6 +61,9 @@ fn a_known_volume_becomes_hounsfield_units_in_every_format() {
         &[
             // Without `as-is` they are no attenuation.
             ("convert b.nii.gz g.nii --hu 60keV", "expected attenuation"),
+            ("convert b.nii.gz g.nii --values hu:0.02 --hu as-is", "these values are attenuation"),
+            // Clipped values have no unit.
+            ("convert a.mha g.nii --values clip:0,0.02 --hu 60keV", "a unit of length"),
             (&format!("convert a.mha g.nii {template}"), "template"),
             (&format!("convert a.mha a.dicom --force {template}"), "which this command reads"),
         ],

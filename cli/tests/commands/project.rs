@@ -51,12 +51,15 @@ fn the_truth_explains_its_scan_and_nothing_else_does() {
     // Another projector and some views.
     let said = d.json("project scan/truth.nii.gz --like scan -o two --views 1,4 --projector siddon --json");
     assert!(said["views"] == 2 && number(&said["residual_relative"]) < 0.05, "{said}");
+    assert_eq!(said["indices_of_views"], serde_json::json!([1, 4]));
     assert!(alike(&read("two").geometry.views, &[1, 4].map(|v| measured.geometry.views[v])));
 
     // The residual is also printed as text, and the result is a scan for every command.
     let said = d.done("project scan/truth.nii.gz --like scan -o two --force");
     assert!(said.contains("measured minus predicted"), "{said}");
     assert_eq!(d.json("info two --json")["views"], 7);
+    let said = d.done("project scan/truth.nii.gz --like scan -o two --views 5,6 --force");
+    assert!(said.contains("in view 5, the worst") || said.contains("in view 6, the worst"), "{said}");
 }
 
 #[test]

@@ -66,7 +66,7 @@ pub fn otsu(volume: ArrayView3<f32>) -> Option<f64> {
         let between = below * above * (sum_below / below - (sum - sum_below) / above).powi(2);
         if between > best.0 {
             best = (between, bin, bin);
-        } else if between == best.0 {
+        } else if between == best.0 && count == 0 && best.2 + 1 == bin {
             best.2 = bin;
         }
     }
@@ -188,6 +188,9 @@ mod tests {
         let found = otsu(volume(&[0.0, 0.0, 0.1, 0.1, 1.0, 1.0]).view()).unwrap();
         assert!(found > 0.1 && found < 1.0, "{found}");
         assert_eq!(otsu(volume(&[0.0, 1.0]).view()), Some(0.5));
+        // Two thresholds as good as each other: the first, not the middle of both, which separates nothing.
+        let tied = otsu(volume(&[0.0, 0.498, 0.502, 1.0]).view()).unwrap();
+        assert!(tied > 0.0 && tied < 0.498, "{tied}");
         assert_eq!(otsu(volume(&[3.0, 3.0]).view()), None);
         assert_eq!("otsu".parse(), Ok(Threshold::Otsu));
         assert_eq!("-0.5".parse(), Ok(Threshold::Value(-0.5)));

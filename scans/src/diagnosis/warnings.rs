@@ -63,8 +63,6 @@ const FEW: f64 = 8.0;
 const OVERLAP: f64 = 0.05;
 /// A gap is large if it exceeds the mean gap by this factor.
 const GAP: f64 = 3.0;
-/// Names of physical units in data sets; others are those of a unit cube or the like.
-const UNITS: [&str; 6] = ["mm", "cm", "m", "um", "µm", "dm"];
 
 fn percent(x: f64) -> String {
     match 100.0 * x {
@@ -263,7 +261,7 @@ fn repeats(scan: &Scan, s: &Survey, warn: Warn) {
 }
 
 fn scale(scan: &Scan, s: &Survey, warn: Warn) {
-    if !UNITS.contains(&scan.unit.name.as_str()) {
+    if !scan.unit.is_length() {
         return;
     }
     let dso = s.setup.source_to_axis_mm;

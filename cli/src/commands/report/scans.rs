@@ -217,8 +217,8 @@ fn own_grid(volume: &Volume, grid: Option<&VoxelGrid>) -> VoxelGrid {
 /// −1000 to 2000 are mapped in volumes from 0 to 1.
 fn set_unit(volume: &mut PageVolume, unit: Option<&Unit>) {
     let Some(unit) = unit else { return };
-    let length = ["mm", "cm", "m"].contains(&&unit.name[..]);
-    (volume.unit, volume.water) = (format!("1/{}", unit.name), if length { 0.02 * unit.mm } else { 1.0 / 3.0 });
+    (volume.unit, volume.water) =
+        (format!("1/{}", unit.name), if unit.is_length() { 0.02 * unit.mm } else { 1.0 / 3.0 });
 }
 
 /// Some views of a scan, with what is needed after the runs' predictions.
