@@ -57,3 +57,16 @@ def counts(value: Any, name: str, n: int) -> list[int]:
     if not good:
         raise invalid("arguments", name, f"{value!r}", f"{n} whole numbers above 0, or one for all")
     return [int(x) for x in np.broadcast_to(numbers, n)]
+
+
+def views(values: Any, name: str, n: int) -> list[int]:
+    """Indices of views, of ``n``: as given, or where a mask is true."""
+    array = np.atleast_1d(as_array(values, name))
+    if array.dtype.kind == "b":
+        if array.shape != (n,):
+            raise invalid("arguments", name, f"a mask of shape {array.shape}", f"({n},), one truth value per view")
+        return np.flatnonzero(array).tolist()
+    if array.ndim != 1 or array.size > 0 and array.dtype.kind not in "iu":
+        found = f"an array of {array.dtype} with {array.ndim} axes"
+        raise invalid("arguments", name, found, "whole numbers, or a mask with one truth value per view")
+    return [int(v) for v in array]

@@ -1,5 +1,6 @@
 //! Positions of source, detector and voxels.
 
+use crate::arguments;
 use crate::arrays::{given, owned};
 use crate::errors::{OrRaise, raised};
 use conefield_core::Error;
@@ -90,9 +91,10 @@ impl Geometry {
         Self::checked(py, geometry::Geometry { volume: VoxelGrid { shape, spacing, center }, ..self.0.clone() })
     }
 
-    /// Some of the views, in the order of the indices.
-    fn select(&self, py: Python<'_>, views: Vec<usize>) -> PyResult<Self> {
-        let n = self.0.views.len();
+    /// Some of the views, in the order of the indices; or those where a mask is true.
+    fn select(&self, views: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let (py, n) = (views.py(), self.0.views.len());
+        let views = arguments::views(views, "views", n)?;
         if let Some(v) = views.iter().find(|v| **v >= n) {
             return Err(raised(py, &Error::invalid("geometry", "view", v, format!("an index below {n}"))));
         }

@@ -155,8 +155,9 @@ impl Scan {
         without_lock(py, |_| self.truth())?.map(|v| made(py, v)).transpose()
     }
 
-    /// The scan without the views `held`, and a scan of only these.
-    fn split(&self, py: Python<'_>, held: Vec<usize>) -> PyResult<(Self, Self)> {
+    /// The scan without the views `held` (indices or a mask), and a scan of only these.
+    fn split(&self, held: &Bound<'_, PyAny>) -> PyResult<(Self, Self)> {
+        let (py, held) = (held.py(), arguments::views(held, "held", self.scan.geometry.views.len())?);
         let (kept, aside) = without_lock(py, |_| self.scan.split(&held))?;
         let of = |scan| Self { scan: Arc::new(scan), path: None, truth: self.truth.clone() };
         Ok((of(kept), of(aside)))

@@ -131,6 +131,23 @@ def test_geometries_are_values(geometry):
     assert finer.volume_shape == (14, 16, 12) and "14 x 16 x 12" in repr(finer)
 
 
+def test_views_are_indices_or_a_mask(geometry, scan):
+    mask = np.array([True, False, False, True, False])
+    for given in (mask, mask.tolist(), [0, 3], np.array([0, 3], np.uint8), range(0, 4, 3)):
+        assert geometry.select(given) == geometry.select([0, 3])
+    held = np.arange(16) % 8 == 1
+    aside = scan.split(held)[1]
+    np.testing.assert_array_equal(aside.projections, scan.projections[held])
+
+    class Series:
+        """A column of a table, as pandas has it."""
+
+        def __array__(self, dtype=None, copy=None):
+            return mask
+
+    assert geometry.select(Series()) == geometry.select([0, 3])
+
+
 def _sum(geometry):
     return float(conefield.project(np.ones(geometry.volume_shape), geometry).sum())
 
@@ -154,6 +171,10 @@ def test_simulation_in_any_geometry(geometry):
     assert 0 < np.abs(noisy - scan.projections).max() < 0.1
 
 
+def _two_views():
+    return conefield.circular(dso=9, dsd=12, angles=2, detector=4, pixel=1, volume=4)
+
+
 @pytest.mark.parametrize(
     "make, words",
     [
@@ -167,6 +188,9 @@ def test_simulation_in_any_geometry(geometry):
         (lambda: conefield.circular(dso=9, dsd=12, angles=[0, np.nan], detector=4, pixel=1, volume=4), "finite"),
         (lambda: conefield.circular(dso=9, dsd=12, angles=0, detector=4, pixel=1, volume=4), "at least one view"),
         (lambda: conefield.from_vectors(np.ones((3, 9)), detector=4, volume=4), "12"),
+        (lambda: _two_views().select([True]), r"views: found a mask of shape \(1,\), expected \(2,\)"),
+        (lambda: _two_views().select([1.9]), "whole numbers"),
+        (lambda: _two_views().select([2]), "index below 2"),
         (lambda: conefield.read_scan("no/such/folder"), "no/such/folder"),
         (lambda: conefield.read_volume("phantom:hand"), "hand"),
         (lambda: conefield.simulate("phantom:head:8", noise="salt"), "poisson"),

@@ -55,6 +55,8 @@ def test_errors_name_the_wrong_setting(scan):
         ({"steps": 0}, "at least 1"),
         ({"hold_out": "x"}, "every:10"),
         ({"hold_out": [99]}, "index below 16"),
+        ({"hold_out": [1.9]}, "hold_out: .*whole numbers"),
+        ({"hold_out": [True, False]}, r"hold_out: .*expected \(16,\)"),
         ({"backend": "abacus"}, "cpu"),
         ({"peak": -1}, "above 0"),
         ({"reference": np.ones((3, 3, 3))}, "the shape of the scan's volume"),
@@ -76,6 +78,8 @@ def test_a_result_describes_itself(scan):
     assert [r["step"] for r in result.record["records"]] == [1, 2]
     assert result.field is None and np.asarray(result) is result.volume.data
     assert "dB" in repr(result)
+    mask = np.isin(np.arange(16), [2, 7, 12])
+    assert conefield.reconstruct(scan, "fdk", hold_out=mask).record["held_out_views"] == [2, 7, 12]
     # The truth scored against itself.
     same = conefield.evaluate(scan.truth, scan.truth)
     assert same["psnr"] == math.inf and same["rmse"] == 0
