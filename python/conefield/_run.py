@@ -193,8 +193,8 @@ def reconstruct(
     init
         Weights of :func:`pretrain`, or a volume (in 1/unit of the scan), to start from.
     reference
-        The volume to score against: a volume, an array or a file, or ``"truth"`` for the one in the scan. It does not
-        influence the result.
+        The volume to score against: a volume, an array or a file, or ``"truth"`` for the one in the scan, also where
+        there is a file of this name. It does not influence the result.
     peak
         The data range for PSNR and SSIM: 1 for a reference in [0, 1] that exceeds 0.5, else its range.
     hold_out
@@ -219,7 +219,7 @@ def reconstruct(
     Ctrl-C ends the run after its step with :class:`KeyboardInterrupt`. Other Python threads keep running.
     """
     scan = as_scan(scan)
-    truth = isinstance(reference, str) and reference == "truth" and not os.path.exists(reference)
+    truth = isinstance(reference, str) and reference == "truth"
     known = None if reference is None or truth else as_volume(reference, "reference", scan.geometry)
     file, start = _start(init, scan.geometry)
     wanted = _wanted(

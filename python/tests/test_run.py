@@ -88,6 +88,13 @@ def test_a_result_describes_itself(scan):
     assert conefield.evaluate(labels, labels, labels=True)["dice"]["mean"] == 1
 
 
+def test_truth_is_the_scans_own_volume(scan, tmp_path, monkeypatch):
+    (tmp_path / "truth").mkdir()
+    monkeypatch.chdir(tmp_path)
+    found, want = [conefield.reconstruct(scan, "fdk", reference=r) for r in ("truth", scan.truth)]
+    assert found.scores == want.scores
+
+
 def test_a_run_starts_from_a_volume_or_its_file(scan, tmp_path):
     first = conefield.reconstruct(scan, "fdk").volume
     first.write(tmp_path / "first.nii.gz")
