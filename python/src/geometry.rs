@@ -54,6 +54,13 @@ impl Geometry {
             let one = dso.is_some() != dsd.is_some() && x.is_none();
             ensure(!one && x.is_none_or(|x| x > 0.0), "geometry", name, found, expected).or_raise(py)?;
         }
+        if let (Some(dso), Some(dsd)) = (dso, dsd) {
+            let expected = format!("more than the {dso} of dso: the detector lies behind the axis (are they swapped?)");
+            ensure(dsd > dso, "geometry", "dsd", dsd, expected).or_raise(py)?;
+        }
+        for (name, x) in ["pixel.v", "pixel.u"].into_iter().zip(pixel) {
+            ensure(x > 0.0, "geometry", name, x, "a positive finite length in mm").or_raise(py)?;
+        }
         let (shape, spacing, center) = volume;
         let volume = VoxelGrid { shape, spacing, center };
         let orbit = match (dso, dsd) {
