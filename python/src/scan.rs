@@ -1,7 +1,7 @@
 //! Scans: projections with their geometry.
 
 use crate::arguments;
-use crate::arrays::{owned, plain};
+use crate::arrays::{fitting, plain};
 use crate::geometry::Geometry;
 use crate::volume::{made, taken};
 use crate::work::without_lock;
@@ -116,7 +116,7 @@ impl Scan {
         unit: (String, f64),
     ) -> PyResult<Self> {
         let (name, mm) = unit;
-        let (projections, geometry) = (owned(&projections), geometry.get().0.clone());
+        let (projections, geometry) = (fitting(&projections)?, geometry.get().0.clone());
         let provenance = serde_json::json!({ "made": "in Python" });
         let scan = scan::Scan { geometry, projections, unit: Unit { name, mm }, provenance };
         without_lock(py, |_| scan.validate("scan"))?;

@@ -171,6 +171,23 @@ def test_simulation_in_any_geometry(geometry):
     assert 0 < np.abs(noisy - scan.projections).max() < 0.1
 
 
+def test_arrays_beyond_memory_are_refused():
+    shape = (1 << 16, 1 << 16, 1 << 10)
+    geometry = conefield.circular(dso=9, dsd=12, angles=2, detector=4, pixel=1, volume=shape, spacing=1e-5)
+    wide = conefield.circular(dso=9, dsd=12, angles=2, detector=1 << 20, pixel=1, volume=4)
+    # It takes no memory until it is copied.
+    large = np.broadcast_to(np.float32(0), shape)
+    for make in [
+        lambda: conefield.backproject(np.ones((2, 4, 4)), geometry),
+        lambda: conefield.project(np.ones((4, 4, 4), np.float32), wide),
+        lambda: conefield.project(large, geometry),
+        lambda: conefield.scan(large, geometry),
+        lambda: conefield.evaluate(conefield.Volume(large), np.ones((2, 2, 2))),
+    ]:
+        with pytest.raises(conefield.UnsupportedError, match="memory: needs"):
+            make()
+
+
 def _two_views():
     return conefield.circular(dso=9, dsd=12, angles=2, detector=4, pixel=1, volume=4)
 
