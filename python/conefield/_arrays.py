@@ -22,11 +22,17 @@ def as_array(values: Any, name: str) -> np.ndarray:
     return np.asarray(values)
 
 
-def as_floats(values: Any, name: str, axes: int, dtype: Any = np.float32) -> np.ndarray:
-    """``values`` as an array of real numbers with ``axes`` axes."""
+def as_real(values: Any, name: str) -> np.ndarray:
+    """``values`` as an array of real numbers of any type."""
     array = as_array(values, name)
     if array.dtype.kind not in "fiub":
         raise invalid("arguments", name, f"an array of {array.dtype}", "an array of real numbers")
+    return array
+
+
+def as_floats(values: Any, name: str, axes: int, dtype: Any = np.float32) -> np.ndarray:
+    """``values`` as an array of real numbers with ``axes`` axes."""
+    array = as_real(values, name)
     if array.ndim != axes:
         raise invalid("arguments", name, f"an array with {array.ndim} axes", f"{axes} axes")
     return array.astype(dtype, copy=False)

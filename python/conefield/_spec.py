@@ -9,7 +9,7 @@ from typing import Any, Mapping
 import numpy as np
 
 from . import _native
-from ._errors import invalid
+from ._errors import Error, invalid
 
 
 def _plain(value: Any) -> Any:
@@ -25,6 +25,8 @@ def encoded(value: Any) -> str:
     """``value`` in JSON."""
     try:
         return json.dumps(value, default=_plain)
+    except Error:
+        raise
     except (TypeError, ValueError) as error:
         raise invalid("arguments", "value", error, "numbers, texts, lists and dicts") from error
 

@@ -45,6 +45,7 @@ def test_errors_name_the_wrong_setting(scan):
         ("fast", {"encoder__levels": None}, "not None"),
         ("fast", {"sets": {"encoder.levels": 3}, "encoder__levels": 4}, "twice"),
         (3, {}, "a name, a file or a dict"),
+        ("fast", {"encoder__levels": object()}, "^spec: value: found a object, expected numbers, texts, lists and dicts$"),
         (None, {}, "a budget"),
     ]:
         with pytest.raises(conefield.InvalidError, match=words):
