@@ -90,6 +90,11 @@ def test_scans_are_read_only_and_come_back(scan, tmp_path):
     np.testing.assert_array_equal(back.truth.data, scan.truth.data)
     made = conefield.scan(kept, scan.geometry, unit=scan.unit[0], unit_mm=scan.unit[1])
     assert made.truth is None and len(made) == 16
+    assert conefield.scan(kept, scan.geometry, unit="cm", unit_mm=10).unit == ("cm", 10.0)
+    assert conefield.scan(kept, scan.geometry, unit="mm").unit == ("mm", 1.0)
+    for unit in ({"unit": "cm"}, {"unit_mm": 10}):
+        with pytest.raises(conefield.InvalidError, match="unit_mm: .*name and millimetres"):
+            conefield.scan(kept, scan.geometry, **unit)
     np.testing.assert_array_equal(made.projections, kept)
     one, two = made.split([1, 5])
     assert (len(one), len(two)) == (14, 2)
