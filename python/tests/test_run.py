@@ -47,6 +47,8 @@ def test_errors_name_the_wrong_setting(scan):
         (3, {}, "a name, a file or a dict"),
         ("fast", {"encoder__levels": object()}, "^spec: value: found a object, expected numbers, texts, lists and dicts$"),
         (None, {}, "a budget"),
+        ("fast", {"training__learning_rate": np.float32("nan")}, "training.learning_rate: found nan, expected a finite"),
+        ({"type": "sart", "relax": [{"a": math.inf}]}, {}, "relax.0.a: found inf, expected a finite number"),
     ]:
         with pytest.raises(conefield.InvalidError, match=words):
             conefield.reconstruct(scan, spec, **overrides)
@@ -60,6 +62,7 @@ def test_errors_name_the_wrong_setting(scan):
         ({"hold_out": [True, False]}, r"hold_out: .*expected \(16,\)"),
         ({"backend": "abacus"}, "cpu"),
         ({"peak": -1}, "above 0"),
+        ({"peak": math.inf}, "peak: found inf, expected a finite number"),
         ({"reference": np.ones((3, 3, 3))}, "the shape of the scan's volume"),
         ({"init": np.ones((24, 24, 24))}, "a method that starts from a volume"),
         ({"seed": -1}, "u64"),
