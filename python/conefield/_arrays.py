@@ -22,11 +22,17 @@ def as_array(values: Any, name: str) -> np.ndarray:
     return np.asarray(values)
 
 
-def as_floats(values: Any, name: str, axes: int, dtype: Any = np.float32) -> np.ndarray:
-    """``values`` as an array of real numbers with ``axes`` axes."""
+def as_real(values: Any, name: str) -> np.ndarray:
+    """``values`` as an array of real numbers of any type."""
     array = as_array(values, name)
     if array.dtype.kind not in "fiub":
         raise invalid("arguments", name, f"an array of {array.dtype}", "an array of real numbers")
+    return array
+
+
+def as_floats(values: Any, name: str, axes: int, dtype: Any = np.float32) -> np.ndarray:
+    """``values`` as an array of real numbers with ``axes`` axes."""
+    array = as_real(values, name)
     if array.ndim != axes:
         raise invalid("arguments", name, f"an array with {array.ndim} axes", f"{axes} axes")
     return array.astype(dtype, copy=False)
@@ -57,3 +63,16 @@ def counts(value: Any, name: str, n: int) -> list[int]:
     if not good:
         raise invalid("arguments", name, f"{value!r}", f"{n} whole numbers above 0, or one for all")
     return [int(x) for x in np.broadcast_to(numbers, n)]
+
+
+def views(values: Any, name: str, n: int) -> list[int]:
+    """Indices of views, of ``n``: as given, or where a mask is true."""
+    array = np.atleast_1d(as_array(values, name))
+    if array.dtype.kind == "b":
+        if array.shape != (n,):
+            raise invalid("arguments", name, f"a mask of shape {array.shape}", f"({n},), one truth value per view")
+        return np.flatnonzero(array).tolist()
+    if array.ndim != 1 or array.size > 0 and array.dtype.kind not in "iu":
+        found = f"an array of {array.dtype} with {array.ndim} axes"
+        raise invalid("arguments", name, found, "whole numbers, or a mask with one truth value per view")
+    return [int(v) for v in array]

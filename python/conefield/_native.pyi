@@ -36,8 +36,8 @@ class Geometry:
         self, shape: list[int], spacing: tuple[float, float, float], center: tuple[float, float, float]
     ) -> Geometry:
         """The same views with another volume."""
-    def select(self, views: list[int]) -> Geometry:
-        """The views with these indices."""
+    def select(self, views: Any) -> Geometry:
+        """The views with these indices, or where a mask is true."""
     def orbit(self) -> tuple[float, float, list[float], list[float], list[float]] | None:
         """The circular orbit of the views, if they lie on one: dso, dsd, pixel, offset, angles."""
     @property
@@ -78,8 +78,8 @@ class Scan:
     @property
     def truth(self) -> Volume | None:
         """The volume that it was simulated from, if known. Read from its file, which must not have changed since."""
-    def split(self, held: list[int]) -> tuple[Scan, Scan]:
-        """The scan without these views, and one with only these."""
+    def split(self, held: Any) -> tuple[Scan, Scan]:
+        """The scan without these views (indices or a mask), and one with only these."""
     def __len__(self) -> int: ...
 
 class Field:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from . import _native
-from ._arrays import as_array, as_floats
+from ._arrays import as_array, as_floats, as_real
 from ._errors import invalid
 from ._scan import Scan
 from ._spec import encoded
@@ -17,7 +17,9 @@ from ._volume import Volume, as_volume
 def _real(values: Any, name: str) -> np.ndarray:
     """Real numbers; double precision is kept."""
     array = as_array(values, name)
-    return as_floats(array, name, 3, np.float64 if array.dtype == np.float64 else np.float32)
+    # In either byte order.
+    double = array.dtype.newbyteorder("=") == np.float64
+    return as_floats(array, name, 3, np.float64 if double else np.float32)
 
 
 def project(volume: Any, like: _native.Geometry | Scan, *, projector: Any = "joseph", residual: bool = False) -> np.ndarray:
@@ -114,7 +116,7 @@ class Operator:
     ndim = 2
 
     def __matmul__(self, x: Any) -> np.ndarray:
-        x = as_array(x.data if isinstance(x, Volume) else x, "operand").astype(self.dtype, copy=False)
+        x = as_real(x.data if isinstance(x, Volume) else x, "operand").astype(self.dtype, copy=False)
         flat = x.shape in ((self.shape[1],), (self.shape[1], 1))
         if not flat and x.shape != self.input_shape:
             expected = f"{self.input_shape}, or a vector of {self.shape[1]}"

@@ -9,6 +9,7 @@ from typing import Any, Iterable, Mapping
 import numpy as np
 
 from . import _native
+from ._arrays import views
 from ._errors import invalid
 from ._progress import Callback, Reporter
 from ._scan import as_scan
@@ -93,11 +94,11 @@ def _time(value: Any) -> str | None:
     return None if value is None else str(value)
 
 
-def _hold_out(value: Any) -> str | None:
-    """View numbers, or a text such as ``"every:10"``."""
+def _hold_out(value: Any, n: int) -> str | None:
+    """View numbers, a mask of the ``n`` views, or a text such as ``"every:10"``."""
     if value is None or isinstance(value, str):
         return value
-    return ",".join(str(int(v)) for v in np.atleast_1d(np.asarray(value, dtype=np.int64)))
+    return ",".join(str(v) for v in views(value, "hold_out", n))
 
 
 def _wanted(
@@ -112,7 +113,7 @@ def _wanted(
     at_most: Any = None,
     budget: Any = None,
     peak: float | None = None,
-    hold_out: Any = None,
+    hold_out: str | None = None,
     init: str | None = None,
     truth: bool = False,
 ) -> str:
@@ -124,7 +125,7 @@ def _wanted(
             "ends": {"steps": steps, "seconds": _time(seconds), "at_most": _time(at_most)},
             "budget": _time(budget),
             "peak": peak,
-            "hold_out": _hold_out(hold_out),
+            "hold_out": hold_out,
             "init": init,
             "truth": truth,
         }
@@ -192,12 +193,13 @@ def reconstruct(
     init
         Weights of :func:`pretrain`, or a volume (in 1/unit of the scan), to start from.
     reference
-        The volume to score against: a volume, an array or a file, or ``"truth"`` for the one in the scan. It does not
-        influence the result.
+        The volume to score against: a volume, an array or a file, or ``"truth"`` for the one in the scan, also where
+        there is a file of this name. It does not influence the result.
     peak
         The data range for PSNR and SSIM: 1 for a reference in [0, 1] that exceeds 0.5, else its range.
     hold_out
-        Views to hold out and predict: their indices, or a string such as ``"every:10"`` for views 5, 15, 25, ….
+        Views to hold out and predict: their indices, a mask of all views, or a string such as ``"every:10"`` for views
+        5, 15, 25, ….
     steps, seconds, at_most
         When training ends: a number of steps, a time that learning-rate schedules aim for, and a time limit that they
         ignore.
@@ -217,7 +219,7 @@ def reconstruct(
     Ctrl-C ends the run after its step with :class:`KeyboardInterrupt`. Other Python threads keep running.
     """
     scan = as_scan(scan)
-    truth = isinstance(reference, str) and reference == "truth" and not os.path.exists(reference)
+    truth = isinstance(reference, str) and reference == "truth"
     known = None if reference is None or truth else as_volume(reference, "reference", scan.geometry)
     file, start = _start(init, scan.geometry)
     wanted = _wanted(
@@ -231,7 +233,7 @@ def reconstruct(
         at_most=at_most,
         budget=budget,
         peak=peak,
-        hold_out=hold_out,
+        hold_out=_hold_out(hold_out, len(scan)),
         init=file,
         truth=truth,
     )

@@ -14,7 +14,7 @@ from ._volume import as_volume
 Scan = _native.Scan
 
 
-def scan(projections: Any, geometry: _native.Geometry, *, unit: str = "mm", unit_mm: float = 1.0) -> Scan:
+def scan(projections: Any, geometry: _native.Geometry, *, unit: str = "mm", unit_mm: float | None = None) -> Scan:
     """A scan of measured line integrals.
 
     Parameters
@@ -24,8 +24,13 @@ def scan(projections: Any, geometry: _native.Geometry, *, unit: str = "mm", unit
     geometry
         The geometry.
     unit, unit_mm
-        Name and millimetres of the unit of length; volumes are in 1/unit.
+        Name and millimetres of the unit of length; volumes are in 1/unit. A unit other than "mm" needs both.
     """
+    if unit_mm is None and unit == "mm":
+        unit_mm = 1.0
+    if unit_mm is None or (unit == "mm" and unit_mm != 1.0):
+        found, expected = f"{unit_mm} with the unit {unit!r}", "name and millimetres of a unit other than mm"
+        raise invalid("arguments", "unit_mm", found, expected)
     return Scan(as_floats(projections, "projections", 3), geometry, (unit, float(unit_mm)))
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from typing import Any, Mapping
 
 import numpy as np
 
 from . import _native
-from ._errors import invalid
+from ._errors import Error, invalid
 
 
 def _plain(value: Any) -> Any:
@@ -21,12 +22,32 @@ def _plain(value: Any) -> Any:
     raise invalid("spec", "value", f"a {type(value).__name__}", "numbers, texts, lists and dicts")
 
 
+def _stray(value: Any, path: str = "") -> tuple[str, Any] | None:
+    """Path and value of the first number that is not finite."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
+    if isinstance(value, float) and not math.isfinite(value):
+        return path, value
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, (list, tuple)) else ()
+    found = (_stray(part, f"{path}.{key}" if path else str(key)) for key, part in parts)
+    return next(filter(None, found), None)
+
+
 def encoded(value: Any) -> str:
-    """``value`` in JSON."""
+    """``value`` in JSON, which has finite numbers only."""
     try:
-        return json.dumps(value, default=_plain)
+        text = json.dumps(value, default=_plain)
+    except Error:
+        raise
     except (TypeError, ValueError) as error:
         raise invalid("arguments", "value", error, "numbers, texts, lists and dicts") from error
+    stray = _stray(value)
+    if stray is not None:
+        path, number = stray
+        # The path as the caller knows it, see argument().
+        path = path.removeprefix("spec.").removeprefix("sets.").removeprefix("table.")
+        raise invalid("arguments", path, number, "a finite number")
+    return text
 
 
 def argument(spec: Any, sets: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> dict[str, Any]:

@@ -46,3 +46,8 @@ pub fn held_out(text: Option<&String>, n: usize) -> Result<Vec<usize>> {
     let choice: Option<HoldOut> = optional("hold_out", text, parse::hold_out)?;
     conefield::input::held_out(choice.as_ref(), n, "arguments", "hold_out")
 }
+
+/// Indices of views, of `n`: as given, or where a mask is true.
+pub fn views(value: &Bound<'_, PyAny>, name: &str, n: usize) -> PyResult<Vec<usize>> {
+    value.py().import("conefield._arrays")?.call_method1("views", (value, name, n))?.extract()
+}

@@ -1,5 +1,6 @@
 //! Positions of source, detector and voxels.
 
+use crate::arguments;
 use crate::arrays::{given, owned};
 use crate::errors::{OrRaise, raised};
 use conefield_core::Error;
@@ -53,6 +54,13 @@ impl Geometry {
             let one = dso.is_some() != dsd.is_some() && x.is_none();
             ensure(!one && x.is_none_or(|x| x > 0.0), "geometry", name, found, expected).or_raise(py)?;
         }
+        if let (Some(dso), Some(dsd)) = (dso, dsd) {
+            let expected = format!("more than the {dso} of dso: the detector lies behind the axis (are they swapped?)");
+            ensure(dsd > dso, "geometry", "dsd", dsd, expected).or_raise(py)?;
+        }
+        for (name, x) in ["pixel.v", "pixel.u"].into_iter().zip(pixel) {
+            ensure(x > 0.0, "geometry", name, x, "a positive finite length in mm").or_raise(py)?;
+        }
         let (shape, spacing, center) = volume;
         let volume = VoxelGrid { shape, spacing, center };
         let orbit = match (dso, dsd) {
@@ -90,9 +98,10 @@ impl Geometry {
         Self::checked(py, geometry::Geometry { volume: VoxelGrid { shape, spacing, center }, ..self.0.clone() })
     }
 
-    /// Some of the views, in the order of the indices.
-    fn select(&self, py: Python<'_>, views: Vec<usize>) -> PyResult<Self> {
-        let n = self.0.views.len();
+    /// Some of the views, in the order of the indices; or those where a mask is true.
+    fn select(&self, views: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let (py, n) = (views.py(), self.0.views.len());
+        let views = arguments::views(views, "views", n)?;
         if let Some(v) = views.iter().find(|v| **v >= n) {
             return Err(raised(py, &Error::invalid("geometry", "view", v, format!("an index below {n}"))));
         }

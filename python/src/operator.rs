@@ -1,23 +1,30 @@
 //! Line integrals of voxels and their adjoint.
 
 use crate::arguments;
-use crate::arrays::{given, owned};
+use crate::arrays::{check_memory, given, owned};
+use crate::errors::OrRaise;
 use crate::geometry::Geometry;
 use crate::scan::Scan;
 use crate::volume::taken;
 use crate::work::{Watch, without_lock};
-use conefield::memory::Memory;
 use conefield::projection;
 use conefield_core::error::ensure;
 use conefield_core::geometry;
 use conefield_core::simd::Real;
-use conefield_core::voxel::{VoxelOperator, VoxelProjector};
+use conefield_core::voxel::VoxelOperator;
 use conefield_core::{Error, Result};
 use conefield_evaluation::metrics;
 use ndarray::Array3;
-use numpy::{PyArray3, PyReadonlyArray3};
+use numpy::{PyArray3, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use serde_json::Value;
+
+/// The shapes of `x` and of the result, and what `x` is.
+fn sides(adjoint: bool, g: &geometry::Geometry) -> ([usize; 3], [usize; 3], &'static str) {
+    let [rows, columns] = g.detector;
+    let (volume, views) = (g.volume.shape, [g.views.len(), rows, columns]);
+    if adjoint { (views, volume, "projections") } else { (volume, views, "volume") }
+}
 
 /// `A·x`, or with `adjoint` `Aᵀ·x`.
 fn applied<R: Real>(
@@ -26,11 +33,7 @@ fn applied<R: Real>(
     g: &geometry::Geometry,
     x: Array3<R>,
 ) -> Result<Array3<R>> {
-    let [rows, columns] = g.detector;
-    let (volume, views) = (g.volume.shape, [g.views.len(), rows, columns]);
-    let (from, to, what) = if adjoint { (views, volume, "projections") } else { (volume, views, "volume") };
-    let found = format!("{:?}", x.shape());
-    ensure(x.shape() == from, what, "shape", found, format!("{from:?}, as the geometry has it"))?;
+    let (_, to, _) = sides(adjoint, g);
     let all: Vec<usize> = (0..g.views.len()).collect();
     let mut out = Array3::from_elem(to, R::ZERO);
     if adjoint {
@@ -53,13 +56,28 @@ pub fn apply<'py>(
 ) -> PyResult<Bound<'py, PyAny>> {
     let projector: Value = arguments::read(py, projector)?;
     let g = &geometry.get().0;
+    // Before `x` is copied: its shape, and memory for both arrays.
+    let checked = |shape: &[usize], size: u64| {
+        let (from, _, what) = sides(adjoint, g);
+        let expected = format!("{from:?}, as the geometry has it");
+        ensure(shape == from, what, "shape", format!("{shape:?}"), expected).or_raise(py)?;
+        without_lock(py, |_| {
+            let projector = projection::projector(projector)?;
+            let voxels = g.volume.shape.iter().map(|&n| n as u64).product::<u64>();
+            check_memory(size / 4 * (projection::bytes(projector.as_ref(), g) + 4 * voxels))?;
+            Ok(projector)
+        })
+    };
     if let Ok(double) = array.extract::<PyReadonlyArray3<'_, f64>>() {
+        let projector = checked(double.shape(), 8)?;
         let x = owned(&double);
-        let work = |_: &Watch| applied(adjoint, projection::projector(projector)?.reference(), g, x);
+        let work = |_: &Watch| applied(adjoint, projector.reference(), g, x);
         return Ok(given(py, without_lock(py, work)?).into_any());
     }
-    let x = owned(&array.extract::<PyReadonlyArray3<'_, f32>>()?);
-    let work = |_: &Watch| applied(adjoint, projection::projector(projector)?.operator(), g, x);
+    let single = array.extract::<PyReadonlyArray3<'_, f32>>()?;
+    let projector = checked(single.shape(), 4)?;
+    let x = owned(&single);
+    let work = |_: &Watch| applied(adjoint, projector.operator(), g, x);
     Ok(given(py, without_lock(py, work)?).into_any())
 }
 
@@ -83,7 +101,7 @@ pub fn project_scan<'py>(
         if let Some(odd) = projection::oddity(&geometry.volume, &scan.geometry.volume) {
             tracing::warn!("{odd}");
         }
-        check_memory(projector.as_ref(), &geometry)?;
+        check_memory(projection::bytes(projector.as_ref(), &geometry))?;
         let mut views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref())?;
         if residual {
             metrics::residual(scan, &mut views)?;
@@ -91,9 +109,4 @@ pub fn project_scan<'py>(
         Ok::<_, Error>(views)
     })?;
     Ok(given(py, views))
-}
-
-fn check_memory(projector: &dyn VoxelProjector, geometry: &geometry::Geometry) -> Result<()> {
-    let buffers = projection::bytes(projector, geometry);
-    Memory::most(&[Memory { buffers, ..Memory::default() }]).check()
 }

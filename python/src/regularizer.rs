@@ -1,6 +1,8 @@
 //! A regularizer implemented by a Python object: a proximal map, or a denoiser in its place.
 
+use crate::errors::OrRaise;
 use crate::stages::{StageObject, optional};
+use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::regularizer::{Penalty, Regularizer, Weight};
 use conefield_core::space::Space;
@@ -80,7 +82,12 @@ impl On {
         let v = v.iter().map(|&v| if v == f32::MIN { 0.0 } else { v }).collect();
         let v = Array3::from_shape_vec(self.grid.shape, v).map_err(|e| crate::errors::broken(py, &e.to_string()))?;
         let found = object.call_method1("prox", (v.into_pyarray(py), tau))?;
-        self.shared.of.shaped(&found, &self.grid.shape, "prox")
+        let found: Array3<f32> = self.shared.of.shaped(&found, &self.grid.shape, "prox")?;
+        // Else the clip at 0 hides NaN.
+        let stray = found.iter().find(|x| !x.is_finite());
+        let finite = ensure(stray.is_none(), self.shared.of.name, "prox", stray.unwrap_or(&0.0), "finite numbers");
+        finite.or_raise(py)?;
+        Ok(found)
     }
 }
 

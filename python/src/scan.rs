@@ -1,7 +1,7 @@
 //! Scans: projections with their geometry.
 
 use crate::arguments;
-use crate::arrays::{owned, plain};
+use crate::arrays::{fitting, plain};
 use crate::geometry::Geometry;
 use crate::volume::{made, taken};
 use crate::work::without_lock;
@@ -116,7 +116,7 @@ impl Scan {
         unit: (String, f64),
     ) -> PyResult<Self> {
         let (name, mm) = unit;
-        let (projections, geometry) = (owned(&projections), geometry.get().0.clone());
+        let (projections, geometry) = (fitting(&projections)?, geometry.get().0.clone());
         let provenance = serde_json::json!({ "made": "in Python" });
         let scan = scan::Scan { geometry, projections, unit: Unit { name, mm }, provenance };
         without_lock(py, |_| scan.validate("scan"))?;
@@ -155,8 +155,9 @@ impl Scan {
         without_lock(py, |_| self.truth())?.map(|v| made(py, v)).transpose()
     }
 
-    /// The scan without the views `held`, and a scan of only these.
-    fn split(&self, py: Python<'_>, held: Vec<usize>) -> PyResult<(Self, Self)> {
+    /// The scan without the views `held` (indices or a mask), and a scan of only these.
+    fn split(&self, held: &Bound<'_, PyAny>) -> PyResult<(Self, Self)> {
+        let (py, held) = (held.py(), arguments::views(held, "held", self.scan.geometry.views.len())?);
         let (kept, aside) = without_lock(py, |_| self.scan.split(&held))?;
         let of = |scan| Self { scan: Arc::new(scan), path: None, truth: self.truth.clone() };
         Ok((of(kept), of(aside)))

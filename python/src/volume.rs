@@ -1,7 +1,7 @@
 //! Volumes: `conefield.Volume` is written in Python, as it holds a NumPy array that users may change.
 
 use crate::arguments;
-use crate::arrays::{given, owned};
+use crate::arrays::{fitting, given};
 use crate::errors::OrRaise;
 use crate::work::without_lock;
 use conefield::hounsfield::{How, Levels};
@@ -24,7 +24,7 @@ pub fn taken(volume: &Bound<'_, PyAny>) -> PyResult<Volume> {
         rows => Some(rows.call_method0("tolist")?.extract()?),
     };
     grid.validate("volume").or_raise(volume.py())?;
-    Ok(Volume { data: owned(&data), grid, affine })
+    Ok(Volume { data: fitting(&data)?, grid, affine })
 }
 
 /// Converts to a `conefield.Volume`.

@@ -90,6 +90,11 @@ def test_scans_are_read_only_and_come_back(scan, tmp_path):
     np.testing.assert_array_equal(back.truth.data, scan.truth.data)
     made = conefield.scan(kept, scan.geometry, unit=scan.unit[0], unit_mm=scan.unit[1])
     assert made.truth is None and len(made) == 16
+    assert conefield.scan(kept, scan.geometry, unit="cm", unit_mm=10).unit == ("cm", 10.0)
+    assert conefield.scan(kept, scan.geometry, unit="mm").unit == ("mm", 1.0)
+    for unit in ({"unit": "cm"}, {"unit_mm": 10}):
+        with pytest.raises(conefield.InvalidError, match="unit_mm: .*name and millimetres"):
+            conefield.scan(kept, scan.geometry, **unit)
     np.testing.assert_array_equal(made.projections, kept)
     one, two = made.split([1, 5])
     assert (len(one), len(two)) == (14, 2)
@@ -131,6 +136,23 @@ def test_geometries_are_values(geometry):
     assert finer.volume_shape == (14, 16, 12) and "14 x 16 x 12" in repr(finer)
 
 
+def test_views_are_indices_or_a_mask(geometry, scan):
+    mask = np.array([True, False, False, True, False])
+    for given in (mask, mask.tolist(), [0, 3], np.array([0, 3], np.uint8), range(0, 4, 3)):
+        assert geometry.select(given) == geometry.select([0, 3])
+    held = np.arange(16) % 8 == 1
+    aside = scan.split(held)[1]
+    np.testing.assert_array_equal(aside.projections, scan.projections[held])
+
+    class Series:
+        """A column of a table, as pandas has it."""
+
+        def __array__(self, dtype=None, copy=None):
+            return mask
+
+    assert geometry.select(Series()) == geometry.select([0, 3])
+
+
 def _sum(geometry):
     return float(conefield.project(np.ones(geometry.volume_shape), geometry).sum())
 
@@ -154,6 +176,27 @@ def test_simulation_in_any_geometry(geometry):
     assert 0 < np.abs(noisy - scan.projections).max() < 0.1
 
 
+def test_arrays_beyond_memory_are_refused():
+    shape = (1 << 16, 1 << 16, 1 << 10)
+    geometry = conefield.circular(dso=9, dsd=12, angles=2, detector=4, pixel=1, volume=shape, spacing=1e-5)
+    wide = conefield.circular(dso=9, dsd=12, angles=2, detector=1 << 20, pixel=1, volume=4)
+    # It takes no memory until it is copied.
+    large = np.broadcast_to(np.float32(0), shape)
+    for make in [
+        lambda: conefield.backproject(np.ones((2, 4, 4)), geometry),
+        lambda: conefield.project(np.ones((4, 4, 4), np.float32), wide),
+        lambda: conefield.project(large, geometry),
+        lambda: conefield.scan(large, geometry),
+        lambda: conefield.evaluate(conefield.Volume(large), np.ones((2, 2, 2))),
+    ]:
+        with pytest.raises(conefield.UnsupportedError, match="memory: needs"):
+            make()
+
+
+def _two_views():
+    return conefield.circular(dso=9, dsd=12, angles=2, detector=4, pixel=1, volume=4)
+
+
 @pytest.mark.parametrize(
     "make, words",
     [
@@ -164,9 +207,15 @@ def test_simulation_in_any_geometry(geometry):
         (lambda: conefield.circular(dso=-1, dsd=2, angles=3, detector=4, pixel=1, volume=4), "dso"),
         (lambda: conefield.circular(dso=9, dsd=2, angles=3, detector=0, pixel=1, volume=4), "above 0"),
         (lambda: conefield.circular(dso=1, dsd=2, angles=3, detector=4, pixel=1, volume=4), "outside the volume"),
+        (lambda: conefield.circular(dso=12, dsd=9, angles=3, detector=4, pixel=1, volume=4), "dsd: .*the axis"),
+        (lambda: conefield.circular(dso=9, dsd=12, angles=3, detector=4, pixel=(1, 0), volume=4), "pixel.u: .*positive"),
+        (lambda: conefield.circular(angles=3, detector=4, pixel=-1, volume=4), "pixel.v: found -1, expected a positive"),
         (lambda: conefield.circular(dso=9, dsd=12, angles=[0, np.nan], detector=4, pixel=1, volume=4), "finite"),
         (lambda: conefield.circular(dso=9, dsd=12, angles=0, detector=4, pixel=1, volume=4), "at least one view"),
         (lambda: conefield.from_vectors(np.ones((3, 9)), detector=4, volume=4), "12"),
+        (lambda: _two_views().select([True]), r"views: found a mask of shape \(1,\), expected \(2,\)"),
+        (lambda: _two_views().select([1.9]), "whole numbers"),
+        (lambda: _two_views().select([2]), "index below 2"),
         (lambda: conefield.read_scan("no/such/folder"), "no/such/folder"),
         (lambda: conefield.read_volume("phantom:hand"), "hand"),
         (lambda: conefield.simulate("phantom:head:8", noise="salt"), "poisson"),

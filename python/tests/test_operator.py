@@ -44,6 +44,12 @@ def test_the_matrix_is_both_functions(geometry):
         a @ x[1:]
     with pytest.raises(conefield.InvalidError, match="float32 or float64"):
         conefield.Operator(geometry, dtype=np.int32)
+    with pytest.raises(conefield.InvalidError, match="operand: .*real numbers"):
+        a @ (x + 1j)
+    with pytest.raises(conefield.InvalidError, match="real numbers"):
+        conefield.project(x + 1j, geometry)
+    for swapped in (conefield.project(x.astype(">f8"), geometry), a @ x.astype(">f8")):
+        np.testing.assert_array_equal(swapped, a @ x)
     with pytest.raises(conefield.InvalidError, match="joseph, siddon, trilinear"):
         conefield.Operator(geometry, projector="magic") @ x
 

@@ -45,7 +45,10 @@ def test_errors_name_the_wrong_setting(scan):
         ("fast", {"encoder__levels": None}, "not None"),
         ("fast", {"sets": {"encoder.levels": 3}, "encoder__levels": 4}, "twice"),
         (3, {}, "a name, a file or a dict"),
+        ("fast", {"encoder__levels": object()}, "^spec: value: found a object, expected numbers, texts, lists and dicts$"),
         (None, {}, "a budget"),
+        ("fast", {"training__learning_rate": np.float32("nan")}, "training.learning_rate: found nan, expected a finite"),
+        ({"type": "sart", "relax": [{"a": math.inf}]}, {}, "relax.0.a: found inf, expected a finite number"),
     ]:
         with pytest.raises(conefield.InvalidError, match=words):
             conefield.reconstruct(scan, spec, **overrides)
@@ -55,8 +58,11 @@ def test_errors_name_the_wrong_setting(scan):
         ({"steps": 0}, "at least 1"),
         ({"hold_out": "x"}, "every:10"),
         ({"hold_out": [99]}, "index below 16"),
+        ({"hold_out": [1.9]}, "hold_out: .*whole numbers"),
+        ({"hold_out": [True, False]}, r"hold_out: .*expected \(16,\)"),
         ({"backend": "abacus"}, "cpu"),
         ({"peak": -1}, "above 0"),
+        ({"peak": math.inf}, "peak: found inf, expected a finite number"),
         ({"reference": np.ones((3, 3, 3))}, "the shape of the scan's volume"),
         ({"init": np.ones((24, 24, 24))}, "a method that starts from a volume"),
         ({"seed": -1}, "u64"),
@@ -76,12 +82,21 @@ def test_a_result_describes_itself(scan):
     assert [r["step"] for r in result.record["records"]] == [1, 2]
     assert result.field is None and np.asarray(result) is result.volume.data
     assert "dB" in repr(result)
+    mask = np.isin(np.arange(16), [2, 7, 12])
+    assert conefield.reconstruct(scan, "fdk", hold_out=mask).record["held_out_views"] == [2, 7, 12]
     # The truth scored against itself.
     same = conefield.evaluate(scan.truth, scan.truth)
     assert same["psnr"] == math.inf and same["rmse"] == 0
     labels = np.zeros((4, 4, 4))
     labels[1:3] = 7
     assert conefield.evaluate(labels, labels, labels=True)["dice"]["mean"] == 1
+
+
+def test_truth_is_the_scans_own_volume(scan, tmp_path, monkeypatch):
+    (tmp_path / "truth").mkdir()
+    monkeypatch.chdir(tmp_path)
+    found, want = [conefield.reconstruct(scan, "fdk", reference=r) for r in ("truth", scan.truth)]
+    assert found.scores == want.scores
 
 
 def test_a_run_starts_from_a_volume_or_its_file(scan, tmp_path):

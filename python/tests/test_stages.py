@@ -54,6 +54,8 @@ class Ridge:
             raise RuntimeError("no more of this")
         if self.fault == "shape":
             return v[1:]
+        if self.fault == "nan":
+            return np.where(v > v.mean(), np.float32(np.nan), v)
         return v / (1 + tau * (2 if self.fault == "wrong" else 1))
 
 
@@ -149,6 +151,8 @@ def test_a_regularizer_regularizes(scan):
         of(fault="raises")
     with pytest.raises(conefield.InvalidError, match="prox: found an array of shape"):
         of(fault="shape")
+    with pytest.raises(conefield.InvalidError, match="test-ridge: prox: found NaN, expected finite numbers"):
+        of(fault="nan")
 
 
 def test_a_denoiser_is_a_prior(scan):
