@@ -29,13 +29,7 @@ impl Inputs {
         if path.exists() {
             self.0.push(path.to_path_buf());
         }
-        // A header names the file with its voxels.
-        if has_extension(path, &["nhdr", "mhd"]) {
-            let text = conefield_core::files::read_text(path, 16 << 20).unwrap_or_default();
-            let named = text.lines().filter_map(|line| line.split_once([':', '=']));
-            let named = named.map(|(_, name)| folder_of(path).join(name.trim_start_matches('=').trim()));
-            self.0.extend(named.filter(|file| file.is_file()));
-        }
+        self.0.extend(conefield_io::data_file(path));
     }
 
     /// Adds a spec with everything it extends and names.
@@ -62,7 +56,8 @@ impl Inputs {
 
     /// Refuses to write a file that is an input or lies in an input folder.
     pub fn spare_file(&self, output: &Path) -> Result<()> {
-        if has_extension(output, &["mhd"]) {
+        // Its voxels are written beside it.
+        if output.extension().is_some_and(|e| e.eq_ignore_ascii_case("mhd")) {
             self.spare_file(&output.with_extension("raw"))?;
         }
         if output.symlink_metadata().is_err() {
@@ -88,10 +83,6 @@ impl Inputs {
         }
         Ok(())
     }
-}
-
-fn has_extension(path: &Path, ends: &[&str]) -> bool {
-    path.extension().is_some_and(|e| ends.iter().any(|end| e.eq_ignore_ascii_case(end)))
 }
 
 fn place(path: &Path) -> String {
@@ -160,8 +151,9 @@ mod tests {
     fn the_data_file_of_a_header_is_spared() {
         let d = tempfile::tempdir().unwrap();
         let at = |name: &str| d.path().join(name);
-        for (header, line) in [("a.nhdr", "data file: a.raw"), ("b.mhd", "ElementDataFile = a.raw")] {
-            std::fs::write(at(header), format!("{line}\n")).unwrap();
+        let nrrd = "NRRD0004\ntype: float\ndata file: a.raw\n";
+        for (header, text) in [("a.nhdr", nrrd), ("b.mhd", "NDims = 3\nElementDataFile = a.raw\n")] {
+            std::fs::write(at(header), text).unwrap();
             std::fs::write(at("a.raw"), "voxels").unwrap();
             let inputs = Inputs::of([at(header)]);
             for (output, free) in [("a.mhd", false), ("a.raw", false), ("c.mhd", true)] {

@@ -80,6 +80,7 @@ pub use scan_folder::write_scan;
 pub use scanner::{Conversion, Counts, I0, OpenBeam, Stored, read_scanner};
 pub use size::{ScanSize, scan_size, scanner_size, volume_voxels};
 pub use volume::{
-    check_shape, is_volume, is_volume_name, packed_bytes, read_volume, write_volume, write_voxels, write_voxels_of,
+    check_shape, data_file, is_volume, is_volume_name, packed_bytes, read_volume, write_volume, write_voxels,
+    write_voxels_of,
 };
 pub use weights::{Tensor, read_weights, write_weights};

@@ -22,7 +22,7 @@ use std::path::Path;
 const LONGEST_HEADER: usize = 1 << 16;
 
 /// The last entry of a header.
-const DATA_FILE: &str = "ElementDataFile";
+pub(crate) const DATA_FILE: &str = "ElementDataFile";
 
 /// Whether `head`, the start of a file, contains the line with the object type or the number of axes, preceded only by
 /// other lines of this form.
@@ -43,7 +43,7 @@ fn entry(line: &[u8]) -> Option<(&str, &[u8])> {
 }
 
 /// Reads up to and including the line that names the data file.
-fn read_header(input: &mut Input) -> Result<Header> {
+pub(crate) fn read_header(input: &mut Input) -> Result<Header> {
     let mut header = Header::new(input, "one, before ElementDataFile");
     let mut left = LONGEST_HEADER;
     for number in 1.. {

@@ -5,7 +5,7 @@
 
 mod read;
 
-pub(crate) use read::{is_header, read, shape};
+pub(crate) use read::{DATA_FILE, is_header, read, read_header, shape};
 
 use crate::affine;
 use crate::file_order::{self, FileOrder};

@@ -2,7 +2,8 @@
 
 use crate::dicom::DicomTemplate;
 use crate::folder::file_name;
-use crate::input::Input;
+use crate::folder_of;
+use crate::input::{Input, start_of};
 use crate::size::product;
 use crate::{dicom, foreign, metaimage, nifti, npy, nrrd, pickle, scan, tiff, write_atomic, zarr};
 use conefield_core::allowance;
@@ -13,7 +14,7 @@ use conefield_core::scan::{Affine, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array3, ArrayViewMut3, Ix3, s};
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Reads a volume: NIfTI-1 (any real number type, gzip or not), MetaImage (`.mha`, or `.mhd` with its data file in the
 /// same folder, zlib or not), NRRD (`.nrrd`, or `.nhdr` with its data file in the same folder, gzip or not), a NumPy
@@ -133,6 +134,20 @@ pub fn is_volume(path: impl AsRef<Path>) -> bool {
             || dicom::is_header(&head)
             || (named && !pickle::is_start(&head))
     })
+}
+
+/// The other file that holds the voxels, if `path` is a header (`.mhd`, `.nhdr`) that names one which exists.
+pub fn data_file(path: &Path) -> Option<PathBuf> {
+    let head = start_of(path, nifti::HEADER as u64).ok()?;
+    let mut input = Input::open_plain(path).ok()?;
+    let header = match () {
+        () if metaimage::is_header(&head) => metaimage::read_header(&mut input),
+        () if nrrd::is_header(&head) => nrrd::read_header(&mut input),
+        () => return None,
+    };
+    let (header, [one, other]) = (header.ok()?, nrrd::DATA_FILE);
+    let (_, name) = header.first(&[metaimage::DATA_FILE, one, other]).ok()??;
+    Some(folder_of(path).join(name)).filter(|file| file.is_file())
 }
 
 /// Whether the name is that of a volume that [`write_voxels`] can write.

@@ -16,7 +16,7 @@ use std::path::Path;
 const LONGEST_HEADER: usize = 1 << 20;
 
 /// The entry that names another file with the data.
-const DATA_FILE: [&str; 2] = ["data file", "datafile"];
+pub(crate) const DATA_FILE: [&str; 2] = ["data file", "datafile"];
 
 /// Whether `head`, the start of a file, has NRRD's magic bytes, of any version.
 pub(crate) fn is_header(head: &[u8]) -> bool {
@@ -24,7 +24,7 @@ pub(crate) fn is_header(head: &[u8]) -> bool {
 }
 
 /// Reads up to and including the empty line before the data, or to the end of a header whose data is elsewhere.
-fn read_header(input: &mut Input) -> Result<Header> {
+pub(crate) fn read_header(input: &mut Input) -> Result<Header> {
     let mut header = Header::new(input, "one");
     let mut left = LONGEST_HEADER;
     for number in 1.. {
