@@ -214,13 +214,11 @@ mod tests {
         let whole = std::fs::read(&path).unwrap();
         assert!(whole.starts_with(&kept) && whole.len() > kept.len());
         // Half an event, a wrong checksum, or a length beyond the end of the file ends the events that are kept.
-        for damaged in
-            [whole[..whole.len() - 1].to_vec(), [&whole[..whole.len() - 1], &[!whole[whole.len() - 1]]].concat(), {
-                let mut long = whole.clone();
-                long[kept.len() + 3] ^= 1;
-                long
-            }]
-        {
+        let (mut short, mut wrong, mut long) = (whole.clone(), whole.clone(), whole.clone());
+        short.pop();
+        *wrong.last_mut().unwrap() ^= 1;
+        long[kept.len() + 3] ^= 1;
+        for damaged in [short, wrong, long] {
             std::fs::write(&path, damaged).unwrap();
             assert_eq!(EventFile::resume(&path, u64::MAX).unwrap().1, Some(300));
             assert_eq!(std::fs::read(&path).unwrap(), kept);
