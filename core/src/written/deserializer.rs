@@ -75,13 +75,13 @@ fn in_words(expected: &str) -> String {
         ("u16", _) => "a whole number from 0 to 65535",
         ("u32", _) => "a whole number from 0 to 4294967295",
         ("u64" | "usize", _) => "a whole number from 0 to 18446744073709551615",
-        ("a nonzero u32" | "a nonzero u64" | "a nonzero usize", _) => "a whole number of at least 1",
         ("i8" | "i16" | "i32" | "i64", _) => "a whole number",
         ("a boolean", _) => "true or false",
         ("a string", _) => "a text",
         ("a sequence", _) => "a list",
         ("a map", _) => "a table",
         (other, _) if other.starts_with("struct ") => "a table",
+        (other, _) if other.starts_with("a nonzero u") => "a whole number of at least 1",
         (other, _) => other,
     }
     .into()
