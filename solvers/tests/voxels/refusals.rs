@@ -67,6 +67,8 @@ fn fdk_refuses_what_is_no_circle() {
     assert!(said.unwrap().contains("a detector whose rows rise along z in view 0"));
     let said = refused(&|i, v| v.source = v.source.map(|x| x * (1.0 + 0.05 * i as f64))).unwrap();
     assert!(said.contains("scan: views: found sources") && said.contains("a circular orbit"), "{said}");
+    let said = refused(&|_, v| v.detector = std::array::from_fn(|k| v.detector[k] + 1e4 * v.u[k])).unwrap();
+    assert!(said.contains("found rays that all miss the volume"), "{said}");
     let said = refused(&|_, v| v.source = [0.0, 0.0, 100.0]).unwrap();
     assert!(said.contains("mm from the axis z, expected a circular orbit"), "{said}");
 }
