@@ -54,7 +54,7 @@ pub fn scan(path: &Path) -> Result<Scan> {
     Ok(scan)
 }
 
-/// Logs warnings about problems for a reconstruction; `surrounded`: not of an object that extends beyond the volume.
+/// Logs warnings about problems for a reconstruction; if `surrounded`, none of an object beyond the volume.
 pub fn warn_of(path: &Path, survey: &Survey, surrounded: bool) {
     for warning in survey.warnings.iter().filter(|w| !(surrounded && w.kind == WarningKind::Outside)) {
         tracing::warn!("{}: {warning}", path.display());

@@ -70,7 +70,8 @@ impl Input {
 }
 
 /// The scan at `path` and the reference volume, if one is asked for: a file, or the scan's own volume for "truth". Logs
-/// warnings about problems for a reconstruction, but if `surrounded` not of an object beyond the volume. Refuses a reference with another shape than the scan's volume.
+/// warnings about problems for a reconstruction; if `surrounded`, none of an object beyond the volume. Refuses a reference
+/// with another shape than the scan's volume.
 pub fn read(path: &Path, reference: Option<&Path>, surrounded: bool) -> Result<(Scan, Option<Volume>)> {
     let own = reference.is_some_and(is_truth);
     let DataSet { train: scan, volume, .. } =
