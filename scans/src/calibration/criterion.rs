@@ -40,7 +40,7 @@ pub(crate) struct Level {
     folds: Vec<Fold>,
     magnification: f64,
     /// The largest line integral of the held-out views.
-    top: f64,
+    pub top: f64,
     /// Root mean square difference of adjacent columns in the held-out views.
     pub slope: f64,
     /// Whether the object reaches the first or last columns.

@@ -21,6 +21,8 @@ pub(crate) const REACH: f64 = 0.5;
 pub(crate) const LONGEST: f64 = 2.0;
 /// A step shorter than this, in pixels of a level, is the last one.
 pub(crate) const SMALL: f64 = 0.01;
+/// Correlation that errors of the reconstruction may have with the effect of a parameter.
+const ALIKE: f64 = 0.03;
 /// How often a step that does not reduce the error is cut to a third.
 const CUTS: usize = 3;
 
@@ -187,8 +189,14 @@ impl Search<'_> {
         let sensitivity = |k: usize| (normal.matrix[k][k] / pixels as f64).sqrt() / self.level.slope.max(1e-300);
         let covariance = normal.covariance();
         let deviation = |k: usize| covariance.as_ref().map_or(f64::INFINITY, |c| c[k][k].max(0.0).sqrt());
+        // The change that such a correlation leads to.
+        let systematic = |k: usize| ALIKE * prediction.error * self.level.top / (sensitivity(k) * self.level.slope);
         (0..slopes.len())
-            .map(|k| Evidence { deviation: units[k] * deviation(k), sensitivity: sensitivity(k), sure: true })
+            .map(|k| Evidence {
+                deviation: units[k] * deviation(k).hypot(systematic(k)),
+                sensitivity: sensitivity(k),
+                sure: true,
+            })
             .collect()
     }
 }
