@@ -28,6 +28,7 @@ pub use low_counts::LowCounts;
 pub use pixels::Pixels;
 pub use rings::{RingMethod, Rings};
 pub use scatter::Scatter;
+pub use spectrum::WATER;
 pub use truncation::Truncation;
 
 use crate::provenance;
