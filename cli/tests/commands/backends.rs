@@ -51,6 +51,7 @@ fn explain_says_what_a_gpu_makes_of_a_spec() {
     if listed()["backends"][1]["adapters"][0]["subgroups"].is_array() {
         assert!(said.contains("summed in subgroups first"), "{said}");
     }
+    assert!(d.done("explain fdk --backend wgpu").contains("\nbackend: wgpu, "));
     let auto = d.done("explain ni-naf");
     assert!(auto.contains("chosen by --backend auto"), "{auto}");
     for (code, backend, words) in [
@@ -102,6 +103,8 @@ fn an_interrupted_run_goes_on_on_the_other_backend() {
             d.killed_at_a_checkpoint(&run, &begun);
             let record = reconstruct(&d, &run, spec, second, &format!("{more} --resume"));
             assert_eq!(record["steps"], steps);
+            let named = [0, 1].map(|i| record["backends"][i]["backend"].as_str().unwrap().split(',').next().unwrap());
+            assert_eq!(named, [first, second]);
         }
         for backend in ["cpu", "wgpu"] {
             d.done(&format!("export {} -o {backend}.npy --backend {backend} --force", of("wgpu")));
