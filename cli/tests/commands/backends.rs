@@ -1,6 +1,7 @@
 //! The wgpu backend in the command: listed, explained, and used for runs.
 
 use crate::common::{Folder, SCAN, number};
+use conefield_evaluation::report::text::bytes;
 use serde_json::Value;
 
 fn listed() -> Value {
@@ -62,6 +63,19 @@ fn explain_says_what_a_gpu_makes_of_a_spec() {
     ] {
         d.refused_with(code, &format!("explain ni-naf --backend {backend}"), &[words]);
     }
+}
+
+#[test]
+fn the_log_counts_the_bytes_of_the_record() {
+    if !adapter("bytes") {
+        return;
+    }
+    let d = Folder::after(&[SCAN]);
+    let line = "reconstruct scan --spec fast --steps 2 --set training.rays=16 -o run --backend wgpu";
+    let said = String::from_utf8(d.loud(line).output().unwrap().stderr).unwrap();
+    let moved = &d.read("run/record.json")["moved"];
+    let [to, from] = ["to_device", "from_device"].map(|way| bytes(moved[way].as_u64().unwrap()));
+    assert!(said.contains(&format!("moved {to} to the device and {from} from it")), "{moved}: {said}");
 }
 
 /// Both specs of Gaussians, the published one with its prior and its density control, end at the same PSNR.
