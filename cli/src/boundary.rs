@@ -9,6 +9,9 @@ use conefield_io::folder_of;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
+/// The ends of the files of which a folder is read whatever their names are.
+const SLICES: [&str; 3] = ["tif", "tiff", "dcm"];
+
 /// The files and folders that a command reads.
 #[derive(Default)]
 pub struct Inputs(Vec<PathBuf>);
@@ -54,14 +57,24 @@ impl Inputs {
         self.spare_folder(output)
     }
 
-    /// Refuses to write a file that is an input or lies in an input folder.
+    /// Refuses to write a file that is an input or lies in an input folder. A new file may lie there unless it would be read
+    /// as a slice.
     pub fn spare_file(&self, output: &Path) -> Result<()> {
         // Its voxels are written beside it.
         if output.extension().is_some_and(|e| e.eq_ignore_ascii_case("mhd")) {
             self.spare_file(&output.with_extension("raw"))?;
         }
         if output.symlink_metadata().is_err() {
-            return Ok(());
+            let slice = output.extension().is_some_and(|e| SLICES.iter().any(|end| e.eq_ignore_ascii_case(end)));
+            let beside = |input: &PathBuf| same_file::is_same_file(input, folder_of(output)).unwrap_or(false);
+            let joins = slice && self.0.iter().any(beside);
+            return ensure(
+                !joins,
+                &place(output),
+                "output",
+                "a slice in a folder that this command reads",
+                "another folder",
+            );
         }
         for input in &self.0 {
             let same = same_file::is_same_file(input, output).unwrap_or(false);
@@ -146,6 +159,16 @@ pub fn text(path: &Path) -> Result<&str> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_folder_that_is_read_gets_no_slice() {
+        let d = tempfile::tempdir().unwrap();
+        let inputs = Inputs::of([d.path()]);
+        for (name, free) in [("a.TIF", false), ("a.dcm", false), ("a.png", true), ("a.nii.gz", true), ("b/a.tif", true)]
+        {
+            assert_eq!(inputs.spare_file(&d.path().join(name)).is_ok(), free, "{name}");
+        }
+    }
 
     #[test]
     fn the_data_file_of_a_header_is_spared() {

@@ -1,6 +1,5 @@
 //! Writing of voxels to a file: shows progress and keeps what the end of a run needs.
 
-use crate::out::duration;
 use crate::progress::Progress;
 use crate::signals;
 use conefield::hounsfield::{Calibration, Levels};
@@ -12,7 +11,6 @@ use conefield_evaluation::report::MiddleSlices;
 use conefield_io::DicomTemplate;
 use ndarray::{Array3, ArrayViewMut3};
 use std::path::Path;
-use std::time::Instant;
 
 /// Writes `voxels` to `path` without keeping any, with `affine` if they have none of their own; in Hounsfield units if
 /// there is a calibration, and then returns its water and air. DICOM gets patient and study from `template`.
@@ -59,7 +57,6 @@ struct Outgoing<'a> {
     kept: Option<WrittenVolume>,
     place: String,
     progress: Progress,
-    start: Instant,
     done: usize,
 }
 
@@ -71,7 +68,6 @@ impl<'a> Outgoing<'a> {
             voxels,
             place: path.display().to_string(),
             progress: Progress::new("export", None),
-            start: Instant::now(),
             done: 0,
         }
     }
@@ -99,9 +95,7 @@ impl Voxels for Outgoing<'_> {
             }
         }
         self.done += out.len();
-        let share = self.done as f64 / self.voxels.grid().len().unwrap_or(usize::MAX) as f64;
-        let left = self.start.elapsed().as_secs_f64() * (1.0 - share) / share;
-        self.progress.show(share, &|_| format!("{} left", duration(left)));
+        self.progress.reach(self.done as f64 / self.voxels.grid().len().unwrap_or(usize::MAX) as f64);
         Ok(())
     }
 }

@@ -1,8 +1,10 @@
 //! Progress on standard error: bars on a terminal, otherwise log lines.
 
 use crate::board::Board;
+use crate::out::duration;
 use crate::signals;
 use conefield::files;
+use conefield::record::History;
 use conefield_core::Result;
 use conefield_core::checkpoint::Checkpoint;
 use conefield_core::geometry::VoxelGrid;
@@ -40,6 +42,7 @@ pub fn between_bars(f: impl FnOnce()) {
 /// Shows a solver's progress and writes its records.
 pub struct Progress {
     bar: ProgressBar,
+    begun: Instant,
     shown: Instant,
     what: String,
     step: u64,
@@ -50,6 +53,8 @@ pub struct Progress {
     pub keeper: Option<Renewed>,
     /// What identifies the run in its checkpoint.
     pub run: BTreeMap<String, String>,
+    /// What its checkpoint keeps for the record.
+    pub history: History,
     /// The middle slices during the run.
     pub live: Option<Renewed>,
     /// The file for TensorBoard.
@@ -84,6 +89,7 @@ impl Progress {
         bar.set_prefix(what.to_owned());
         Self {
             bar,
+            begun: Instant::now(),
             shown: Instant::now(),
             what: what.into(),
             step: 0,
@@ -91,6 +97,7 @@ impl Progress {
             log,
             keeper: None,
             run: BTreeMap::new(),
+            history: History::default(),
             live: None,
             board: None,
         }
@@ -106,8 +113,14 @@ impl Progress {
         }
     }
 
+    /// Shows that `share` of work without steps is done, with the time left.
+    pub fn reach(&mut self, share: f64) {
+        let left = self.begun.elapsed().as_secs_f64() * (1.0 - share) / share.max(1e-6);
+        self.show(share, &|_| format!("{} left", duration(left)));
+    }
+
     /// Shows that `share` of the work is done, with an explanatory line, unless the last update is recent.
-    pub fn show(&mut self, share: f64, line: &dyn Fn(&Self) -> String) {
+    fn show(&mut self, share: f64, line: &dyn Fn(&Self) -> String) {
         let wait = if self.bar.is_hidden() { EVERY } else { Duration::from_millis(100) };
         if self.shown.elapsed() < wait {
             return;
@@ -128,7 +141,7 @@ impl Progress {
         // A narrow terminal cuts the end off.
         let parts = [
             Some(format!("step {step}")),
-            seconds_left.is_finite().then(|| format!("{} left", crate::out::duration(seconds_left))),
+            seconds_left.is_finite().then(|| format!("{} left", duration(seconds_left))),
             r.psnr.map(|p| format!("{p:.2} dB")),
             r.held_out.map(|h| format!("held out {h:.4}")),
             r.loss.map(|loss| format!("loss {loss:.3e}")),
@@ -177,7 +190,7 @@ impl Observer for Progress {
 
     fn checkpoint(&mut self, checkpoint: &Checkpoint<'_>) -> Result<()> {
         let Some(keeper) = &mut self.keeper else { return Ok(()) };
-        let written = files::write_checkpoint(&keeper.path, checkpoint, &self.run);
+        let written = files::write_checkpoint(&keeper.path, checkpoint, &self.run, &self.history);
         keeper.last = Instant::now();
         written?;
         debug!("checkpoint after step {}", checkpoint.standing.step);

@@ -12,7 +12,7 @@ use conefield_core::files::read_text;
 use conefield_core::method::Record;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::text::bytes;
-use conefield_io::{Contents, Lease, Progressed};
+use conefield_io::{Contents, Lease, Progressed, folder_of};
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -41,6 +41,11 @@ pub const CONTENTS: Contents = Contents { known, progressed };
 pub fn known(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default();
     FILES.iter().any(|f| name == *f) || conefield_io::is_unfinished(name)
+}
+
+/// Whether `path` is the volume of a finished run, which is attenuation.
+pub fn is_result(path: &Path) -> bool {
+    path.file_name().is_some_and(|name| name == FILES[0]) && folder_of(path).join("record.json").is_file()
 }
 
 /// The progress of the run in `folder`.

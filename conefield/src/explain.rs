@@ -3,6 +3,7 @@
 use crate::memory::{self, Memory};
 use crate::{plugins, scratch};
 use conefield_core::Result;
+use conefield_core::backend::Backend;
 use conefield_core::method::{Findings, Line, Outline, Plan};
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::Loaded;
@@ -20,6 +21,9 @@ pub struct Explanation {
     description: String,
     #[serde(flatten)]
     outline: Outline,
+    /// The backend of the plan.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    backend: Option<String>,
     parameters: usize,
     model_bytes: usize,
     /// The plugins whose stages the spec uses.
@@ -42,8 +46,13 @@ struct ForScan {
 }
 
 impl Explanation {
-    /// Explains a spec and its plan; with a scan, also its requirements in such a `run`.
-    pub fn new(loaded: &Loaded, plan: &dyn Plan, scan: Option<(&Scan, memory::Run)>) -> Result<Self> {
+    /// Explains a spec and its plan for `backend`; with a scan, also its requirements in such a `run`.
+    pub fn new(
+        loaded: &Loaded,
+        plan: &dyn Plan,
+        backend: Option<&dyn Backend>,
+        scan: Option<(&Scan, memory::Run)>,
+    ) -> Result<Self> {
         let for_scan = |(scan, run): (&Scan, memory::Run)| {
             let g = &scan.geometry;
             Ok(ForScan {
@@ -64,6 +73,7 @@ impl Explanation {
             extends: loaded.sources().into_iter().filter(|s| *s != loaded.source).collect(),
             description: loaded.spec.description.clone(),
             outline,
+            backend: backend.map(Backend::describe),
             parameters,
             model_bytes: 16 * parameters,
             plugins: plugins::used(&loaded.tree),
@@ -85,6 +95,9 @@ impl Explanation {
         }
         lines.push(String::new());
         outlined(&self.outline, &mut lines);
+        // That of a field is listed with what it compiled.
+        let backend = self.backend.iter().filter(|_| self.outline.backend().backend.is_empty());
+        lines.extend(backend.map(|backend| format!("\nbackend: {backend}")));
         lines.extend(self.plugins.iter().map(|plugin| format!("\nplugin: {}", plugin.line())));
         if self.parameters > 0 || self.scan.is_some() {
             lines.push(String::new());

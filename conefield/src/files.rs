@@ -1,5 +1,6 @@
 //! Maps the names of files and phantoms to volumes, scans and weights.
 
+use crate::record::History;
 use conefield_backend_cpu::Cpu;
 use conefield_core::arena::Weights;
 use conefield_core::checkpoint::{Checkpoint, Resume, Standing};
@@ -113,35 +114,51 @@ pub fn read_field(path: &Path) -> Result<TrainedField> {
 /// More steps than any run takes. Up to here, counting is exact in every number type in use.
 const MOST_STEPS: u64 = 1 << 48;
 
-/// The checkpoint text with the run's progress; the other texts identify the run.
+/// The checkpoint text with the run's progress; [`HISTORY`] has its history, and the other texts identify the run.
 const STANDING: &str = "standing";
+const HISTORY: &str = "history";
 
-/// Writes a checkpoint of the run described by `run`.
-pub fn write_checkpoint(path: &Path, checkpoint: &Checkpoint<'_>, run: &BTreeMap<String, String>) -> Result<()> {
-    let standing = serde_json::to_string(&checkpoint.standing)
-        .map_err(|e| Error::unsupported("checkpoint", format!("cannot be written as text: {e}")))?;
+/// Writes a checkpoint of the run described by `run`, with this history.
+pub fn write_checkpoint(
+    path: &Path,
+    checkpoint: &Checkpoint<'_>,
+    run: &BTreeMap<String, String>,
+    history: &History,
+) -> Result<()> {
+    let failed = |e| Error::unsupported("checkpoint", format!("cannot be written as text: {e}"));
     let mut text = run.clone();
-    text.insert(STANDING.into(), standing);
+    text.insert(STANDING.into(), serde_json::to_string(&checkpoint.standing).map_err(failed)?);
+    text.insert(HISTORY.into(), serde_json::to_string(history).map_err(failed)?);
     let tensors: Vec<_> = checkpoint.tensors.iter().map(|(name, shape, values)| (&name[..], *shape, *values)).collect();
     conefield_io::write_checkpoint(path, &tensors, &text)
 }
 
+/// An interrupted run.
+pub struct Interrupted {
+    /// Its state.
+    pub resume: Resume,
+    /// What its record keeps.
+    pub history: History,
+}
+
 /// Reads the checkpoint of the run described by `run`; refuses the checkpoint of another run.
-pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Resume> {
+pub fn read_checkpoint(path: &Path, run: &BTreeMap<String, String>) -> Result<Interrupted> {
     let place = path.display().to_string();
     if !path.exists() {
         let expected = "an interrupted run with a checkpoint; other runs must start over";
         return Err(Error::invalid(place, "--resume", "no checkpoint", expected));
     }
     let mut file = conefield_io::read_checkpoint(path)?;
-    let standing = file.notes.remove(STANDING).unwrap_or_default();
+    let [standing, history] = [STANDING, HISTORY].map(|name| file.notes.remove(name));
     same_run(&place, &file.notes, run)?;
-    let standing: Standing = written::read(&format!("{place}: {STANDING}.json"), &standing)?;
+    let standing: Standing = written::read(&format!("{place}: {STANDING}.json"), &standing.unwrap_or_default())?;
+    let history = history.map(|text| written::read(&format!("{place}: {HISTORY}.json"), &text)).transpose()?;
     let Standing { step, recorded, seconds, .. } = standing;
     ensure(step <= MOST_STEPS, &place, "step", step, format!("at most {MOST_STEPS}"))?;
     ensure(recorded <= step, &place, "recorded", recorded, format!("at most {step}, the steps that are done"))?;
     ensure(seconds.is_finite() && seconds >= 0.0, &place, "seconds", seconds, "a number of seconds")?;
-    Ok(Resume::new(place, standing, Weights { tensors: file.tensors, ..Weights::default() }))
+    let resume = Resume::new(place, standing, Weights { tensors: file.tensors, ..Weights::default() });
+    Ok(Interrupted { resume, history: history.unwrap_or_default() })
 }
 
 /// Refuses to resume a run that differs from `now`; `place` names its file.

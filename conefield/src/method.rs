@@ -169,7 +169,7 @@ mod tests {
             };
             let budget = Budget { begin: Instant::now(), seconds: 8.0, spent: 0.0 };
             let (_, schedule) = budget.choose(&bench(&scan, &truth, &backend), &front, build).unwrap();
-            assert_eq!(schedule.point.as_deref(), Some(wanted), "{schedule:?}");
+            assert_eq!(schedule.reason.point.as_deref(), Some(wanted), "{schedule:?}");
         }
     }
 }

@@ -8,11 +8,16 @@ use conefield_core::registry::read;
 use conefield_core::registry::{Kind, names};
 use conefield_core::scan::Volume;
 use conefield_core::voxel::{VoxelProjector, VoxelProjectorSpec};
-use ndarray::Array3;
+use ndarray::{Array3, s};
 use serde_json::Value;
+use std::time::{Duration, Instant};
 
 /// Default projector of iterative methods.
 pub const PROJECTOR: &str = "joseph";
+
+/// Views that are projected first, and how long a part of the views takes at least, unless it is the last.
+const FIRST: usize = 8;
+const PART: Duration = Duration::from_secs(2);
 
 /// Largest relative difference between a volume's box and the scan's volume that is not reported.
 const SAME_BOX: f64 = 0.01;
@@ -62,12 +67,14 @@ pub fn bytes(projector: &dyn VoxelProjector, geometry: &Geometry) -> u64 {
 }
 
 /// The line integrals of `volume`, whose values are per `unit_mm` millimetres, in the views of `geometry`, which also
-/// positions the voxels.
+/// positions the voxels. Calls `progress` with the share of finished views every few seconds; an error of it ends the
+/// work.
 pub fn predicted(
     volume: &Volume,
     geometry: &Geometry,
     unit_mm: f64,
     projector: &dyn VoxelProjector,
+    progress: &mut dyn FnMut(f64) -> Result<()>,
 ) -> Result<Array3<f32>> {
     geometry.validate("projection")?;
     let (found, expected) = (format!("{:?}", volume.data.shape()), format!("{:?}", geometry.volume.shape));
@@ -79,11 +86,47 @@ pub fn predicted(
     let views: Vec<usize> = (0..geometry.views.len()).collect();
     let mut out = Array3::zeros((views.len(), rows, columns));
     let operator = projector.operator();
-    operator.forward(geometry, &views, volume.data.view(), out.view_mut());
-    operator.fault()?;
+    let (mut done, mut some) = (0, FIRST);
+    while done < views.len() {
+        let (part, start) = (done..views.len().min(done + some), Instant::now());
+        done = part.end;
+        operator.forward(geometry, &views[part.clone()], volume.data.view(), out.slice_mut(s![part, .., ..]));
+        operator.fault()?;
+        progress(done as f64 / views.len() as f64)?;
+        // Fewer calls prepare the volume less often.
+        some = if start.elapsed() < PART { 2 * some } else { some };
+    }
     if unit_mm != 1.0 {
         let per_unit = (1.0 / unit_mm) as f32;
         parallel::scale(&mut out, per_unit);
     }
     Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use conefield_projectors::simulate::{PhantomKind, Protocol, phantom_of};
+
+    #[test]
+    fn views_do_not_depend_on_the_parts_and_progress_ends_them() {
+        let volume = phantom_of(PhantomKind::Head, 24);
+        let geometry =
+            Protocol::r2(&volume.grid).with_detector([20, 20]).with_views(29).geometry(&volume.grid).unwrap();
+        for name in names(Kind::VoxelProjector) {
+            let projector = projector(name.into()).unwrap();
+            let mut shares = vec![];
+            let mut heard = |share| {
+                shares.push(share);
+                Ok(())
+            };
+            let parts = predicted(&volume, &geometry, 1.0, projector.as_ref(), &mut heard).unwrap();
+            let mut whole = Array3::zeros(parts.dim());
+            let views: Vec<usize> = (0..29).collect();
+            projector.operator().forward(&geometry, &views, volume.data.view(), whole.view_mut());
+            assert!(parts == whole && shares.len() > 1 && shares.is_sorted() && shares.last() == Some(&1.0), "{name}");
+            let mut ends = |_| Err(Error::Aborted { part: "the projection".into() });
+            assert!(predicted(&volume, &geometry, 1.0, projector.as_ref(), &mut ends).is_err(), "{name}");
+        }
+    }
 }

@@ -4,7 +4,7 @@ use crate::machine::Machine;
 use crate::memory::Memory;
 use crate::plugins::Used;
 use crate::tradeoff::json::to_json;
-use crate::tradeoff::schedule::Schedule;
+use crate::tradeoff::schedule::{Reason, Schedule};
 use conefield_core::backend::Explain;
 use conefield_core::method::Limits;
 use conefield_core::place::Moved;
@@ -58,6 +58,9 @@ pub struct RunRecord {
     pub plugins: Vec<Used>,
     /// The backend, and what it compiled.
     pub backend: Explain,
+    /// All backends of a run that was resumed on another one.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub backends: Vec<Stretch>,
     /// Bytes that crossed between the host and the backend's device; 0 on the CPU.
     pub moved: Moved,
     /// Number of processes.
@@ -100,6 +103,24 @@ pub struct RunRecord {
     pub best_step: Option<u64>,
     /// The data range of scores.
     pub peak: f64,
+}
+
+/// The steps of a run on one backend, up to the next one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Stretch {
+    /// The backend.
+    pub backend: String,
+    /// Steps before.
+    pub from_step: u64,
+}
+
+/// What the record of a resumed run takes from the run before, through the checkpoint.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct History {
+    /// The backends, in order.
+    pub backends: Vec<Stretch>,
+    /// Why the run has its method, within a budget.
+    pub reason: Option<Reason>,
 }
 
 /// Written files and the time for them.

@@ -4,14 +4,15 @@
 //! [`Session::plan`] takes the inputs and, within a budget, measures this machine and chooses the method. [`Run::solve`]
 //! runs it, and [`Run::record`] describes all of it.
 
+use crate::files::Interrupted;
 use crate::input::{Input, check_reference};
 use crate::machine::{Machine, simd_level};
 use crate::memory;
 use crate::method::{self, Planned, Read};
-use crate::record::{RunRecord, Written};
+use crate::record::{History, RunRecord, Stretch, Written};
 use crate::tradeoff::calibrate::Bench;
 use crate::tradeoff::front::Front;
-use crate::tradeoff::schedule::{Budget, Schedule};
+use crate::tradeoff::schedule::{Budget, Reason, Schedule};
 use crate::{plugins, ranks, rehearsal, score, specs};
 use conefield_core::backend::Backend;
 use conefield_core::checkpoint::Resume;
@@ -112,10 +113,12 @@ impl<'a> Session<'a> {
         if both > memory::limit() { read() } else { rehearsal::meanwhile(loaded, self.backend, read) }
     }
 
-    /// Plans the run on `input`. Within a budget this measures the machine for a few seconds. `spent` are the seconds of
-    /// training that an interrupted run has already used.
-    pub fn plan(self, input: Input, spent: f64, cancelled: &dyn Fn() -> bool) -> Result<Run<'a>> {
+    /// Plans the run on `input`, or the rest of the run `earlier`. Within a budget this measures the machine for a few
+    /// seconds.
+    pub fn plan(self, input: Input, earlier: Option<&Interrupted>, cancelled: &dyn Fn() -> bool) -> Result<Run<'a>> {
         let Self { request, backend, run, begin, wish } = self;
+        let (from_step, spent) = earlier.map_or((0, 0.0), |e| (e.resume.standing.step, e.resume.standing.seconds));
+        let mut history = earlier.map(|e| e.history.clone()).unwrap_or_default();
         let load_s = begin.elapsed().as_secs_f64();
         if let Wish::Method(m) = &wish {
             specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held)?;
@@ -124,7 +127,8 @@ impl<'a> Session<'a> {
         let budget = |seconds| Budget { begin, seconds, spent };
         let (method, schedule) = match wish {
             Wish::Method(mut method) => {
-                let schedule = request.budget.map(|s| budget(s).plan(&bench, &mut method)).transpose()?;
+                let reason = history.reason.take().unwrap_or_else(Reason::requested);
+                let schedule = request.budget.map(|s| budget(s).plan(&bench, &mut method, reason)).transpose()?;
                 (method, schedule)
             }
             Wish::OneOf(front, seconds) => {
@@ -146,9 +150,14 @@ impl<'a> Session<'a> {
         };
         schedule.iter().flat_map(|s| s.lines(&method.loaded.spec.name)).for_each(|line| info!("{line}"));
         info!("memory: {}", method.memory.line());
+        history.reason = schedule.as_ref().map(|schedule| schedule.reason.clone());
+        let here = Stretch { backend: backend.describe(), from_step };
+        if history.backends.last().is_none_or(|last| last.backend != here.backend) {
+            history.backends.push(here);
+        }
         let (seed, limits) = (request.seed, request.limits);
         let (budget, moved) = (request.budget, backend.moved());
-        Ok(Run { input, method, schedule, backend, seed, limits, budget, begin, spent, load_s, moved })
+        Ok(Run { input, method, schedule, history, backend, seed, limits, budget, begin, spent, load_s, moved })
     }
 }
 
@@ -160,6 +169,8 @@ pub struct Run<'a> {
     pub method: Planned,
     /// The plan of a budget.
     pub schedule: Option<Schedule>,
+    /// What its checkpoints keep for the record.
+    pub history: History,
     backend: &'a dyn Backend,
     seed: u64,
     limits: Limits,
@@ -196,7 +207,7 @@ impl<'a> Run<'a> {
         let (split, scored) = (!held.is_empty(), reference.is_some());
         let run = memory::Run { split, reference: scored, ..memory::Run::on_scan(&scan) };
         let session = Session::open(request, backend, run, begin)?;
-        session.plan(Input::new(scan, held, reference, peak)?, 0.0, cancelled)
+        session.plan(Input::new(scan, held, reference, peak)?, None, cancelled)
     }
 
     /// Runs the method from `start`, a volume, or from the checkpoint `resume`.
@@ -217,10 +228,6 @@ impl<'a> Run<'a> {
         self.backend.run(lead, &follow).map_err(|e| loaded.locate(e))?;
         let solution = solution.unwrap_or_else(|| unreachable!("the leading backend has run"));
         let prepare_s = (begin.elapsed().as_secs_f64() + self.spent - solution.train_s).max(0.0);
-        let Moved { to_device, from_device } = self.moved();
-        if to_device > 0 {
-            info!("moved {} to the device and {} from it", bytes(to_device), bytes(from_device));
-        }
         Ok(Solved { solution, prepare_s })
     }
 
@@ -253,7 +260,8 @@ impl<'a> Run<'a> {
         Ok((volume, written))
     }
 
-    /// The record of the whole run; `last` is its last record of progress. The caller adds the names of files.
+    /// The record of the whole run, after the export; `last` is its last record of progress. The caller adds the names of
+    /// files.
     pub fn record(&self, solved: &Solved, last: Option<&Record>, written: Written) -> RunRecord {
         let Solved { solution, prepare_s } = solved;
         let (method, best) = (&self.method, solution.best);
@@ -261,6 +269,11 @@ impl<'a> Run<'a> {
         if backend.backend.is_empty() {
             // Only a field is compiled when it is planned.
             backend.backend = self.backend.describe();
+        }
+        let backends = if self.history.backends.len() > 1 { self.history.backends.clone() } else { vec![] };
+        let moved = self.moved();
+        if moved.to_device > 0 {
+            info!("moved {} to the device and {} from it", bytes(moved.to_device), bytes(moved.from_device));
         }
         RunRecord {
             version: env!("CARGO_PKG_VERSION"),
@@ -278,8 +291,9 @@ impl<'a> Run<'a> {
             hounsfield: None,
             plugins: plugins::used(&method.loaded.tree),
             backend,
+            backends,
             processes: ranks::count(),
-            moved: self.moved(),
+            moved,
             simd: simd_level(),
             threads: rayon::current_num_threads(),
             machine: Machine::here(),

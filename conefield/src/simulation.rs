@@ -8,7 +8,7 @@ use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
 use conefield_core::words::plural;
 use conefield_core::{Error, Result, written};
-use conefield_projectors::simulate::{Angles, DetectorNoise, HuMapping, Protocol, downsample, project, simulate};
+use conefield_projectors::simulate::{Angles, DetectorNoise, HuMapping, Protocol, downsample, project, simulate_with};
 use serde_json::json;
 use std::path::Path;
 
@@ -89,16 +89,22 @@ pub fn changed(mut p: Protocol, changes: &Changes, place: &str) -> Result<Protoc
     Ok(p)
 }
 
-/// Simulates a scan of `volume`, after [`prepared`], with `protocol`; returns the scan and its true volume. Refuses a
-/// scan that does not fit into memory.
-pub fn scan(mut volume: Volume, values: Values, protocol: &Protocol, source: &str) -> Result<(Scan, Volume)> {
+/// Simulates a scan of `volume`, after [`prepared`], with `protocol`; returns the scan and its true volume. Calls
+/// `progress` with the share of finished views after each. Refuses a scan that does not fit into memory.
+pub fn scan(
+    mut volume: Volume,
+    values: Values,
+    protocol: &Protocol,
+    source: &str,
+    progress: &(dyn Fn(f64) + Sync),
+) -> Result<(Scan, Volume)> {
     check_memory(&volume, &protocol.geometry(&volume.grid)?)?;
     if let Values::Hu(HuMapping::Mu { .. }) = values {
         // Converts 1/mm to the protocol's unit.
         let per_unit = protocol.unit.mm as f32;
         volume = volume.mapped(|x| x * per_unit);
     }
-    let mut scan = simulate(&volume, protocol)?;
+    let mut scan = simulate_with(&volume, protocol, progress)?;
     let most = range(&scan.projections)[1];
     if most > OPAQUE {
         tracing::warn!(

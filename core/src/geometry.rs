@@ -7,7 +7,7 @@
 use crate::error::{Result, ensure};
 use serde::{Deserialize, Serialize};
 use std::fmt::Debug;
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 /// A point or vector in the world, in millimetres.
 pub type Vec3 = [f64; 3];
@@ -173,18 +173,21 @@ impl VoxelGrid {
         self.shape.contains(&0)
     }
 
-    /// Refuses empty grids, sizes beyond memory, and spacings that are not positive and finite.
+    /// Refuses empty grids, sizes beyond memory, and voxels whose sides single precision cannot hold.
     pub fn validate(&self, place: &str) -> Result<()> {
         let check = |ok: bool, key: &str, found: &dyn Debug, expected: &str| {
             ensure(ok, place, &format!("volume.{key}"), format!("{found:?}"), expected)
         };
         check(!self.is_empty(), "shape", &self.shape, "at least one voxel per axis")?;
         check(addressable(self.len()), "shape", &self.shape, "a number of voxels that can be addressed")?;
-        let spaced = self.spacing.iter().all(|s| s.is_finite() && *s > 0.0);
-        check(spaced, "spacing", &self.spacing, "positive finite millimetres")?;
+        let spaced = self.spacing.iter().all(|s| SIDES.contains(s));
+        check(spaced, "spacing", &self.spacing, "voxels with sides from 1e-12 to 1e12 mm")?;
         check(self.center.iter().all(|s| s.is_finite()), "center", &self.center, "finite millimetres")
     }
 }
+
+/// Sides of voxels in mm. The square of a length on them, for all rays of a scan, is a number in single precision.
+const SIDES: RangeInclusive<f64> = 1e-12..=1e12;
 
 /// Whether memory can hold as many numbers in double precision.
 fn addressable(count: Option<usize>) -> bool {
@@ -428,6 +431,16 @@ mod tests {
         let at_axis = fitted.at_axis();
         let apart = (0..2).map(|k| (at_axis.0[k] - [0.7, 1.3][k]).abs() + (at_axis.1[k] - [2.0, -4.0][k]).abs());
         assert!(apart.fold(0.0, f64::max) < 1e-6, "{at_axis:?}");
+    }
+
+    #[test]
+    fn voxels_of_no_size_in_single_precision_are_refused() {
+        let of = |side: f64| VoxelGrid { spacing: [1.0, side, 1.0], ..geometry().volume }.validate("scan.toml");
+        assert!([1e-12, 1e12].into_iter().all(|side| of(side).is_ok()));
+        for side in [0.0, -1.0, 1e-22, 1e16, f64::NAN, f64::INFINITY] {
+            let e = of(side).unwrap_err().to_string();
+            assert!(e.contains(&format!("volume.spacing: found [1.0, {side:?}, 1.0], expected")), "{e}");
+        }
     }
 
     #[test]

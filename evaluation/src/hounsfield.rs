@@ -9,45 +9,18 @@ use conefield_core::parallel;
 use conefield_core::parts::{Part, Voxels};
 use conefield_core::scan::{Affine, Unit};
 use conefield_core::{Error, Result, written};
+use conefield_scans::corrections::WATER;
+use conefield_scans::diagnosis::quantiles::median;
 use ndarray::{Array3, ArrayViewMut3};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-/// Mass attenuation coefficient of liquid water in cm²/g at photon energies in keV. With its density of 1 g/cm³ a tenth
-/// of it is the attenuation in 1/mm.
-///
-/// Source: J. H. Hubbell and S. M. Seltzer, NIST Standard Reference Database 126 (NISTIR 5632), table 4,
-/// physics.nist.gov/PhysRefData/XrayMassCoef/ComTab/water.html.
-const WATER: [(f64, f64); 21] = [
-    (5.0, 42.58),
-    (6.0, 24.64),
-    (8.0, 10.37),
-    (10.0, 5.329),
-    (15.0, 1.673),
-    (20.0, 0.8096),
-    (30.0, 0.3756),
-    (40.0, 0.2683),
-    (50.0, 0.2269),
-    (60.0, 0.2059),
-    (80.0, 0.1837),
-    (100.0, 0.1707),
-    (150.0, 0.1505),
-    (200.0, 0.1370),
-    (300.0, 0.1186),
-    (400.0, 0.1061),
-    (500.0, 0.09687),
-    (600.0, 0.08956),
-    (800.0, 0.07865),
-    (1000.0, 0.07072),
-    (1250.0, 0.06323),
-];
-
-/// The attenuation of water in 1/mm at `energy` in keV, between the energies of the table interpolated in the
-/// logarithms of both; `None` outside of the table.
+/// The attenuation of water, with its density of 1 g/cm³, in 1/mm at `energy` in keV, between the energies of the table
+/// interpolated in the logarithms of both; `None` outside of the table.
 pub fn water(energy: f64) -> Option<f64> {
-    WATER.windows(2).find(|pair| (pair[0].0..=pair[1].0).contains(&energy)).map(|pair| {
-        let [(e0, m0), (e1, m1)] = [pair[0], pair[1]];
+    WATER.windows(2).find(|pair| (pair[0][0]..=pair[1][0]).contains(&energy)).map(|pair| {
+        let [[e0, m0], [e1, m1]] = [pair[0], pair[1]];
         let share = (energy / e0).ln() / (e1 / e0).ln();
         0.1 * m0 * (m1 / m0).powf(share)
     })
@@ -120,7 +93,7 @@ impl FromStr for How {
         let (number, _) = number.filter(|(_, unit)| unit.eq_ignore_ascii_case("kev")).ok_or_else(wrong)?;
         let energy: f64 = number.trim().parse().map_err(|_| wrong())?;
         water(energy).map(|_| Self::Energy(energy)).ok_or_else(|| {
-            format!("expected an energy from {} to {} keV, the range of the table of water", WATER[0].0, WATER[20].0)
+            format!("expected an energy from {} to {} keV, the range of the table of water", WATER[0][0], WATER[20][0])
         })
     }
 }
@@ -224,7 +197,7 @@ impl How {
             Self::Levels(levels) => Some(levels.clone()),
             Self::Energy(energy) => {
                 remark = format!(" at {energy} keV");
-                let expected = format!("{} to {} keV", WATER[0].0, WATER[20].0);
+                let expected = format!("{} to {} keV", WATER[0][0], WATER[20][0]);
                 let water = water(*energy).ok_or_else(|| Error::invalid(FIELD, "energy", energy, expected))?;
                 Some([water, 0.0].map(KnownValue::Given))
             }
@@ -299,18 +272,7 @@ fn median_in(voxels: &mut dyn Voxels, region: &Region) -> Result<f64> {
             values.extend(inside.iter().map(|[x, y, _]| read[[*x, *y, 0]]));
         }
     }
-    Ok(median(&mut values))
-}
-
-/// The median; of an even number the mean of the middle two, of none not a number.
-fn median(values: &mut [f32]) -> f64 {
-    let n = values.len();
-    if n == 0 {
-        return f64::NAN;
-    }
-    let (below, upper, _) = values.select_nth_unstable_by(n / 2, f32::total_cmp);
-    let lower = if n.is_multiple_of(2) { below.iter().copied().max_by(f32::total_cmp) } else { None };
-    (f64::from(lower.unwrap_or(*upper)) + f64::from(*upper)) / 2.0
+    Ok(f64::from(median(&mut values).unwrap_or(f32::NAN)))
 }
 
 /// Water and air of a volume, in its unit.
@@ -392,7 +354,7 @@ mod tests {
         assert!((water(60.0).unwrap() - 0.02059).abs() < 1e-12);
         let between = water((60.0f64 * 80.0).sqrt()).unwrap();
         assert!((between - 0.1 * (0.2059f64 * 0.1837).sqrt()).abs() < 1e-12, "{between}");
-        assert!(WATER.windows(2).all(|p| p[0].0 < p[1].0 && p[0].1 > p[1].1));
+        assert!(WATER.windows(2).all(|p| p[0][0] < p[1][0] && p[0][1] > p[1][1]));
     }
 
     #[test]
@@ -419,14 +381,6 @@ mod tests {
         let how: How = "water=box:1,-2,-1,3,2,1,air=box:-3,-2,-1,-1,2,1".parse().unwrap();
         let levels = how.open("a.nii", None, &volume.grid, None).unwrap().measure(&mut &volume).unwrap();
         assert_eq!([levels.water as f32, levels.air as f32], [0.021, 0.001]);
-    }
-
-    #[test]
-    fn the_median_of_an_even_number_lies_between_the_middle_two() {
-        let (_, note) = converted("water=box:-3,-2,-1,3,2,1,air=0", None).unwrap();
-        assert_eq!(note, "HU: water 0.011, air 0");
-        assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
-        assert!(median(&mut []).is_nan());
     }
 
     #[test]

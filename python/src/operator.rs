@@ -102,7 +102,7 @@ pub fn project_scan<'py>(
             tracing::warn!("{odd}");
         }
         check_memory(projection::bytes(projector.as_ref(), &geometry))?;
-        let mut views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref())?;
+        let mut views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref(), &mut |_| Ok(()))?;
         if residual {
             metrics::residual(scan, &mut views)?;
         }

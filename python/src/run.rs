@@ -117,13 +117,13 @@ pub fn plan<'py>(
                 let Planned { loaded, plan, .. } = &run.method;
                 let about = Some((scan.as_ref(), memory::Run::on_scan(&scan)));
                 let schedule = serde_json::to_value(&run.schedule).unwrap_or(Value::Null);
-                Ok((Explanation::new(loaded, plan.as_ref(), about)?, schedule))
+                Ok((Explanation::new(loaded, plan.as_ref(), Some(backend.as_ref()), about)?, schedule))
             }
             (None, scan) => {
                 let loaded = wanted.spec.read(&wanted.spec.sets()?)?;
                 let plan = method::plan_without_files(&loaded, backend.as_ref())?;
                 let about = scan.as_ref().map(|s| (s.as_ref(), memory::Run::on_scan(s)));
-                Ok((Explanation::new(&loaded, plan.as_ref(), about)?, Value::Null))
+                Ok((Explanation::new(&loaded, plan.as_ref(), Some(backend.as_ref()), about)?, Value::Null))
             }
         }
     })?;

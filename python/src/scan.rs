@@ -245,7 +245,7 @@ pub fn simulate(
         };
         let protocol = simulation::protocol(&wanted.protocol, &volume.grid)?;
         let protocol = simulation::changed(protocol, &changes, "arguments")?;
-        let (scan, truth) = simulation::scan(volume, values, &protocol, &wanted.source)?;
+        let (scan, truth) = simulation::scan(volume, values, &protocol, &wanted.source, &|_| {})?;
         Ok((scan, Some(truth)))
     })?;
     let truth = truth.map_or(Truth::Unknown, |truth| Truth::Known(Arc::new(truth)));

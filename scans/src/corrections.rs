@@ -28,6 +28,7 @@ pub use low_counts::LowCounts;
 pub use pixels::Pixels;
 pub use rings::{RingMethod, Rings};
 pub use scatter::Scatter;
+pub use spectrum::WATER;
 pub use truncation::Truncation;
 
 use crate::provenance;
@@ -111,9 +112,7 @@ impl Corrections {
 
     /// Largest memory in bytes in addition to a scan of `pixels` pixels, including the new scan of a wider detector.
     pub fn bytes(&self, pixels: u64) -> u64 {
-        let over_time = if self.pixels.is_some() { 4 * pixels } else { 0 };
-        let wider = self.truncation.map_or(0, |t| (4.0 * (1.0 + 2.0 * t.share) * pixels as f64) as u64);
-        over_time.max(wider)
+        self.truncation.map_or(0, |t| (4.0 * (1.0 + 2.0 * t.share) * pixels as f64) as u64)
     }
 
     /// Refuses invalid settings.

@@ -60,13 +60,17 @@ pub fn line_integrals(
     }
     let response = response(place, conversion, [rows, columns])?;
     let mut open = open_beam(place, conversion, views)?;
-    let typical = response.as_ref().map(|r| middle(r.view())).or(open.first().copied().filter(|x| *x > 0.0));
-    let known = from_fields(response.as_ref().map(|r| r.view()), dark.map(|d| d.view()), typical.unwrap_or(f32::MAX));
     let mut bad = Array2::from_elem((rows, columns), false);
+    let from_air = |bad: &_| open_beam_of_air(place, &values, bad);
+    if conversion.open == OpenBeam::Air {
+        open = from_air(&bad)?;
+    }
+    let typical = response.as_ref().map_or_else(|| spread(open.clone()).1, |r| middle(r.view()));
+    let known = from_fields(response.as_ref().map(|r| r.view()), dark.map(|d| d.view()), typical);
     known.iter().for_each(|&at| bad[at] = true);
     refuse_bad(place, known.len(), pixels)?;
-    if conversion.open == OpenBeam::Air {
-        open = open_beam_of_air(place, &values, &bad)?;
+    if conversion.open == OpenBeam::Air && !known.is_empty() {
+        open = from_air(&bad)?;
     }
     let (low, mid, high) = spread(response.as_ref().map_or_else(|| open.clone(), |r| good(r, &bad)));
     let floor = conversion.floor.map_or_else(|| (1e-4 * mid).min(1.0), |f| f as f32);
@@ -246,6 +250,11 @@ mod tests {
             let c = Conversion { open, dark: dark.clone(), floor: None };
             let (found, report) = line_integrals(counts(&a, &even, 110.0), &c, "t").unwrap();
             assert!(worst(&found, &a) < 1e-5 && report.open_beam[1] == 4890.0, "{c:?} {report:?}");
+            // A pixel that is hot in the dark field.
+            let mut hot = Conversion { dark: dark.clone(), ..c };
+            hot.dark.as_mut().unwrap()[[0, 9]] = 4000.0;
+            let (found, report) = line_integrals(counts(&a, &even, 110.0), &hot, "t").unwrap();
+            assert!(worst(&found, &a) < 1e-5 && report.bad_by_fields == 1, "{hot:?} {report:?}");
         }
         // Intensities of 0 to 1.
         let c = Conversion { open: OpenBeam::Number(1.0), dark: None, floor: None };

@@ -200,15 +200,12 @@ fn draw(path: &Path, found: &Calibration) -> Result<()> {
 }
 
 /// Shows the progress of a calibration and handles interruptions.
-pub struct Shown {
-    progress: Mutex<Progress>,
-    begin: Instant,
-}
+pub struct Shown(Mutex<Progress>);
 
 impl Shown {
     /// Starts the clock.
     pub fn new() -> Self {
-        Self { progress: Mutex::new(Progress::new("calibrate", None)), begin: Instant::now() }
+        Self(Mutex::new(Progress::new("calibrate", None)))
     }
 }
 
@@ -218,9 +215,7 @@ impl Watch for Shown {
     }
 
     fn progress(&self, share: f64) {
-        let left = self.begin.elapsed().as_secs_f64() * (1.0 - share) / share.max(1e-6);
-        let mut progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner);
-        progress.show(share, &|_| format!("{} left", out::duration(left)));
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).reach(share);
     }
 }
 

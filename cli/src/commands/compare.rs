@@ -7,13 +7,13 @@ use crate::boundary::Inputs;
 use crate::{out, run_folder};
 use clap::Args;
 use conefield::backend::BackendChoice;
-use conefield::machine::simd_level;
 use conefield::record::ScanRecord;
 use conefield::specs;
 use conefield::study::method::{FOLDER_NAME, Method};
 use conefield::study::outcome::{Columns, Outcome};
 use conefield::study::pictures::{self, Shown};
 use conefield::tradeoff::trial::TrialInput;
+use conefield_core::backend::Backend;
 use conefield_core::error::ensure;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::Table;
@@ -78,8 +78,8 @@ struct Shared<'a> {
     budget_s: Option<f64>,
     sets: &'a [String],
     backend: BackendChoice,
-    simd: String,
-    threads: usize,
+    /// What the methods run on.
+    device: String,
     memory_limit: Option<u64>,
 }
 
@@ -96,7 +96,9 @@ struct Entry {
 impl CompareArgs {
     pub fn run(self, general: &General) -> Result<()> {
         // Errors in the input are reported before anything is created.
-        let methods = self.methods()?;
+        let backend = self.protocol.backend.open_for_run(self.protocol.budget)?;
+        let (methods, device) = (self.methods(backend.as_ref())?, backend.describe());
+        drop(backend);
         let input = trial::input(&self.scan, &self.protocol, &|_| Ok(()))?;
         methods.iter().try_for_each(|m| specs::check_held_out(&m.loaded, m.plan.as_ref(), &input.held))?;
         let mut lease = Lease::take(&self.output, CONTENTS)?;
@@ -117,7 +119,8 @@ impl CompareArgs {
             return Err(Error::unsupported("compare: every method failed", why.join("; ")));
         }
         let TrialInput { scan, held, reference, peak, .. } = input;
-        let report = Report { protocol: self.shared(scan, held, peak, general), methods: entries };
+        let protocol = self.shared(scan, held, peak, device, general);
+        let report = Report { protocol, methods: entries };
         let table = table(&report);
         conefield_io::write_text_atomic(self.output.join("table.json"), &out::to_json(&report)?)?;
         conefield_io::write_text_atomic(self.output.join("table.md"), &table.markdown())?;
@@ -144,11 +147,10 @@ impl CompareArgs {
     }
 
     /// Reads and builds every spec. Names must be distinct and valid as folder names.
-    fn methods(&self) -> Result<Vec<Method>> {
+    fn methods(&self, backend: &dyn Backend) -> Result<Vec<Method>> {
         let mut methods: Vec<Method> = vec![];
-        let backend = self.protocol.backend.open_for_run(self.protocol.budget)?;
         for spec in &self.specs {
-            let method = Method::read(spec, None, &self.protocol.sets, None, backend.as_ref())?;
+            let method = Method::read(spec, None, &self.protocol.sets, None, backend)?;
             let free = !FILES.contains(&&method.name.to_lowercase()[..]);
             ensure(free, &method.loaded.source, "name", format!("{:?}", method.name), FOLDER_NAME)?;
             method.differs(&methods)?;
@@ -200,7 +202,14 @@ impl CompareArgs {
         ensure(free, &self.output.display().to_string(), "output", "an earlier comparison", expected)
     }
 
-    fn shared(&self, scan: ScanRecord, held_out_views: Vec<usize>, peak: f64, general: &General) -> Shared<'_> {
+    fn shared(
+        &self,
+        scan: ScanRecord,
+        held_out_views: Vec<usize>,
+        peak: f64,
+        device: String,
+        general: &General,
+    ) -> Shared<'_> {
         Shared {
             version: env!("CARGO_PKG_VERSION"),
             scan,
@@ -212,8 +221,7 @@ impl CompareArgs {
             budget_s: self.protocol.budget,
             sets: &self.protocol.sets,
             backend: self.protocol.backend.clone(),
-            simd: simd_level(),
-            threads: rayon::current_num_threads(),
+            device,
             memory_limit: general.memory,
         }
     }
@@ -266,8 +274,7 @@ impl Shared<'_> {
         parts.extend(self.budget_s.map(|t| format!("budget {}", out::duration(t))));
         parts.extend(self.limits.at_most.map(|t| format!("at most {}", out::duration(t))));
         parts.extend(self.sets.iter().map(|s| format!("`{s}`")));
-        let (threads, version) = (self.threads, self.version);
-        parts.push(format!("seed {}, {threads} {}, conefield {version}", self.seed, out::plural(threads, "thread")));
+        parts.push(format!("seed {}, {}, conefield {}", self.seed, self.device, self.version));
         parts.join("; ")
     }
 }

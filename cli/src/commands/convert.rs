@@ -4,7 +4,7 @@ use super::corrections::{CorrectionOptions, corrected_size, log_applied};
 use super::selection::SelectionOptions;
 use super::units::{HounsfieldOption, unit_of};
 use crate::boundary::Inputs;
-use crate::out;
+use crate::{out, run_folder};
 use clap::{Args, ValueEnum};
 use conefield::files;
 use conefield::hounsfield::How;
@@ -80,8 +80,8 @@ impl ConvertArgs {
                 let expected = "a scan: only scans have views and pixels";
                 return Err(Error::invalid(place, option, "a volume", expected));
             }
-            // Mapped values are no Hounsfield units.
-            if self.values != Values::AsIs {
+            // Mapped values are no Hounsfield units, nor are those of a run.
+            if self.values != Values::AsIs || run_folder::is_result(&self.input) {
                 self.units.of_attenuation()?;
             }
             let template = self.dicom_template.as_ref().map(DicomTemplate::read).transpose()?;
@@ -126,6 +126,12 @@ impl ConvertArgs {
             let (train, applied) = corrections.apply(train, &place)?;
             log_applied(&self.input, &applied);
             let test = test.map(|test| corrections.apply(test, &place)).transpose()?.map(|(test, _)| test);
+            if let (ScanFormat::R2 | ScanFormat::Naf, Some(_), Some(test)) = (self.to, corrections.truncation, &test) {
+                let [wide, own] = [&train, test].map(|scan| scan.geometry.detector);
+                let found = format!("training views of {wide:?} pixels and test views of {own:?}");
+                let expected = "an object that reaches the sides in both: this format has one detector for all views";
+                ensure(wide == own, &place, "--correct truncation", found, expected)?;
+            }
             let test = test.map(|test| selection.of_detector(test)).transpose()?;
             let data = DataSet { train: selection.of(train)?, test, volume };
             files::warn_of(&self.input, &survey(&data.train), false);

@@ -32,15 +32,17 @@ impl ExplainArgs {
     pub fn run(self) -> Result<()> {
         let loaded = specs::read(&self.spec, &self.sets)?;
         // Weights named by an initializer are not read here: a spec is explained without them.
-        let plan = method::plan_without_files(&loaded, self.backend.open()?.as_ref())?;
+        let backend = self.backend.open()?;
+        let plan = method::plan_without_files(&loaded, backend.as_ref())?;
+        let backend = Some(backend.as_ref());
         let explanation = match &self.scan {
-            None => Explanation::new(&loaded, plan.as_ref(), None)?,
+            None => Explanation::new(&loaded, plan.as_ref(), backend, None)?,
             Some(path) => {
                 let size = conefield_io::scan_size(path)?;
                 Memory::of_views(&size).check()?;
                 let scan = conefield_scans::read_scan(path)?;
                 files::warn_of(path, &survey(&scan), plan.needs(&scan.header()).surround > 0);
-                Explanation::new(&loaded, plan.as_ref(), Some((&scan, memory::Run::on(size))))?
+                Explanation::new(&loaded, plan.as_ref(), backend, Some((&scan, memory::Run::on(size))))?
             }
         };
         if self.json { out::json(&explanation) } else { out::say(&explanation.text()) }

@@ -1,6 +1,7 @@
 //! `conefield project`
 
 use crate::boundary::Inputs;
+use crate::progress::Progress;
 use crate::{out, signals};
 use clap::Args;
 use conefield::memory::{self, Memory};
@@ -78,11 +79,14 @@ impl ProjectArgs {
         }
         signals::listen();
         let start = Instant::now();
-        let views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref())?;
+        let mut progress = Progress::new("project", None);
+        let mut go_on = |share| {
+            progress.reach(share);
+            signals::caught().map_or(Ok(()), |_| Err(Error::Aborted { part: "the projection".into() }))
+        };
+        let views = projection::predicted(&volume, &geometry, scan.unit.mm, projector.as_ref(), &mut go_on)?;
+        drop(progress);
         let project_s = start.elapsed().as_secs_f64();
-        if signals::caught().is_some() {
-            return Err(Error::Aborted { part: "the projection".into() });
-        }
         let of = |projections: Array3<f32>, what: &str| Scan {
             geometry: scan.geometry.clone(),
             projections,

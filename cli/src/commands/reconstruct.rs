@@ -11,6 +11,7 @@ use crate::run_folder::RunFolder;
 use crate::{out, signals};
 use clap::error::ErrorKind;
 use clap::{Args, CommandFactory};
+use conefield::files::Interrupted;
 use conefield::input::{self, Input};
 use conefield::memory;
 use conefield::method::Read;
@@ -140,12 +141,11 @@ impl ReconstructArgs {
         let backend = self.protocol.backend.open()?;
         let session = self.session(backend.as_ref(), begin)?;
         let (input, _, earlier) = self.input(&session)?;
-        let resume = earlier.map(|(resume, _)| resume);
-        let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
-        let mut run = session.plan(input, spent, &|| false)?;
+        let earlier = earlier.map(|(earlier, _)| earlier);
+        let mut run = session.plan(input, earlier.as_ref(), &|| false)?;
         signals::listen();
         // Such a process is quiet.
-        match run.solve(None, resume.as_ref(), &mut Progress::new("reconstruct", None)) {
+        match run.solve(None, earlier.as_ref().map(|e| &e.resume), &mut Progress::new("reconstruct", None)) {
             // The leading process writes the checkpoint and says so.
             Err(Error::Interrupted { .. }) => Ok(()),
             done => done.map(drop),
@@ -185,14 +185,14 @@ impl ReconstructArgs {
         };
         inputs.spare_folder(&self.output)?;
         let (input, scan, earlier) = self.input(&session)?;
-        let (resume, files) = earlier.unzip();
+        let (earlier, files) = earlier.unzip();
         conefield_io::check_shape(folder.file("volume.nii.gz"), input.scan.geometry.volume.shape)?;
         let affine = input.reference.as_ref().and_then(|r| r.affine);
         let (unit, grid) = (&input.scan.unit, &input.scan.geometry.volume);
         let hu = self.units.of_attenuation()?.open(&self.scan, Some(unit), grid, affine.as_ref())?;
 
-        let spent = resume.as_ref().map_or(0.0, |resume| resume.standing.seconds);
-        let mut run = session.plan(input, spent, &|| signals::caught().is_some())?;
+        let mut run = session.plan(input, earlier.as_ref(), &|| signals::caught().is_some())?;
+        let resume = earlier.as_ref().map(|e| &e.resume);
         let loaded = &run.method.loaded;
         let files = files.map_or_else(|| specs::checksums(loaded), Ok)?;
         let identity = identity(loaded, &self.protocol, &run.input.held, &scan, &files)?;
@@ -205,17 +205,18 @@ impl ReconstructArgs {
         if resume.is_none() {
             inputs.and_spec(loaded).spare_folder(&self.output)?;
         }
-        let (metrics, earlier) = begin_or_go_on(&mut folder, loaded, resume.as_ref())?;
+        let (metrics, recorded) = begin_or_go_on(&mut folder, loaded, resume)?;
         if let Some(port) = self.watch {
             watch::serve(&self.output, port)?;
         }
         let mut progress = self.progress(&folder, metrics, identity)?;
-        let solved = run.solve(None, resume.as_ref(), &mut progress)?;
+        progress.history = run.history.clone();
+        let solved = run.solve(None, resume, &mut progress)?;
         if ranks::count() > 1 {
             tracing::info!("{} processes; this one sent {} to the others", ranks::count(), bytes(ranks::sent()));
         }
         // A run resumed after its last pass adds no record.
-        let last = progress.latest.take().or(earlier);
+        let last = progress.latest.take().or(recorded);
         let board = progress.board.take();
         drop(progress);
 
@@ -339,7 +340,7 @@ impl ReconstructArgs {
 }
 
 /// A checkpoint, and the checksums of the files that its spec names.
-type Earlier = (Resume, BTreeMap<String, String>);
+type Earlier = (Interrupted, BTreeMap<String, String>);
 
 /// Begins a run in its folder, or resumes it. Returns its file of metrics, and the last record that it keeps.
 fn begin_or_go_on(

@@ -2,6 +2,7 @@
 
 use crate::boundary::{Inputs, refuse_existing};
 use crate::out;
+use crate::progress::Progress;
 use clap::Args;
 use conefield::files;
 use conefield::memory::Memory;
@@ -14,6 +15,7 @@ use conefield_core::scan::Unit;
 use conefield_projectors::simulate::{DetectorExtent, DetectorNoise, Protocol};
 use serde_json::json;
 use std::path::PathBuf;
+use std::sync::Mutex;
 use tracing::warn;
 
 /// Make a scan of a known volume.
@@ -114,7 +116,11 @@ impl SimulateArgs {
         };
         let protocol = set_up.map_or_else(|| simulation::protocol(&self.protocol, &volume.grid), Ok)?;
         let protocol = simulation::changed(protocol, &changes, "command line")?;
-        let (scan, volume) = simulation::scan(volume, self.values, &protocol, &self.volume)?;
+        let progress = Mutex::new(Progress::new("simulate", None));
+        // One thread shows what all have done.
+        let reach = |share| progress.try_lock().map_or((), |mut progress| progress.reach(share));
+        let (scan, volume) = simulation::scan(volume, self.values, &protocol, &self.volume, &reach)?;
+        drop(progress);
         conefield_io::write_scan(&self.output, &scan, Some(&volume))?;
         let g = &scan.geometry;
         if range(&scan.projections) == [0.0; 2] {

@@ -21,7 +21,7 @@ pub fn summary(r: &RunRecord, output: &Path) -> String {
         out::duration(r.train_s),
         out::duration(r.written.export_s),
     )];
-    if let Some(plan) = &r.plan {
+    if let Some(plan) = r.plan.as_ref().map(|plan| &plan.reason) {
         let point = plan.point.as_ref().map_or(String::new(), |p| format!("{p}, "));
         lines.push(format!("method: {point}spec {}, {}", r.spec, plan.why));
     }

@@ -8,7 +8,6 @@ use crate::out;
 use clap::Args;
 use conefield::backend::{self, BackendChoice};
 use conefield::input::is_truth;
-use conefield::machine::simd_level;
 use conefield::parse::{self, HoldOut};
 use conefield::specs;
 use conefield::tradeoff::levers::{self, Candidate, Levers};
@@ -123,7 +122,7 @@ impl TradeoffArgs {
             format!("{all} volumes"),
             format!("{}, one per scan", self.scans.len()),
         )?;
-        self.backend.open_for_run(self.budgets.first().copied())?;
+        let device = self.backend.open_for_run(self.budgets.first().copied())?.describe();
         let ranked = all > 0 || self.hold_out.0.is_some();
         ensure(ranked, "tradeoff", "--hold-out", "none", "views to rank by, as there is no --reference")?;
         let references: Vec<PathBuf> =
@@ -147,8 +146,7 @@ impl TradeoffArgs {
             keep: self.keep,
             candidates,
             backend: self.backend.to_string(),
-            simd: simd_level(),
-            threads: rayon::current_num_threads(),
+            device,
             memory_limit: general.memory,
         })
     }

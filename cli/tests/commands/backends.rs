@@ -1,6 +1,7 @@
 //! The wgpu backend in the command: listed, explained, and used for runs.
 
 use crate::common::{Folder, SCAN, number};
+use conefield_evaluation::report::text::bytes;
 use serde_json::Value;
 
 fn listed() -> Value {
@@ -51,6 +52,7 @@ fn explain_says_what_a_gpu_makes_of_a_spec() {
     if listed()["backends"][1]["adapters"][0]["subgroups"].is_array() {
         assert!(said.contains("summed in subgroups first"), "{said}");
     }
+    assert!(d.done("explain fdk --backend wgpu").contains("\nbackend: wgpu, "));
     let auto = d.done("explain ni-naf");
     assert!(auto.contains("chosen by --backend auto"), "{auto}");
     for (code, backend, words) in [
@@ -61,6 +63,19 @@ fn explain_says_what_a_gpu_makes_of_a_spec() {
     ] {
         d.refused_with(code, &format!("explain ni-naf --backend {backend}"), &[words]);
     }
+}
+
+#[test]
+fn the_log_counts_the_bytes_of_the_record() {
+    if !adapter("bytes") {
+        return;
+    }
+    let d = Folder::after(&[SCAN]);
+    let line = "reconstruct scan --spec fast --steps 2 --set training.rays=16 -o run --backend wgpu";
+    let said = String::from_utf8(d.loud(line).output().unwrap().stderr).unwrap();
+    let moved = &d.read("run/record.json")["moved"];
+    let [to, from] = ["to_device", "from_device"].map(|way| bytes(moved[way].as_u64().unwrap()));
+    assert!(said.contains(&format!("moved {to} to the device and {from} from it")), "{moved}: {said}");
 }
 
 /// Both specs of Gaussians, the published one with its prior and its density control, end at the same PSNR.
@@ -102,6 +117,8 @@ fn an_interrupted_run_goes_on_on_the_other_backend() {
             d.killed_at_a_checkpoint(&run, &begun);
             let record = reconstruct(&d, &run, spec, second, &format!("{more} --resume"));
             assert_eq!(record["steps"], steps);
+            let named = [0, 1].map(|i| record["backends"][i]["backend"].as_str().unwrap().split(',').next().unwrap());
+            assert_eq!(named, [first, second]);
         }
         for backend in ["cpu", "wgpu"] {
             d.done(&format!("export {} -o {backend}.npy --backend {backend} --force", of("wgpu")));

@@ -106,4 +106,6 @@ fn an_interrupted_run_goes_on_with_what_it_chose() {
     let spec = d.text("run/spec.toml");
     assert!(spec.contains("type = \"sart\"") && spec.contains("relaxation = 1.5"), "{spec}");
     assert!(record["steps"].as_u64().unwrap() > 1 && !d.has("run/checkpoint.safetensors"));
+    let (point, why) = (&record["plan"]["point"], record["plan"]["why"].as_str().unwrap());
+    assert!(*point == "p" && why.starts_with("the best of the front"), "{why}");
 }

@@ -29,6 +29,8 @@ fn table_picture_and_records_agree_and_resume_skips_what_is_done() {
     assert_eq!(scan, [json!(12), json!([24, 24]), json!([24, 24, 24])]);
     let asked = [&protocol["seed"], &protocol["reference"], &protocol["limits"]["steps"]];
     assert_eq!(asked, [&json!(3), &json!("truth"), &json!(3)]);
+    let device = protocol["device"].as_str().unwrap();
+    assert!(device.starts_with("cpu, ") && d.text("out/table.md").contains(&format!("; seed 3, {device}, conefield ")));
     let rows = markdown(&d);
     let heads = [
         "method", "PSNR dB", "ssim_2d", "ssim_3d", "ssim_skimage", "held-out error", "steps or passes",

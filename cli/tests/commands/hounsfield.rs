@@ -83,6 +83,7 @@ fn a_reconstruction_is_within_one_hounsfield_unit() {
     assert!(read_volume(d.at("run/volume.nii.gz")).unwrap().data.iter().all(|x| *x < 0.03));
     d.done("convert run/volume-hu.nii.gz hu.dicom --hu as-is");
     is_hu(&d, "hu.dicom", 1.0);
+    d.refuses("x.dicom", &[("convert run/volume.nii.gz x.dicom --hu as-is", "these values are attenuation")]);
     // A finished run with Hounsfield units is still a run.
     assert!(d.refused(1, "reconstruct scan --spec fdk -o run").contains("--force"));
     d.done("reconstruct scan --spec fdk -o run --force");

@@ -90,13 +90,18 @@ fn a_signal_ends_the_step_keeps_a_checkpoint_and_says_so() {
     d.done(&line("whole", steps, ""));
     for name in ["INT", "TERM"] {
         let begun = || d.filled(&format!("{name}/metrics.jsonl"));
-        let said = d.interrupted(&line(name, steps, "--checkpoint-every 1h"), name, &begun);
+        let said = d.interrupted(&line(name, steps, "--checkpoint-every 1h --threads 2"), name, &begun);
         assert!(said.contains("interrupted") && said.contains("--resume"), "{said}");
         let run = d.at(name);
         assert!(run.join("checkpoint.safetensors").exists() && !run.join("volume.nii.gz").exists());
-        d.done(&line(name, steps, "--resume"));
+        d.done(&line(name, steps, "--resume --threads 1"));
         same_results(&d, "whole", name);
+        let record = d.read(format!("{name}/record.json"));
+        let [before, after] = [0, 1].map(|i| &record["backends"][i]);
+        assert!(before["from_step"] == 0 && before["backend"].as_str().unwrap().ends_with(" 2 threads"), "{record}");
+        assert!(after["from_step"].as_u64() > Some(0) && after["backend"] == record["backend"]["backend"], "{record}");
     }
+    assert!(d.read("whole/record.json").get("backends").is_none());
 }
 
 /// Three methods with the mean of the last two volumes: a field with 140 steps and 20 records, then twice 300 passes.

@@ -59,6 +59,7 @@ fn tables_pictures_and_records_agree_and_resume_repeats_nothing() {
         for key in ["steps", "scores", "total_s", "seed", "machine"] {
             assert_eq!(run[key], record[key], "{key}");
         }
+        assert_eq!(run["backend"], record["backend"]["backend"]);
         assert_eq!((&run["status"], &record["reference"]), (&"done".into(), &"truth".into()));
         // Noise and method use the cell's seed; the scan has the requested number of views.
         let case = run["case"].as_str().unwrap();

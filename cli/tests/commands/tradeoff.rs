@@ -106,6 +106,10 @@ fn halving_front_and_specs_agree() {
     assert_eq!((picture.width, picture.height), (2000, 750));
     let table = d.text("out/tradeoff.md");
     assert!(table.starts_with("| front | budget | PSNR dB |") && table.contains("rank correlation"), "{table}");
+    assert!(
+        found["search"]["device"].as_str().is_some_and(|cpu| table.contains(&format!(", {cpu}, conefield "))),
+        "{table}"
+    );
 
     // Every spec can be read back, and one runs for as many steps as its trial.
     let specs = d.names("out/front");

@@ -6,7 +6,7 @@ use conefield_core::scan::Volume;
 use conefield_evaluation::report::Pixels;
 use conefield_io::{Parts, read_volume, write_r2, write_scan, write_volume};
 use conefield_scans::{read_data_set, read_scan};
-use ndarray::Array3;
+use ndarray::{Array3, s};
 use serde_json::{Value, json};
 
 const SMALL: &str = "--set encoder.levels=3 --set encoder.log2_table_size=10 --set projector.samples=24";
@@ -121,6 +121,15 @@ fn test_views_are_kept_or_their_loss_is_reported() {
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(said.contains("left out: 3 test views"), "{said}");
     }
+    // Columns are added to the views of an object that reaches their sides.
+    let (mut cut, mut test) = (train, test);
+    cut.projections += 1.0;
+    test.projections.slice_mut(s![.., .., ..2]).fill(0.0);
+    test.projections.slice_mut(s![.., .., 20..]).fill(0.0);
+    write_r2(d.at("cut"), &cut, Some(&test), whole.volume.as_ref()).unwrap();
+    let words = "--correct truncation: found training views of [14, 44] pixels and test views of [14, 22]";
+    let asked = ["r2", "naf"].map(|to| format!("convert cut none --to {to} --correct truncation"));
+    d.refuses("none", &asked.each_ref().map(|line| (&line[..], words)));
 }
 
 #[test]

@@ -101,6 +101,8 @@ struct RunLine {
     run: String,
     /// The machine of the run.
     machine: Option<Machine>,
+    /// The backend, with the instruction set or device.
+    backend: Option<String>,
     #[serde(flatten)]
     outcome: Outcome,
 }
@@ -108,6 +110,13 @@ struct RunLine {
 impl RunLine {
     fn name(&self) -> String {
         run_name(&self.case, self.seed, &self.method)
+    }
+
+    /// The machine, and its GPU if that has computed.
+    fn computed_on(&self) -> Option<String> {
+        let machine = self.machine.as_ref()?.line();
+        let gpu = self.backend.as_ref().filter(|b| !b.starts_with("cpu"));
+        Some(gpu.map_or(machine.clone(), |gpu| format!("{machine}, {gpu}")))
     }
 }
 
@@ -134,8 +143,10 @@ impl<'a> StudyReport<'a> {
         let line = |(cell, outcome): (Cell, Outcome)| {
             let (case, method) = (study.cases[cell.case].name.clone(), study.methods[cell.method].name.clone());
             let run = layout.run(&study.run_name(&cell)).display().to_string();
-            let machine = outcome.figures.as_ref().and_then(|f| f.machine.clone());
-            RunLine { case, seed: cell.seed, method, run, machine, outcome }
+            let figures = outcome.figures.as_ref();
+            let machine = figures.and_then(|f| f.machine.clone());
+            let backend = figures.and_then(|f| Some(f.backend.as_ref()?.backend.clone()));
+            RunLine { case, seed: cell.seed, method, run, machine, backend, outcome }
         };
         Self {
             version: env!("CARGO_PKG_VERSION"),
@@ -195,13 +206,13 @@ impl<'a> StudyReport<'a> {
         let seeds: Vec<String> = self.seeds.iter().map(u64::to_string).collect();
         let mut words = self.protocol.words();
         words.push(format!("seeds {}", seeds.join(", ")));
-        let mut machines: Vec<&Machine> = vec![];
-        for machine in self.runs.iter().filter_map(|r| r.machine.as_ref()) {
+        let mut machines: Vec<String> = vec![];
+        for machine in self.runs.iter().filter_map(RunLine::computed_on) {
             if !machines.contains(&machine) {
                 machines.push(machine);
             }
         }
-        words.extend(machines.iter().map(|m| m.line()));
+        words.extend(machines.iter().cloned());
         let commit = self.commit.map_or(String::new(), |c| format!(" ({c})"));
         words.push(format!("conefield {}{commit}", self.version));
         let mut line = format!("Mean ± standard deviation over the seeds; {}.", words.join("; "));
@@ -345,6 +356,20 @@ mod tests {
         let scores = json!({ "psnr": psnr, "ssim_2d": psnr / 100.0, "ssim_3d": null, "ssim_skimage": null });
         let figures = Figures { total_s, scores: Some(scores), ..Figures::default() };
         Outcome { status: Status::Done, error: None, figures: Some(figures) }
+    }
+
+    #[test]
+    fn a_gpu_is_named_beside_its_machine() {
+        let study = study("volumes = ['phantom:head:16']\nspecs = ['fdk']\n");
+        let cell = study.cells()[0];
+        for (backend, named) in [("cpu, avx2, 2 threads", false), ("wgpu, H200 (Vulkan)", true)] {
+            let record = json!({ "machine": {}, "backend": { "backend": backend }, "steps": 1, "train_s": 1, "export_s": 0,
+                "total_s": 1, "threads": 2, "parameters": 0, "samples": 0 });
+            let figures = Some(serde_json::from_value(record).unwrap());
+            let outcome = Outcome { status: Status::Done, error: None, figures };
+            let report = StudyReport::new(&study, &Layout(Path::new("out")), vec![], vec![(cell, outcome)]);
+            assert_eq!(report.line().contains(backend), named, "{}", report.line());
+        }
     }
 
     #[test]

@@ -63,7 +63,7 @@ impl Simulation {
         let volume = self.prepared()?;
         let protocol = self.protocol(&volume.grid, seed)?;
         let prepared = self.preparation(&volume);
-        let (mut scan, volume) = simulation::scan(volume, self.values, &protocol, &self.written)?;
+        let (mut scan, volume) = simulation::scan(volume, self.values, &protocol, &self.written, &|_| {})?;
         if let Some(p) = scan.provenance.as_object_mut() {
             p.insert("prepared".into(), prepared);
         }

@@ -43,7 +43,7 @@ impl Unknowns {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Front {
-    /// Program and number of threads with which it was made.
+    /// Program and device with which it was made.
     pub made: String,
     /// Time of a pass of the [standard reconstruction](crate::tradeoff::speed) on that machine, in seconds: a measure of its
     /// speed.

@@ -157,12 +157,11 @@ impl TradeoffReport {
             let base = specs::read(&candidate.spec, &candidate.sets)?;
             let scans: Vec<String> = self.search.scans.iter().map(|s| s.name()).collect();
             let said = format!(
-                "{} in {} on {}, with {} {}.",
+                "{} in {} on {}, on {}.",
                 self.reached(point),
                 duration(point.total_s),
                 scans.join(", "),
-                self.search.threads,
-                plural(self.search.threads, "thread")
+                self.search.device
             );
             let mut sets = candidate.sets.clone();
             let steps = (point.steps.round() as u64).max(1);
@@ -177,7 +176,7 @@ impl TradeoffReport {
     }
 
     fn front_file(&self) -> Result<String> {
-        let Search { version, threads, simd, .. } = &self.search;
+        let Search { version, device, .. } = &self.search;
         let tuned = self.search.scans.iter().map(|s| Tuned {
             name: s.name(),
             views: s.views,
@@ -206,7 +205,7 @@ impl TradeoffReport {
                 runs: point.runs.iter().map(reached).collect(),
             });
         }
-        let made = format!("conefield {version}, {threads} {}, {simd}", plural(*threads, "thread"));
+        let made = format!("conefield {version}, {device}");
         let front = Front { made, pass_s: None, scans: tuned.collect(), points };
         let text = toml::to_string(&front).map_err(|e| Error::unsupported("front.toml", e.to_string()))?;
         Ok(format!("# Written by \"conefield tradeoff\", read by \"conefield reconstruct --budget --front\".\n{text}"))
@@ -256,8 +255,7 @@ impl TradeoffReport {
             ));
         }
         notes.extend(s.hold_out.as_ref().map(|h| format!("views held out: {h}")));
-        let threads = plural(s.threads, "thread");
-        notes.push(format!("seed {}, {} {threads}, conefield {}", s.seed, s.threads, s.version));
+        notes.push(format!("seed {}, {}, conefield {}", s.seed, s.device, s.version));
         for rung in &self.rungs {
             let short = self.count(rung.budget_s, Status::TooShort);
             let failed = self.count(rung.budget_s, Status::Failed);

@@ -8,7 +8,7 @@ use conefield_core::method::Plan;
 use conefield_core::words::plural;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::text::{duration, number};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
@@ -42,16 +42,31 @@ pub struct Budget {
     pub spent: f64,
 }
 
-/// The planned run, for people and for the record.
-#[derive(Debug, Clone, Serialize)]
-pub struct Schedule {
+/// Why a run within a budget has its method. A resumed run keeps it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Reason {
     /// The point of the front, if the method was chosen.
     pub point: Option<String>,
     /// Reason for the method.
     pub why: String,
     /// Rejected methods, with reasons.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub passed_over: Vec<String>,
+}
+
+impl Reason {
+    /// The reason for a method that was not chosen.
+    pub fn requested() -> Self {
+        Self { point: None, why: "the requested spec".into(), passed_over: vec![] }
+    }
+}
+
+/// The planned run, for people and for the record.
+#[derive(Debug, Clone, Serialize)]
+pub struct Schedule {
+    /// The reason for the method.
+    #[serde(flatten)]
+    pub reason: Reason,
     /// Steps or passes that fit into the time.
     pub steps: u64,
     /// Seconds until the plan was complete.
@@ -81,11 +96,11 @@ impl Budget {
         AIM * self.seconds - self.spent - self.begin.elapsed().as_secs_f64()
     }
 
-    /// Plans the requested method `method`.
-    pub fn plan(&self, bench: &Bench<'_>, method: &mut Planned) -> Result<Schedule> {
+    /// Plans `method`, which the run has for this reason.
+    pub fn plan(&self, bench: &Bench<'_>, method: &mut Planned, reason: Reason) -> Result<Schedule> {
         let start = Instant::now();
         let costs = calibrate(bench, method.plan.as_mut(), self.measuring())?;
-        self.settle(None, "the requested spec".into(), vec![], method, costs, start)
+        self.settle(reason, method, costs, start)
     }
 
     /// The best method of `front` that fits, built by `build` from a spec and settings, with its schedule.
@@ -150,7 +165,8 @@ impl Budget {
         };
         let why = format!("{why} ({})", point.scores(front));
         let passed_over = passed_over.into_iter().map(|(i, why)| format!("{}: {why}", points[i].name)).collect();
-        let plan = self.settle(Some(point.name.clone()), why, passed_over, &mut method, costs, start)?;
+        let reason = Reason { point: Some(point.name.clone()), why, passed_over };
+        let plan = self.settle(reason, &mut method, costs, start)?;
         Ok((method, plan))
     }
 
@@ -160,15 +176,7 @@ impl Budget {
     }
 
     /// The schedule, or an error that states a sufficient time.
-    fn settle(
-        &self,
-        point: Option<String>,
-        why: String,
-        passed_over: Vec<String>,
-        method: &mut Planned,
-        costs: Costs,
-        start: Instant,
-    ) -> Result<Schedule> {
+    fn settle(&self, reason: Reason, method: &mut Planned, costs: Costs, start: Instant) -> Result<Schedule> {
         let kind = Unknowns::of(method.plan.as_mut());
         let left = self.left();
         // If time is short, training gets half of it, provided that later methods can do with less.
@@ -200,9 +208,7 @@ impl Budget {
         };
         let steps = (train_s / costs.step_s.max(1e-12)) as u64;
         Ok(Schedule {
-            point,
-            why,
-            passed_over,
+            reason,
             steps: passes.map_or(steps, |most| most.min(steps)),
             passes,
             load_s,
@@ -242,13 +248,14 @@ fn time(seconds: f64) -> String {
 impl Schedule {
     /// Text for people; `spec` is the name of the method's spec.
     pub fn lines(&self, spec: &str) -> Vec<String> {
-        let named = match &self.point {
+        let Reason { point, why, passed_over } = &self.reason;
+        let named = match point {
             Some(point) => format!("{point} (spec {spec})"),
             None => format!("spec {spec}"),
         };
         let (e, steps) = (&self.expected, plural(self.steps, self.kind.step()));
-        let mut lines = vec![format!("method: {named}, {}", self.why)];
-        lines.extend(self.passed_over.iter().map(|line| format!("passed over: {line}")));
+        let mut lines = vec![format!("method: {named}, {why}")];
+        lines.extend(passed_over.iter().map(|line| format!("passed over: {line}")));
         if e.then_s > 0.0 {
             lines.push(format!("planned: at most {} after the training", time(e.then_s)));
         }

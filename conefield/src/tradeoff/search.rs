@@ -51,10 +51,8 @@ pub struct Search {
     pub candidates: Vec<Candidate>,
     /// As on the command line.
     pub backend: String,
-    /// Available SIMD instructions.
-    pub simd: String,
-    /// Threads per run.
-    pub threads: usize,
+    /// What it runs on: the processor's instructions and threads, or an adapter.
+    pub device: String,
     /// Memory limit of a run in bytes, if set.
     pub memory_limit: Option<u64>,
 }

@@ -59,6 +59,16 @@ pub struct Figures {
     /// The machine, which tables do not repeat beside them.
     #[serde(default, skip_serializing)]
     pub machine: Option<Machine>,
+    /// The backend, as the machine.
+    #[serde(default, skip_serializing)]
+    pub backend: Option<Computing>,
+}
+
+/// The part of a record on its backend that figures have.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Computing {
+    /// Name of the backend, with the instruction set or device.
+    pub backend: String,
 }
 
 impl Figures {

@@ -40,8 +40,13 @@ use serde_json::json;
 /// The volume's values are per protocol unit of length (1/mm for the default unit), so that a projection is Σ value ·
 /// length in units and has no unit itself.
 pub fn simulate(volume: &Volume, protocol: &Protocol) -> Result<Scan> {
+    simulate_with(volume, protocol, &|_| {})
+}
+
+/// As [`simulate`]; calls `progress` with the share of finished views after each.
+pub fn simulate_with(volume: &Volume, protocol: &Protocol, progress: &(dyn Fn(f64) + Sync)) -> Result<Scan> {
     let geometry: Geometry = protocol.geometry(&volume.grid)?;
-    let mut projections = project(volume, &geometry, protocol.samples_per_voxel)?;
+    let mut projections = project::project_with(volume, &geometry, protocol.samples_per_voxel, progress)?;
     let units_per_mm = (1.0 / protocol.unit.mm) as f32;
     parallel::scale(&mut projections, units_per_mm);
     let largest = range(&projections)[1].max(0.0);

@@ -10,6 +10,7 @@ use conefield_core::geometry::Geometry;
 use conefield_core::parallel;
 use conefield_core::scan::Volume;
 use ndarray::Array3;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Side of the blocks of cells that are skipped if empty.
 const BLOCK: usize = 8;
@@ -22,6 +23,16 @@ const BAND: usize = 16;
 /// voxel side, at least 2: the step is at most half a voxel. Positions are computed in `f64`, sampled in `f32` and
 /// summed in `f64` block by block. The result does not depend on the number of threads.
 pub fn project(volume: &Volume, geometry: &Geometry, per_voxel_samples: f64) -> Result<Array3<f32>> {
+    project_with(volume, geometry, per_voxel_samples, &|_| {})
+}
+
+/// As [`project`]; calls `progress` with the share of finished views after each.
+pub(super) fn project_with(
+    volume: &Volume,
+    geometry: &Geometry,
+    per_voxel_samples: f64,
+    progress: &(dyn Fn(f64) + Sync),
+) -> Result<Array3<f32>> {
     geometry.validate("projection")?;
     volume.grid.validate("projection")?;
     ensure(
@@ -41,6 +52,7 @@ pub fn project(volume: &Volume, geometry: &Geometry, per_voxel_samples: f64) -> 
         return Err(Error::invalid("projection", "detector", found, "projections that fit in memory"));
     }
     pixels.resize(count, 0.0);
+    let finished = AtomicUsize::new(0);
     parallel::over(pixels.chunks_mut(rows * columns), |view, pixels| {
         parallel::over(pixels.chunks_mut(BAND * columns), |band, pixels| {
             for column in 0..columns {
@@ -49,6 +61,7 @@ pub fn project(volume: &Volume, geometry: &Geometry, per_voxel_samples: f64) -> 
                 }
             }
         });
+        progress((finished.fetch_add(1, Ordering::Relaxed) + 1) as f64 / views as f64);
     });
     Array3::from_shape_vec((views, rows, columns), pixels)
         .map_err(|e| Error::invalid("projection", "detector", e, "as many pixels as the shape has"))

@@ -4,6 +4,7 @@ use super::*;
 use conefield_core::geometry::{Millimetres, Radians, Vec3, View, VoxelGrid};
 use ndarray::{Array2, Array3};
 use std::path::PathBuf;
+use std::sync::Mutex;
 
 fn on<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
     rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(work)
@@ -99,6 +100,10 @@ fn projection_is_the_same_on_any_number_of_threads() {
     let one = on(1, || simulate(&volume, &protocol).unwrap());
     let three = on(3, || simulate(&volume, &protocol).unwrap());
     assert_eq!(one.projections, three.projections);
+    let shares = Mutex::new(vec![]);
+    let heard = simulate_with(&volume, &protocol, &|share| shares.lock().unwrap().push(share)).unwrap();
+    let shares = shares.into_inner().unwrap();
+    assert!(heard.projections == one.projections && shares.len() == 6 && shares.contains(&1.0), "{shares:?}");
     assert_ne!(
         one.projections,
         simulate(&volume, &Protocol { seed: 6, ..protocol.clone() }).unwrap().projections,

@@ -7,7 +7,7 @@ use crate::diagnosis::quantiles::{median, quantile, sorted_sample};
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::parallel;
 use conefield_core::scan::Scan;
-use ndarray::{Array2, Array3, ArrayView3, Axis};
+use ndarray::{Array2, ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 
 /// Least number of views for judging a pixel over the views.
@@ -18,6 +18,8 @@ const STUCK: f32 = 0.1;
 const RESTLESS: f32 = 0.02;
 /// ... and a single outlier by this share.
 const STANDS_OUT: f32 = 0.1;
+/// Columns examined at once: a thread holds their differences for all views.
+const STRIP: usize = 64;
 /// With a larger share of bad values, the scan is wrong, not the detector.
 const MOST: f64 = 0.2;
 
@@ -133,27 +135,30 @@ fn range(values: ArrayView3<'_, f32>) -> f32 {
 /// difference from its neighbours (median distance from the median).
 fn over_time(values: ArrayView3<'_, f32>) -> [Array2<f32>; 2] {
     let (views, rows, columns) = values.dim();
-    let mut apart = Array3::<f32>::zeros((rows, columns, views));
-    parallel::over(apart.axis_iter_mut(Axis(0)), |r, mut line| {
+    let (mut changes, mut flickers) = (Array2::zeros((rows, columns)), Array2::zeros((rows, columns)));
+    let lines = changes.outer_iter_mut().zip(flickers.outer_iter_mut());
+    parallel::over(lines, |r, (mut changes, mut flickers)| {
         let mut around = Vec::with_capacity(8);
-        for ((c, v), out) in line.indexed_iter_mut() {
-            let view = values.index_axis(Axis(0), v);
-            neighbours(view, (r, c), None, &mut around);
-            *out = view[[r, c]] - median(&mut around).unwrap_or(0.0);
+        let mut strip = vec![Vec::with_capacity(views); STRIP.min(columns)];
+        for first in (0..columns).step_by(STRIP) {
+            let pixels = || (first..columns).zip(0..STRIP);
+            strip.iter_mut().for_each(Vec::clear);
+            for view in values.outer_iter() {
+                for (c, k) in pixels() {
+                    neighbours(view, (r, c), None, &mut around);
+                    strip[k].push(view[[r, c]] - median(&mut around).unwrap_or(0.0));
+                }
+            }
+            for (c, k) in pixels() {
+                let own = values.slice(ndarray::s![.., r, c]);
+                let mean = own.sum() / views as f32;
+                changes[c] = own.iter().map(|x| (x - mean).abs()).sum::<f32>() / views as f32;
+                let apart = &mut strip[k];
+                let middle = median(apart).unwrap_or(0.0);
+                apart.iter_mut().for_each(|x| *x = (*x - middle).abs());
+                flickers[c] = median(apart).unwrap_or(0.0);
+            }
         }
     });
-    let mut changes = Array2::zeros((rows, columns));
-    let mut flickers = Array2::zeros((rows, columns));
-    for r in 0..rows {
-        for c in 0..columns {
-            let own = values.slice(ndarray::s![.., r, c]);
-            let mean = own.sum() / views as f32;
-            changes[[r, c]] = own.iter().map(|x| (x - mean).abs()).sum::<f32>() / views as f32;
-            let mut apart = apart.slice(ndarray::s![r, c, ..]).to_vec();
-            let middle = median(&mut apart).unwrap_or(0.0);
-            apart.iter_mut().for_each(|x| *x = (*x - middle).abs());
-            flickers[[r, c]] = median(&mut apart).unwrap_or(0.0);
-        }
-    }
     [changes, flickers]
 }

@@ -116,6 +116,8 @@ fn pixels_that_do_not_measure_are_filled_in() {
         let (kept, found) = corrected(clean, &["pixels"]);
         assert!(kept.projections == clean.projections, "{found}");
     }
+    // Without a copy of the scan.
+    assert_eq!(Corrections::parse(&["pixels"]).unwrap().bytes(1 << 30), 0);
 }
 
 #[test]

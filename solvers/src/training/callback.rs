@@ -71,7 +71,7 @@ pub trait Callback: Send {
         Ok(())
     }
 
-    /// Called after the last step if the run reaches its limits, before the last record.
+    /// Called after the last step, before the last record; if that record ends the run, after [`at_record`](Self::at_record).
     fn at_end(&mut self, _run: &mut Run<'_>) -> Result<()> {
         Ok(())
     }

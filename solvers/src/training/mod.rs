@@ -113,6 +113,10 @@ fn record(run: &mut Run<'_>, callbacks: &mut Callbacks, over: bool) -> Result<()
     callbacks.each(|c| c.at_record(&mut record, run))?;
     if run.settled {
         record.events.push("the stopping rule is met".into());
+        if !over {
+            callbacks.each(|c| c.at_end(run))?;
+            record.events.append(&mut run.tally.window.events);
+        }
     }
     run.observer.record(&record);
     run.tally.window = run::Window::default();

@@ -52,13 +52,17 @@ fn least(records: &[Record]) -> (Best, usize) {
 #[test]
 fn a_run_that_learns_noise_ends_early_and_returns_the_best() {
     let scans = scans(1.0);
-    let (solution, records) = solve(&settings(4000, Some(5)), &scans, Limits::default());
+    let mut patient = settings(4000, Some(5));
+    patient["callbacks"].as_array_mut().unwrap().push(json!({"type": "fft-mask", "epoch": 100_000}));
+    let (solution, records) = solve(&patient, &scans, Limits::default());
     let (best, after) = least(&records);
     let errors: Vec<_> = records.iter().map(|r| r.held_out.unwrap()).collect();
     assert!(solution.steps < 4000 && after == 5, "{errors:.4?}");
     assert_eq!((solution.best, solution.steps), (Some(best), best.step + 5 * 20));
     let met = |r: &Record| r.events.iter().any(|e| e.contains("stopping rule"));
     assert!(met(records.last().unwrap()) && !records[..records.len() - 1].iter().any(met));
+    let ends = &records.last().unwrap().events;
+    assert!(ends.iter().any(|e| e.contains("no channel was evaluated")), "{ends:?}");
     // The result equals that of a run with this number of steps. More steps would have made it worse.
     let (early, _) = solve(&settings(best.step, None), &scans, Limits::default());
     assert_eq!(early.best, None);

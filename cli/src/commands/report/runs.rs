@@ -135,7 +135,7 @@ fn curves(run: &RunOnDisk) -> Vec<Value> {
 fn plan(run: &RunOnDisk) -> Result<String> {
     let loaded = specs::reread(&run.spec, &run.folder.join("spec.toml").display().to_string())?;
     let plan = method::plan_without_files(&loaded, &Cpu::new())?;
-    Ok(Explanation::new(&loaded, plan.as_ref(), None)?.text())
+    Ok(Explanation::new(&loaded, plan.as_ref(), None, None)?.text())
 }
 
 /// Names of the specs; if these are ambiguous, of the folders, of the folders in their parents as in a study, or else

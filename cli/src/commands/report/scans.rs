@@ -250,7 +250,8 @@ impl Shown {
     fn predict(&mut self, volume: &Volume, grid: VoxelGrid, options: &Options) -> Result<PredictedViews> {
         let mut geometry = self.scan.geometry.clone();
         geometry.volume = grid;
-        let mut views = projection::predicted(volume, &geometry, self.scan.unit.mm, options.projector.as_ref())?;
+        let (unit_mm, projector) = (self.scan.unit.mm, options.projector.as_ref());
+        let mut views = projection::predicted(volume, &geometry, unit_mm, projector, &mut |_| Ok(()))?;
         let pictures =
             views.outer_iter().map(|v| picture_url(v, Scale::Grey(self.window))).collect::<Result<Vec<_>>>()?;
         let left = metrics::residual(&self.scan, &mut views)?;

@@ -145,11 +145,12 @@ impl Callback for Guard {
         if calm && due { self.keep(run) } else { Ok(Update::Take) }
     }
 
-    /// Judges the last steps, which no further step judges; reports if the whole run was in vain.
+    /// Judges the last steps, which no further step judges, unless the run ends at an earlier state; reports if the whole
+    /// run was in vain.
     fn at_end(&mut self, run: &mut Run<'_>) -> Result<()> {
         let away = self.ran_away();
         run.exe.fetch(&mut run.model)?;
-        if let Some(what) = away.or_else(|| strayed(&run.model.arena)) {
+        if let Some(what) = away.or_else(|| strayed(&run.model.arena)).filter(|_| !run.settled) {
             self.back(&what, run)?;
         } else if let Some(said) = self.in_vain(run.step) {
             run.report(said);
