@@ -67,13 +67,13 @@ impl Level {
     /// The level of `scan` with about `width` pixels along the longer side of the detector and `folds` folds. Each fold
     /// holds out another quarter of the views. The voxels cover the object in the geometry corrected by `known`.
     pub fn new(scan: &Scan, width: usize, folds: usize, known: &Correction) -> Result<Self> {
-        let bin = bin(scan, width);
-        Self::of(spread(scan.binned(bin))?, bin, width, folds, known)
+        let bin = bin(scan.geometry.detector, width);
+        Self::of(spread(scan.binned(bin)), bin, width, folds, known)
     }
 
     /// The level of all views of `scan`, each of them held out once.
     pub fn whole(scan: &Scan, width: usize) -> Result<Self> {
-        let bin = bin(scan, width);
+        let bin = bin(scan.geometry.detector, width);
         Self::of(scan.binned(bin), bin, width, EVERY, &Correction::default())
     }
 
@@ -167,8 +167,7 @@ impl Level {
 }
 
 /// The side of a level's pixels, in pixels of the scan.
-pub(crate) fn bin(scan: &Scan, width: usize) -> usize {
-    let [rows, columns] = scan.geometry.detector;
+pub(crate) fn bin([rows, columns]: [usize; 2], width: usize) -> usize {
     let (shorter, longer) = (rows.min(columns), rows.max(columns));
     // Some rows remain, unless there are hardly any.
     let most = if shorter < 8 { longer } else { shorter } / 4;
@@ -205,13 +204,13 @@ fn reconstruct(scan: &Scan, backend: &dyn Backend, cancelled: &(dyn Fn() -> bool
 }
 
 /// The scan, reduced to at most [`MOST_VIEWS`] evenly spaced views.
-pub(crate) fn spread(scan: Scan) -> Result<Scan> {
+pub(crate) fn spread(scan: Scan) -> Scan {
     let n = scan.geometry.views.len();
     if n <= MOST_VIEWS {
-        return Ok(scan);
+        return scan;
     }
     let kept: Vec<usize> = (0..MOST_VIEWS).map(|i| i * n / MOST_VIEWS).collect();
-    Ok(scan.split(&kept)?.1)
+    scan.select(&kept)
 }
 
 /// Voxels as fine as the pixels, in the volume of the scan. If the object extends beyond the detector or the volume,
