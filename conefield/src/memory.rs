@@ -204,6 +204,8 @@ pub struct Run {
     pub scan: ScanSize,
     /// Whether some views are held out.
     pub split: bool,
+    /// Whether the whole scan stays in memory beside its parts.
+    pub kept: bool,
     /// Whether there is a reference.
     pub reference: bool,
     /// Whether it resumes from a checkpoint.
@@ -213,7 +215,7 @@ pub struct Run {
 impl Run {
     /// A run on a scan of this size, without reference, held-out views and checkpoint.
     pub fn on(scan: ScanSize) -> Self {
-        Self { scan, split: false, reference: false, resume: false }
+        Self { scan, split: false, kept: false, reference: false, resume: false }
     }
 
     /// A run on a scan that is in memory.
@@ -243,9 +245,10 @@ impl Run {
         // Reordering a file's voxels takes a copy.
         let comparing = Memory { scan: projections, reference: 2 * reference, ..Memory::default() };
         let splitting = Memory { scan: if self.split { 2 * projections } else { 0 }, reference, ..Memory::default() };
-        let surrounding = Memory { scan: projections, reference, buffers: needs.surround, ..Memory::default() };
+        let scan = if self.split && self.kept { 2 * projections } else { projections };
+        let surrounding = Memory { scan, reference, buffers: needs.surround, ..Memory::default() };
         let solving = Memory {
-            scan: projections + needs.corrected,
+            scan: scan + needs.corrected,
             volume: iterate,
             reference,
             model: needs.model,
@@ -257,7 +260,7 @@ impl Run {
         // A result is held whole for scoring, beside the method's own volume.
         let volume = iterate + if self.reference { voxels } else { 0 };
         let buffers = needs.evaluating + SLAB_BYTES + checkpoint;
-        let exporting = Memory { scan: projections, volume, buffers, ..solving };
+        let exporting = Memory { scan, volume, buffers, ..solving };
         Memory::most(&[reading, comparing, splitting, surrounding, solving, exporting])
     }
 
@@ -338,6 +341,9 @@ mod tests {
         assert_eq!(m.total, m.scan + m.volume + m.reference + m.model + m.optimizer + m.buffers);
         let alone = Run { reference: false, ..run() }.memory(&Fixed(1 << 22));
         assert_eq!((alone.reference, alone.volume), (0, 0));
+        let split = Run { split: true, ..run() }.memory(&Fixed(1 << 22));
+        let kept = Run { split: true, kept: true, ..run() }.memory(&Fixed(1 << 22));
+        assert_eq!((split.total, kept.total), (m.total, m.total + (4 << 20)));
         assert!(m.line().contains("reference 512 MiB") && !alone.line().contains("reference"), "{}", m.line());
     }
 

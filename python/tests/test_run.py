@@ -78,6 +78,8 @@ def test_errors_name_the_wrong_setting(scan):
 def test_a_result_describes_itself(scan):
     result = conefield.reconstruct(scan, "fista-tv", reference=scan.truth, hold_out="every:5", stop__passes=2)
     assert result.record["held_out_views"] == [2, 7, 12] and result.record["held_out"] > 0
+    # The whole scan, and its parts.
+    assert result.record["memory"]["scan"] == 2 * scan.projections.nbytes
     assert result.scores["psnr"] > 15 and result.scores["ssim_3d"] is not None
     assert [r["step"] for r in result.record["records"]] == [1, 2]
     assert result.field is None and np.asarray(result) is result.volume.data
