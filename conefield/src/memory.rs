@@ -4,11 +4,13 @@
 //! program itself.
 
 use crate::{ranks, scratch};
+use conefield_core::backend::Backend;
 use conefield_core::method::{Needs, Plan};
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result, allowance};
 use conefield_evaluation::report::text::bytes;
 use conefield_io::{SLAB_BYTES, ScanSize};
+use conefield_scans::calibration::{self, Settings};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -191,9 +193,20 @@ impl Memory {
 
     /// The same, including the scan's volume.
     pub fn of_data_set(size: &ScanSize) -> Self {
+        Self::of_data_set_and(size, 0)
+    }
+
+    /// The same, and for calibrating the scan, with `shifts` also its single views.
+    pub fn of_calibration(size: &ScanSize, settings: &Settings, shifts: bool, backend: &dyn Backend) -> Result<Self> {
+        Ok(Self::of_data_set_and(size, calibration::bytes(&size.header(), settings, shifts, backend)?))
+    }
+
+    /// Memory for reading a scan with its volume, and for work with it that takes so many bytes.
+    fn of_data_set_and(size: &ScanSize, buffers: u64) -> Self {
         let scan = 4 * (size.pixels + size.test_pixels);
         let reading = Memory { scan: scan + size.reading, volume: 4 * size.voxels, ..Memory::default() };
-        Self::most(&[reading, Memory { scan, volume: 8 * size.voxels, ..Memory::default() }])
+        let reordering = Memory { scan, volume: 8 * size.voxels, ..Memory::default() };
+        Self::most(&[reading, reordering, Memory { scan, volume: 4 * size.voxels, buffers, ..Memory::default() }])
     }
 }
 

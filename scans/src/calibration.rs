@@ -24,6 +24,7 @@ mod opposite;
 mod parameters;
 mod search;
 
+pub use criterion::bytes;
 pub use direction::{Directions, directions};
 pub use jitter::{Jitter, jitter};
 pub use parameters::{Correction, Parameter};

@@ -1,14 +1,15 @@
 //! The criterion: the error of held-out views, predicted from a quick reconstruction of the others.
 
 use crate::calibration::parameters::{Correction, Parameter};
+use crate::calibration::{FINER, Settings};
 use crate::diagnosis::setup;
 use conefield_core::backend::Backend;
 use conefield_core::finite::range;
 use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, norm};
-use conefield_core::method::{Context, Job, Method, Quiet, Reconstruction};
+use conefield_core::method::{Context, Job, Method, Plan, Quiet, Reconstruction};
 use conefield_core::parallel;
 use conefield_core::place::ViewRays;
-use conefield_core::scan::{Scan, Unit};
+use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::{Error, Result};
 use conefield_projectors::voxel::Joseph;
 use conefield_solvers::iterative::Stop;
@@ -16,6 +17,10 @@ use conefield_solvers::iterative::order::Subsets;
 use conefield_solvers::iterative::sart::Sart;
 use ndarray::{Array3, ArrayView2, s};
 
+/// Copies of a level's views during the search: two folds of every level, those of the corrected geometry, and the
+/// predictions for changes of all parameters. And such copies of the pixels that pairs of views compare.
+const SEARCHED: u64 = 10;
+const PAIRED: u64 = 17;
 /// One in this many views is held out.
 const EVERY: usize = 4;
 /// Subsets of the views and passes of the quick reconstruction.
@@ -187,12 +192,46 @@ impl Level {
     }
 }
 
-/// A quick reconstruction, in 1/mm.
-fn reconstruct(scan: &Scan, backend: &dyn Backend, cancelled: &(dyn Fn() -> bool + Sync)) -> Result<Array3<f32>> {
+/// The quick reconstruction.
+fn plan(backend: &dyn Backend) -> Result<Box<dyn Plan>> {
     let subsets = Subsets::Count(SUBSETS);
     let sart = Sart { subsets, relaxation: 1.0, decay: 0.7, stop: Stop::after(PASSES), ..Sart::default() };
-    let mut plan = sart.plan(&Context::new(backend))?;
-    let solution = plan.run(&Job::new(scan, backend), &mut Quiet(cancelled));
+    sart.plan(&Context::new(backend))
+}
+
+/// Bytes that [`crate::calibration::calibrate`], [`crate::calibration::directions`] and, for `shifts`,
+/// [`crate::calibration::jitter()`] take besides a scan of this size, with `settings`: those of the largest arrays, for voxels
+/// as fine as the pixels.
+pub fn bytes(scan: &ScanHeader, settings: &Settings, shifts: bool, backend: &dyn Backend) -> Result<u64> {
+    let plan = plan(backend)?;
+    let views = scan.views.min(MOST_VIEWS);
+    let level = |views: usize, width: usize| {
+        let header = ScanHeader { views, ..*scan }.binned(bin(scan.detector, width));
+        let longest = header.detector.into_iter().max().unwrap_or(0) as f64;
+        let shrink = longest / scan.volume.into_iter().max().unwrap_or(1).max(1) as f64;
+        ScanHeader { volume: scan.volume.map(|n| (shrink * n as f64).ceil() as usize), ..header }
+    };
+    // Its training views, and what the solver takes.
+    let solving = |whole: ScanHeader| {
+        let train = ScanHeader { views: whole.views - whole.views / EVERY, ..whole };
+        let needs = plan.needs(&train);
+        4 * (train.pixels() + train.voxels()) + needs.backend + needs.working
+    };
+    let threads = rayon::current_num_threads() as u64;
+    let (few, all) = (level(views, settings.width), level(scan.views, settings.width));
+    let paired = settings.parameters.iter().any(|p| p.by_pairs());
+    let pairs = if paired { PAIRED * 4 * level(views, FINER * settings.width).pixels() } else { 0 };
+    // The whole views are kept for the rays that two of them share.
+    let searching = 4 * (all.pixels() + SEARCHED * few.pixels()) + threads * solving(few) + pairs;
+    // Each fold has all views, at every level; the finest ones are binned beside them, and predicted.
+    let shifting =
+        4 * (EVERY as u64 * all.pixels() * 4 / 3 + 2 * all.pixels()) + threads.min(EVERY as u64) * solving(all);
+    Ok(if shifts { searching.max(shifting) } else { searching })
+}
+
+/// A quick reconstruction, in 1/mm.
+fn reconstruct(scan: &Scan, backend: &dyn Backend, cancelled: &(dyn Fn() -> bool + Sync)) -> Result<Array3<f32>> {
+    let solution = plan(backend)?.run(&Job::new(scan, backend), &mut Quiet(cancelled));
     let solution = solution.map_err(|e| match e {
         Error::Interrupted { .. } => Error::Aborted { part: "calibration".into() },
         e => e,
