@@ -172,6 +172,12 @@ def test_simulation_in_any_geometry(geometry):
     predicted = conefield.project(truth, fine, projector="siddon")
     # Voxels with sharp edges, compared with their interpolation.
     assert (predicted - scan.projections).std() < 0.05 * scan.projections.max()
+    # An array of other voxels fills the volume; a volume keeps its own.
+    coarse = np.random.default_rng(0).random((5, 4, 3), dtype=np.float32)
+    sides = [n * s / m for n, s, m in zip(shape, fine.spacing, coarse.shape)]
+    sized = conefield.simulate(conefield.Volume(coarse, sides, fine.center), fine).projections
+    np.testing.assert_array_equal(conefield.simulate(coarse, fine).projections, sized)
+    assert (conefield.simulate(conefield.Volume(coarse), fine).projections != sized).any()
     noisy = conefield.simulate(truth, fine, noise="poisson:1e5", seed=1).projections
     assert 0 < np.abs(noisy - scan.projections).max() < 0.1
 
