@@ -201,6 +201,9 @@ def test_what_is_no_stage_is_refused():
     ]:
         with pytest.raises(conefield.InvalidError, match=words):
             kind("test-none")(cls)
+    for decorator in (conefield.encoder, conefield.regularizer):
+        with pytest.raises(conefield.InvalidError, match=r'name: found <class .*Waves.>, expected .*as in @conefield.*\("name"\)'):
+            decorator(Waves)
     with pytest.raises(conefield.InvalidError, match="conefield itself"):
         conefield.encoder("hash-grid")(Waves)
 
