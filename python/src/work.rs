@@ -53,8 +53,8 @@ impl Watch {
     }
 }
 
-/// Runs `work` without the GIL. An exception of a callback, a stage or a signal handler takes precedence over the error
-/// caused by stopping.
+/// Runs `work` without the GIL. It ends where it asks the watch, at the end of a loop's items under way, or where a stage is
+/// checked. An exception of a callback, a stage or a signal handler takes precedence over the error caused by stopping.
 pub fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce(&Watch) -> Result<T> + Send) -> PyResult<T> {
     log::start();
     let (looked, stopped) = (Mutex::new(Instant::now()), Mutex::new(None));
@@ -65,7 +65,13 @@ pub fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce(&Watch) -> Result
         return Err(e);
     }
     match done {
-        Ok(done) => done.map_err(|e| raised(py, &e)),
+        Ok(done) => done.map_err(|e| {
+            let error = raised(py, &e);
+            if let Some(cause) = watch.raised.cause(py, &e.to_string()) {
+                error.set_cause(py, Some(cause));
+            }
+            error
+        }),
         Err(panic) => {
             let text = panic.downcast_ref::<String>().map(String::as_str);
             Err(broken(py, text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("a panic without a message")))
