@@ -102,6 +102,21 @@ def test_scans_are_read_only_and_come_back(scan, tmp_path):
         np.testing.assert_array_equal(part.truth.data, scan.truth.data)
 
 
+def test_an_array_gets_the_warnings_of_its_file(scan, tmp_path, caplog):
+    # Counts in place of line integrals, and a volume smaller than the object.
+    geometry = scan.geometry.with_volume((9, 9, 9), scan.geometry.spacing, (0.0, 0.0, 0.0))
+    for projections, words in [(np.exp(-scan.projections), "looks like intensities"), (scan.projections, "beside the volume")]:
+        caplog.clear()
+        made = conefield.scan(projections, geometry)
+        told = [record.getMessage() for record in caplog.records]
+        assert any(words in text and text.startswith("scan: ") for text in told), told
+        conefield.write_scan(tmp_path / words, made)
+        caplog.clear()
+        conefield.read_scan(tmp_path / words)
+        read = [record.getMessage().removeprefix(str(tmp_path / words)) for record in caplog.records]
+        assert [text.removeprefix("scan") for text in told] == read
+
+
 def test_a_scan_keeps_its_truth(scan, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     conefield.write_scan("s", scan)
