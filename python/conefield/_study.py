@@ -9,7 +9,7 @@ import sys
 import tempfile
 from typing import Any
 
-from ._errors import Error
+from ._errors import Error, in_python
 
 
 def study(
@@ -61,5 +61,5 @@ def study(
         raise KeyboardInterrupt
     if status != 0:
         errors = [line.removeprefix("error: ").strip() for line in lines if line.startswith("error: ")]
-        raise Error(errors[-1] if errors else f"the study ended with status {status}")
+        raise Error(in_python(errors[-1]) if errors else f"the study ended with status {status}")
     return json.loads(text)

@@ -241,6 +241,7 @@ def _two_views():
         (lambda: conefield.read_volume("phantom:hand"), "hand"),
         (lambda: conefield.simulate("phantom:head:8", noise="salt"), "poisson"),
         (lambda: conefield.simulate("phantom:head:8", views=0), "views"),
+        (lambda: conefield.simulate("phantom:head:8", views=3, angles="a.txt"), "views: found both, expected views or angles FILE"),
     ],
 )
 def test_what_cannot_be_is_refused(make, words):
