@@ -60,7 +60,8 @@ def test_what_does_not_fit_into_memory_is_refused():
         geometry = conefield.circular(dso=500, dsd=800, angles=1000, detector=128, pixel=1, volume=8)
         scan = conefield.scan(np.ones((1000, 128, 128), np.float32), geometry)
         volume = conefield.Volume(np.broadcast_to(np.float32(1), (400, 400, 500)))
-        conefield.reconstruct(scan, "fdk")
+        # Threads take addresses, too.
+        conefield.simulate("phantom:head:8", views=2, detector=(8, 8))
         used = 1024 * next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmSize"))
         # Seven eighths of it count: more than one volume and less than two.
         resource.setrlimit(resource.RLIMIT_AS, (used + (480 << 20),) * 2)
