@@ -4,11 +4,13 @@
 //! program itself.
 
 use crate::{ranks, scratch};
+use conefield_core::backend::Backend;
 use conefield_core::method::{Needs, Plan};
 use conefield_core::scan::Scan;
 use conefield_core::{Error, Result, allowance};
 use conefield_evaluation::report::text::bytes;
 use conefield_io::{SLAB_BYTES, ScanSize};
+use conefield_scans::calibration::{self, Settings};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -191,9 +193,20 @@ impl Memory {
 
     /// The same, including the scan's volume.
     pub fn of_data_set(size: &ScanSize) -> Self {
+        Self::of_data_set_and(size, 0)
+    }
+
+    /// The same, and for calibrating the scan, with `shifts` also its single views.
+    pub fn of_calibration(size: &ScanSize, settings: &Settings, shifts: bool, backend: &dyn Backend) -> Result<Self> {
+        Ok(Self::of_data_set_and(size, calibration::bytes(&size.header(), settings, shifts, backend)?))
+    }
+
+    /// Memory for reading a scan with its volume, and for work with it that takes so many bytes.
+    fn of_data_set_and(size: &ScanSize, buffers: u64) -> Self {
         let scan = 4 * (size.pixels + size.test_pixels);
         let reading = Memory { scan: scan + size.reading, volume: 4 * size.voxels, ..Memory::default() };
-        Self::most(&[reading, Memory { scan, volume: 8 * size.voxels, ..Memory::default() }])
+        let reordering = Memory { scan, volume: 8 * size.voxels, ..Memory::default() };
+        Self::most(&[reading, reordering, Memory { scan, volume: 4 * size.voxels, buffers, ..Memory::default() }])
     }
 }
 
@@ -204,6 +217,8 @@ pub struct Run {
     pub scan: ScanSize,
     /// Whether some views are held out.
     pub split: bool,
+    /// Whether the whole scan stays in memory beside its parts.
+    pub kept: bool,
     /// Whether there is a reference.
     pub reference: bool,
     /// Whether it resumes from a checkpoint.
@@ -213,7 +228,7 @@ pub struct Run {
 impl Run {
     /// A run on a scan of this size, without reference, held-out views and checkpoint.
     pub fn on(scan: ScanSize) -> Self {
-        Self { scan, split: false, reference: false, resume: false }
+        Self { scan, split: false, kept: false, reference: false, resume: false }
     }
 
     /// A run on a scan that is in memory.
@@ -243,9 +258,10 @@ impl Run {
         // Reordering a file's voxels takes a copy.
         let comparing = Memory { scan: projections, reference: 2 * reference, ..Memory::default() };
         let splitting = Memory { scan: if self.split { 2 * projections } else { 0 }, reference, ..Memory::default() };
-        let surrounding = Memory { scan: projections, reference, buffers: needs.surround, ..Memory::default() };
+        let scan = if self.split && self.kept { 2 * projections } else { projections };
+        let surrounding = Memory { scan, reference, buffers: needs.surround, ..Memory::default() };
         let solving = Memory {
-            scan: projections + needs.corrected,
+            scan: scan + needs.corrected,
             volume: iterate,
             reference,
             model: needs.model,
@@ -257,7 +273,7 @@ impl Run {
         // A result is held whole for scoring, beside the method's own volume.
         let volume = iterate + if self.reference { voxels } else { 0 };
         let buffers = needs.evaluating + SLAB_BYTES + checkpoint;
-        let exporting = Memory { scan: projections, volume, buffers, ..solving };
+        let exporting = Memory { scan, volume, buffers, ..solving };
         Memory::most(&[reading, comparing, splitting, surrounding, solving, exporting])
     }
 
@@ -338,6 +354,9 @@ mod tests {
         assert_eq!(m.total, m.scan + m.volume + m.reference + m.model + m.optimizer + m.buffers);
         let alone = Run { reference: false, ..run() }.memory(&Fixed(1 << 22));
         assert_eq!((alone.reference, alone.volume), (0, 0));
+        let split = Run { split: true, ..run() }.memory(&Fixed(1 << 22));
+        let kept = Run { split: true, kept: true, ..run() }.memory(&Fixed(1 << 22));
+        assert_eq!((split.total, kept.total), (m.total, m.total + (4 << 20)));
         assert!(m.line().contains("reference 512 MiB") && !alone.line().contains("reference"), "{}", m.line());
     }
 

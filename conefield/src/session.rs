@@ -205,7 +205,8 @@ impl<'a> Run<'a> {
     ) -> Result<Self> {
         reference.iter().try_for_each(|r| check_reference("reference", r, &scan))?;
         let (split, scored) = (!held.is_empty(), reference.is_some());
-        let run = memory::Run { split, reference: scored, ..memory::Run::on_scan(&scan) };
+        let kept = Arc::strong_count(&scan) > 1;
+        let run = memory::Run { split, kept, reference: scored, ..memory::Run::on_scan(&scan) };
         let session = Session::open(request, backend, run, begin)?;
         session.plan(Input::new(scan, held, reference, peak)?, None, cancelled)
     }

@@ -1,5 +1,6 @@
 //! Circular orbits of source and detector, described by a few numbers, and the arcs that views cover.
 
+use crate::error::{Result, ensure};
 use crate::geometry::{FAR, Millimetres, PARALLEL, Radians, View, VoxelGrid, dot, norm, sub};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
@@ -36,6 +37,30 @@ pub struct CircularOrbit {
     /// Angle of each view in radians.
     pub angles: Vec<f64>,
 }
+
+/// Distances from the source to the axis and to the detector, mm. Refuses a missing one, one that is no length, and a
+/// detector that is no farther than the axis. Errors name `place` and fields that begin with `prefix`; `or` is valid, too.
+pub fn distances(place: &str, prefix: &str, given: [Option<f64>; 2], or: &str) -> Result<[f64; 2]> {
+    for (name, x) in ["dso", "dsd"].into_iter().zip(given) {
+        let found = x.map_or("nothing".into(), |x| x.to_string());
+        let expected = format!("{LENGTH}, or {or}");
+        ensure(x.is_some_and(|x| x.is_finite() && x > 0.0), place, &format!("{prefix}{name}"), found, expected)?;
+    }
+    let found @ [dso, dsd] = given.map(Option::unwrap_or_default);
+    let expected = format!("more than the {dso} of dso: the detector lies behind the axis (are they swapped?)");
+    ensure(dsd > dso, place, &format!("{prefix}dsd"), dsd, expected)?;
+    Ok(found)
+}
+
+/// Refuses a pixel, along v and u, that has no size; see [`distances`].
+pub fn check_pixel(place: &str, prefix: &str, [v, u]: [f64; 2]) -> Result<()> {
+    for (name, x) in [("v", v), ("u", u)] {
+        ensure(x.is_finite() && x > 0.0, place, &format!("{prefix}pixel.{name}"), x, LENGTH)?;
+    }
+    Ok(())
+}
+
+const LENGTH: &str = "a positive finite length in mm";
 
 /// Tolerance of a view's deviation from the circle, relative to the source-detector distance.
 const TOLERANCE: f64 = 1e-9;

@@ -7,18 +7,79 @@
 use crate::allowance;
 use ndarray::Array3;
 use rayon::prelude::*;
-use std::sync::{Mutex, PoisonError};
+use std::cell::RefCell;
+use std::panic::resume_unwind;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 /// Numbers per item of a loop over numbers.
 const PART: usize = 1 << 16;
 
+/// Interval at which a loop asks whether to stop.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// Answers whether work must stop.
+pub type Stop = Arc<dyn Fn() -> bool>;
+
+thread_local! {
+    static STOP: RefCell<Option<Stop>> = const { RefCell::new(None) };
+}
+
+/// Runs `work`, which ends early once `stop` answers true: a loop that this thread starts asks it, on this thread, begins
+/// no more items, and then unwinds, and so does [`look`]. For hosts that learn of an interruption on their own thread only.
+pub fn stoppable<T>(stop: Stop, work: impl FnOnce() -> T) -> T {
+    struct Before(Option<Stop>);
+    impl Drop for Before {
+        fn drop(&mut self) {
+            STOP.set(self.0.take());
+        }
+    }
+    let _before = Before(STOP.replace(Some(stop)));
+    work()
+}
+
+/// The question of [`stoppable`]. A thread of a pool has other work, too: it never waits.
+fn stop() -> Option<Stop> {
+    STOP.with_borrow(Option::clone).filter(|_| rayon::current_thread_index().is_none())
+}
+
+/// Ends the work of [`stoppable`] if it must stop. For long work outside loops.
+pub fn look() {
+    if stop().is_some_and(|stop| stop()) {
+        resume_unwind(Box::new("stopped"));
+    }
+}
+
 /// Calls `work` for every number below `count`.
 #[inline(never)]
 pub fn each(count: usize, work: &(dyn Fn(usize) + Sync)) {
-    (0..count).into_par_iter().for_each(|n| {
-        allowance::trim();
-        work(n);
+    let stopped = AtomicBool::new(false);
+    let all = || {
+        (0..count).into_par_iter().for_each(|n| {
+            if !stopped.load(Ordering::Relaxed) {
+                allowance::trim();
+                work(n);
+            }
+        });
+    };
+    let Some(stop) = stop() else { return all() };
+    rayon::in_place_scope(|scope| {
+        let (end, ended) = mpsc::channel::<()>();
+        scope.spawn(|_| {
+            let _end = end;
+            all();
+        });
+        while ended.recv_timeout(LOOK) == Err(RecvTimeoutError::Timeout) {
+            if stop() {
+                stopped.store(true, Ordering::Relaxed);
+            }
+        }
     });
+    if stopped.into_inner() {
+        resume_unwind(Box::new("stopped"));
+    }
 }
 
 /// Calls `work` for every item, with its number.
@@ -67,6 +128,9 @@ pub fn scale(x: &mut Array3<f32>, factor: f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::panic::{AssertUnwindSafe, catch_unwind};
+    use std::sync::atomic::AtomicUsize;
+    use std::thread::{self, sleep};
 
     #[test]
     fn numbers_change_with_those_at_the_same_place() {
@@ -94,7 +158,40 @@ mod tests {
 
     #[test]
     fn a_panic_reaches_the_caller() {
-        let done = std::panic::catch_unwind(|| over(0..10, |_, x| assert!(x != 5, "five")));
-        assert_eq!(done.unwrap_err().downcast_ref::<&str>(), Some(&"five"));
+        for stop in [None, Some(Arc::new(|| false) as Stop)] {
+            let five = || over(0..10, |_, x| assert!(x != 5, "five"));
+            let done = catch_unwind(AssertUnwindSafe(|| match stop {
+                Some(stop) => stoppable(stop, five),
+                None => five(),
+            }));
+            assert_eq!(done.unwrap_err().downcast_ref::<&str>(), Some(&"five"));
+        }
+    }
+
+    #[test]
+    fn a_loop_that_must_stop_begins_no_more_items() {
+        let done = AtomicUsize::new(0);
+        let work = || {
+            // A loop within a loop does not ask: its thread is one of the pool.
+            each(500, &|_| {
+                each(2, &|_| sleep(Duration::from_millis(1)));
+                done.fetch_add(1, Ordering::Relaxed);
+            });
+            look();
+        };
+        stoppable(Arc::new(|| false), work);
+        assert_eq!(done.swap(0, Ordering::Relaxed), 500);
+        let here = thread::current().id();
+        let stop = Arc::new(move || {
+            assert_eq!(thread::current().id(), here);
+            true
+        });
+        for work in [&work as &dyn Fn(), &look] {
+            let ended = catch_unwind(AssertUnwindSafe(|| stoppable(stop.clone(), work)));
+            assert_eq!(ended.unwrap_err().downcast_ref::<&str>(), Some(&"stopped"));
+            assert!(done.load(Ordering::Relaxed) < 500);
+        }
+        // Nothing of it remains.
+        work();
     }
 }

@@ -188,7 +188,8 @@ impl Scan {
         self.with(Geometry { detector, views, volume: g.volume }, projections)
     }
 
-    fn select(&self, views: &[usize]) -> Scan {
+    /// A scan of only these views, in this order. Each is an index below the number of views.
+    pub fn select(&self, views: &[usize]) -> Scan {
         let geometry =
             Geometry { views: views.iter().map(|&v| self.geometry.views[v]).collect(), ..self.geometry.clone() };
         self.with(geometry, self.projections.select(ndarray::Axis(0), views))

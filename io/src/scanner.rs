@@ -69,7 +69,7 @@ use crate::text::{self, described};
 use crate::{ScanSize, folder, foreign, memory};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{Geometry, Radians, View, VoxelGrid, norm};
-use conefield_core::orbit::{Beam, CircularOrbit};
+use conefield_core::orbit::{self, Beam, CircularOrbit};
 use conefield_core::scan::{Scan, Unit};
 use conefield_core::{Error, Result};
 use ndarray::{Array2, Array3, Axis};
@@ -528,27 +528,16 @@ fn vectors(folder: &Path, place: &str, v: &Vectors, volume: &VoxelGrid) -> Resul
 
 /// DSO and DSD of a cone beam; `None` for a parallel one.
 fn distances(place: &str, c: &Circle) -> Result<Option<[f64; 2]>> {
-    let all = [("circle.dso", c.dso), ("circle.dsd", c.dsd)];
     if c.beam == Beam::Parallel {
-        let said = all.iter().find_map(|(field, x)| x.map(|x| (field, x)));
+        let said = [("circle.dso", c.dso), ("circle.dsd", c.dsd)].into_iter().find_map(|(field, x)| Some((field, x?)));
         let expected = "no distance: a parallel beam has no source";
-        return said.map_or(Ok(None), |(field, x)| Err(Error::invalid(place, *field, x, expected)));
+        return said.map_or(Ok(None), |(field, x)| Err(Error::invalid(place, field, x, expected)));
     }
-    let expected = "a positive finite length in mm, or beam = \"parallel\"";
-    for (field, x) in all {
-        let found = x.map_or("nothing".into(), |x| x.to_string());
-        ensure(x.is_some_and(|x| x.is_finite() && x > 0.0), place, field, found, expected)?;
-    }
-    let distances @ [dso, dsd] = all.map(|(_, x)| x.unwrap_or_default());
-    let expected = format!("more than the {dso} of dso: the detector lies behind the axis (are they swapped?)");
-    ensure(dsd > dso, place, "circle.dsd", dsd, expected)?;
-    Ok(Some(distances))
+    orbit::distances(place, "circle.", [c.dso, c.dsd], "beam = \"parallel\"").map(Some)
 }
 
 fn lengths(place: &str, table: &str, pixel: Uv, offset: Uv) -> Result<()> {
-    for (field, x) in [("pixel.u", pixel.u), ("pixel.v", pixel.v)] {
-        ensure(x.is_finite() && x > 0.0, place, &format!("{table}.{field}"), x, "a positive finite length in mm")?;
-    }
+    orbit::check_pixel(place, &format!("{table}."), [pixel.v, pixel.u])?;
     for (field, x) in [("offset.u", offset.u), ("offset.v", offset.v)] {
         ensure(x.is_finite(), place, &format!("{table}.{field}"), x, "a finite length in mm")?;
     }

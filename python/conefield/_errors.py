@@ -1,4 +1,6 @@
-"""The exceptions. Their messages are those of the command ``conefield``."""
+"""The exceptions. Their messages are those of the command ``conefield``, with arguments in place of its options."""
+
+import re
 
 
 class Error(Exception):
@@ -40,6 +42,22 @@ class DivergedError(Error, ArithmeticError):
 
 class InternalError(Error, RuntimeError):
     """A bug in conefield."""
+
+
+_NAMES = ("angles", "backend", "budget", "hold-out", "peak", "reference", "spec", "values", "views")
+_ARGUMENTS = {
+    **{f"--{name}": name.replace("-", "_") for name in _NAMES},
+    "--force": "force=True",
+    "--resume": "resume=True",
+    "--memory or the system": "the system",
+    **{f"--{name}": f"the command's --{name}" for name in ("i0", "plugin", "scratch")},
+}
+_OPTION = re.compile(f"({'|'.join(_ARGUMENTS)})(?![\\w-])")
+
+
+def in_python(text):
+    """A message of the command, with the arguments of this package in place of options."""
+    return _OPTION.sub(lambda option: _ARGUMENTS[option[0]], text)
 
 
 def invalid(place, field, found, expected):

@@ -32,17 +32,15 @@ def project(volume: Any, like: _native.Geometry | Scan, *, projector: Any = "jos
     like
         A geometry or a scan. With a geometry, values are in 1/mm on its voxels; ``float64`` is computed in double
         precision. With a scan, its views are predicted as by ``conefield project``: values are in 1/unit of the scan, and
-        a :class:`Volume` of another shape keeps its voxels and is placed at the same centre; an array fills the volume of
-        the scan.
+        a :class:`Volume` or a file of another shape keeps its voxels and is placed at the same centre; an array, or a file
+        of NumPy, fills the volume of the scan.
     projector
         ``"joseph"``, ``"siddon"``, ``"trilinear"``, or a dict with its type and settings.
     residual
         For a scan: return measured minus predicted line integrals.
     """
     if isinstance(like, Scan):
-        sized = isinstance(volume, Volume)
-        taken = as_volume(volume, "volume", like.geometry)
-        return _native.project_scan(like, encoded(projector), taken, sized, residual)
+        return _native.project_scan(like, encoded(projector), as_volume(volume, "volume", like.geometry), residual)
     if residual:
         raise invalid("arguments", "residual", "a geometry, in which nothing was measured", "a scan")
     values = volume.data if isinstance(volume, Volume) else volume

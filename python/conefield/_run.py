@@ -216,7 +216,7 @@ def reconstruct(
         Settings to change, by path: ``sets={"encoder.levels": 8}``, or a keyword with two underscores for a dot:
         ``encoder__levels=8``.
 
-    Ctrl-C ends the run after its step with :class:`KeyboardInterrupt`. Other Python threads keep running.
+    Ctrl-C ends the run, after its step at the latest, with :class:`KeyboardInterrupt`. Other Python threads keep running.
     """
     scan = as_scan(scan)
     truth = isinstance(reference, str) and reference == "truth"

@@ -77,7 +77,8 @@ def simulate(
         A :class:`Volume`, an array ``[x, y, z]``, a file, or ``"phantom:head"``, ``"phantom:abdomen"``,
         ``"phantom:random:SEED"``, each also with ``:SIZE``.
     geometry
-        The geometry; values are then in 1/mm, and the volume keeps its place. Without one:
+        The geometry; values are then in 1/mm, and the volume keeps its place. An array, or a file of NumPy, fills the
+        volume of the geometry. Without one:
     protocol, views, detector, offset, angles
         ``"r2"``, the published synthetic set-up, or a TOML or JSON file; and changes to it: number of views, rows and
         columns, shift of the detector along v and u in mm, and ``"START:RANGE"`` in degrees or a file.

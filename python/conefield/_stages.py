@@ -13,9 +13,14 @@ from ._spec import encoded
 C = TypeVar("C", bound=type)
 
 
-def _register(kind: str, methods: tuple[str, ...], name: str, cls: C) -> C:
+def _decorator(kind: str, methods: tuple[str, ...], name: str) -> Callable[[C], C]:
+    # A decorator without a name gets the class in its place.
     if not isinstance(name, str) or not name:
-        raise invalid("stage", "name", repr(name), "a text")
+        raise invalid("stage", "name", repr(name), f'a text, as in @conefield.{kind}("name")')
+    return lambda cls: _register(kind, methods, name, cls)
+
+
+def _register(kind: str, methods: tuple[str, ...], name: str, cls: C) -> C:
     if not inspect.isclass(cls):
         raise invalid("stage", name, f"a {type(cls).__name__}", "a class")
     for method in methods:
@@ -51,7 +56,7 @@ def encoder(name: str) -> Callable[[C], C]:
     The GIL is acquired for each batch, and one batch runs at a time: this is for prototyping. An exception ends the
     run. Registering a name again replaces the class.
     """
-    return lambda cls: _register("encoder", ("forward", "backward"), name, cls)
+    return _decorator("encoder", ("forward", "backward"), name)
 
 
 def regularizer(name: str) -> Callable[[C], C]:
@@ -71,7 +76,7 @@ def regularizer(name: str) -> Callable[[C], C]:
     ``tau`` is the weight λ over the step's constant. ``weight`` is λ itself; ``noise_weight`` (default 1) is a multiple of
     the scan's noise level. Before each call ``self.spacing`` is set to the voxel size in mm.
     """
-    return lambda cls: _register("regularizer", ("prox",), name, cls)
+    return _decorator("regularizer", ("prox",), name)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import sys
 import tempfile
 from typing import Any
 
-from ._errors import Error
+from ._errors import Error, in_python
 
 
 def study(
@@ -38,15 +38,15 @@ def study(
     written nevertheless.
     """
     options = ["--resume"] * resume + ["--force"] * force + ([] if shard is None else [f"--shard={shard}"])
-    words = [sys.executable, "-m", "conefield", "study", "--json", f"--output={os.fspath(output)}", *options]
+    words = [sys.executable, "-m", "conefield", "study", "--as-part", "--json", f"--output={os.fspath(output)}", *options]
     lines: list[str] = []
     interrupted = False
     with tempfile.TemporaryFile("w+") as printed:
         process = subprocess.Popen(
-            [*words, "--", os.fspath(study)], stdin=subprocess.DEVNULL, stdout=printed, stderr=subprocess.PIPE, text=True
+            [*words, "--", os.fspath(study)], stdin=subprocess.PIPE, stdout=printed, stderr=subprocess.PIPE, text=True
         )
         while True:
-            # A terminal sends Ctrl-C to both processes. The study ends by itself after its step.
+            # The study ends by itself after its step: a terminal sends Ctrl-C to it, too, and the end of its input stops it.
             try:
                 for line in process.stderr:
                     lines.append(line)
@@ -55,11 +55,13 @@ def study(
                 break
             except KeyboardInterrupt:
                 interrupted = True
+                process.stdin.close()
+        process.stdin.close()
         printed.seek(0)
         text = printed.read()
     if interrupted or status in (130, 143):
         raise KeyboardInterrupt
     if status != 0:
         errors = [line.removeprefix("error: ").strip() for line in lines if line.startswith("error: ")]
-        raise Error(errors[-1] if errors else f"the study ended with status {status}")
+        raise Error(in_python(errors[-1]) if errors else f"the study ended with status {status}")
     return json.loads(text)

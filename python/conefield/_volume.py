@@ -96,16 +96,21 @@ class Volume:
 def as_volume(value: Any, name: str, like: Any = None) -> Volume:
     """``value`` as a volume: itself, a file, ``phantom:KIND[:SIZE]``, or an array.
 
-    An array gets the voxels of the geometry ``like`` if its shape matches, else voxels of 1 mm.
+    An array, or a file of NumPy, has no voxel sizes: it fills the volume of the geometry ``like``, or has voxels of 1 mm.
     """
     if isinstance(value, Volume):
         return value
     if isinstance(value, (str, os.PathLike)):
-        return _native.read_volume(os.fspath(value))
-    array = as_floats(value, name, 3)
-    if like is not None and tuple(like.volume_shape) == array.shape:
-        return Volume(array, like.spacing, like.center)
-    return Volume(array)
+        volume = _native.read_volume(os.fspath(value))
+        if not os.fspath(value).endswith(".npy"):
+            return volume
+    else:
+        volume = Volume(as_floats(value, name, 3))
+    if like is not None and 0 not in volume.shape:
+        sides = zip(like.volume_shape, like.spacing, volume.shape)
+        volume.spacing = tuple(side if n == own else n * side / own for n, side, own in sides)
+        volume.center = like.center
+    return volume
 
 
 def read_volume(path: str | os.PathLike[str]) -> Volume:

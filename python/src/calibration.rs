@@ -5,9 +5,11 @@ use crate::arrays::plain;
 use crate::run::{CallbackArgument, callback};
 use crate::scan::Scan;
 use crate::work::{Progress, without_lock};
+use conefield::memory::{self, Memory};
 use conefield_core::error::ensure;
 use conefield_core::method::Observer;
 use conefield_core::{Error, Result};
+use conefield_io::ScanSize;
 use conefield_scans::calibration::{Parameter, Settings, Watch, calibrate as search, directions, jitter};
 use pyo3::prelude::*;
 use serde::Deserialize;
@@ -72,6 +74,10 @@ pub fn calibrate<'py>(
     let (corrected, result) = without_lock(py, |watch| {
         let settings = wanted.settings()?;
         let backend = arguments::backend(&wanted.backend)?.open()?;
+        // The corrected scan is a copy, and not every scan has a volume.
+        let size = memory::Run::on_scan(&scan.scan).scan;
+        let size = ScanSize { test_pixels: size.pixels, voxels: 1, ..size };
+        Memory::of_calibration(&size, &settings, wanted.jitter, backend.as_ref())?.check()?;
         let progress = Mutex::new(Progress::new(watch, function));
         let parts = if wanted.jitter { 3.0 } else { 2.0 };
         let begin = Instant::now();

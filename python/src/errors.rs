@@ -19,11 +19,11 @@ fn class(error: &Error) -> &'static str {
 
 /// The exception for an error. For an unusable value it also has the parts of the error as attributes.
 pub fn raised(py: Python<'_>, error: &Error) -> PyErr {
-    let exception = named(py, class(error), &error.to_string());
+    let exception = in_python(py, &error.to_string()).and_then(|text| named(py, class(error), &text));
     match (exception, error) {
         (Ok(exception), Error::Invalid { place, field, found, expected }) => {
             let parts = [("place", place), ("field", field), ("found", found), ("expected", expected)];
-            match parts.into_iter().try_for_each(|(name, text)| exception.setattr(name, text)) {
+            match parts.into_iter().try_for_each(|(name, text)| exception.setattr(name, in_python(py, text)?)) {
                 Ok(()) => PyErr::from_value(exception),
                 Err(e) => e,
             }
@@ -37,6 +37,11 @@ pub fn raised(py: Python<'_>, error: &Error) -> PyErr {
 pub fn broken(py: Python<'_>, what: &str) -> PyErr {
     let text = format!("a bug in conefield, please report it: {what}");
     named(py, "InternalError", &text).map_or_else(|e| e, PyErr::from_value)
+}
+
+/// A message of the command as one of this package, which has arguments in place of options.
+pub fn in_python(py: Python<'_>, text: &str) -> PyResult<String> {
+    py.import("conefield._errors")?.call_method1("in_python", (text,))?.extract()
 }
 
 fn named<'py>(py: Python<'py>, class: &str, text: &str) -> PyResult<Bound<'py, PyAny>> {

@@ -6,7 +6,7 @@ use crate::errors::{OrRaise, raised};
 use conefield_core::Error;
 use conefield_core::error::ensure;
 use conefield_core::geometry::{self, Radians, Vec3, View, VoxelGrid};
-use conefield_core::orbit::CircularOrbit;
+use conefield_core::orbit::{self, CircularOrbit};
 use conefield_core::words::plural;
 use ndarray::Array2;
 use numpy::{PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
@@ -43,29 +43,19 @@ impl Geometry {
         volume: ([usize; 3], Vec3, Vec3),
     ) -> PyResult<Self> {
         let angles = owned(&angles).to_vec();
-        let distances: Vec<f64> = [dso, dsd].into_iter().flatten().collect();
-        let all = [&distances[..], &pixel, &offset, &tilt, &angles].concat();
+        let all = [&offset[..], &tilt, &angles].concat();
         let field = "a length or an angle";
         ensure(all.iter().all(|x| x.is_finite()), "geometry", field, "a number that is not finite", "finite numbers")
             .or_raise(py)?;
-        for (name, x) in [("dso", dso), ("dsd", dsd)] {
-            let found = x.map_or("None".into(), |x| x.to_string());
-            let expected = "a distance above 0, or None for both: a parallel beam";
-            let one = dso.is_some() != dsd.is_some() && x.is_none();
-            ensure(!one && x.is_none_or(|x| x > 0.0), "geometry", name, found, expected).or_raise(py)?;
-        }
-        if let (Some(dso), Some(dsd)) = (dso, dsd) {
-            let expected = format!("more than the {dso} of dso: the detector lies behind the axis (are they swapped?)");
-            ensure(dsd > dso, "geometry", "dsd", dsd, expected).or_raise(py)?;
-        }
-        for (name, x) in ["pixel.v", "pixel.u"].into_iter().zip(pixel) {
-            ensure(x > 0.0, "geometry", name, x, "a positive finite length in mm").or_raise(py)?;
-        }
         let (shape, spacing, center) = volume;
         let volume = VoxelGrid { shape, spacing, center };
-        let orbit = match (dso, dsd) {
-            (Some(dso), Some(dsd)) => CircularOrbit { dso, dsd, pixel, offset, angles },
-            _ => CircularOrbit::parallel(&volume, pixel, offset, angles),
+        orbit::check_pixel("geometry", "", pixel).or_raise(py)?;
+        let orbit = if dso.is_none() && dsd.is_none() {
+            CircularOrbit::parallel(&volume, pixel, offset, angles)
+        } else {
+            let parallel = "neither dso nor dsd: a parallel beam";
+            let [dso, dsd] = orbit::distances("geometry", "", [dso, dsd], parallel).or_raise(py)?;
+            CircularOrbit { dso, dsd, pixel, offset, angles }
         };
         let tilt = tilt.map(Radians);
         let views = orbit.views().into_iter().map(|v| v.tilted(tilt)).collect();

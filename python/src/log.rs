@@ -1,5 +1,6 @@
 //! Forwards the log to Python's logging, under the name `conefield`.
 
+use crate::errors::in_python;
 use pyo3::prelude::*;
 use std::fmt::{Debug, Write};
 use std::sync::Once;
@@ -35,7 +36,7 @@ impl<S: Subscriber> Layer<S> for ToPython {
         // A failing logger does not stop the work.
         let _ = Python::attach(|py| -> PyResult<()> {
             let logger = py.import("logging")?.call_method1("getLogger", ("conefield",))?;
-            logger.call_method1(level, ("%s", text.0))?;
+            logger.call_method1(level, ("%s", in_python(py, &text.0)?))?;
             Ok(())
         });
     }

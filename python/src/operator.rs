@@ -81,15 +81,13 @@ pub fn apply<'py>(
     Ok(given(py, without_lock(py, work)?).into_any())
 }
 
-/// Predicted views of `scan` for a volume in 1/unit of the scan; with `residual` measured minus predicted ones. An array
-/// that is not `sized`, without a voxel size, fills the volume of the scan.
+/// Predicted views of `scan` for a volume in 1/unit of the scan; with `residual` measured minus predicted ones.
 #[pyfunction]
 pub fn project_scan<'py>(
     py: Python<'py>,
     scan: &Bound<'py, Scan>,
     projector: &str,
     volume: &Bound<'py, PyAny>,
-    sized: bool,
     residual: bool,
 ) -> PyResult<Bound<'py, PyArray3<f32>>> {
     let projector: Value = arguments::read(py, projector)?;
@@ -97,7 +95,7 @@ pub fn project_scan<'py>(
     let views = without_lock(py, |_| {
         let projector = projection::projector(projector)?;
         let mut geometry = scan.geometry.clone();
-        geometry.volume = projection::placed(&volume, &scan.geometry.volume, sized);
+        geometry.volume = projection::placed(&volume, &scan.geometry.volume, true);
         if let Some(odd) = projection::oddity(&geometry.volume, &scan.geometry.volume) {
             tracing::warn!("{odd}");
         }

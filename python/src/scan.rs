@@ -13,6 +13,7 @@ use conefield_core::error::ensure;
 use conefield_core::scan::{self, Unit, Volume};
 use conefield_core::words::plural;
 use conefield_projectors::simulate::DetectorNoise;
+use conefield_scans::diagnosis::survey;
 use numpy::{PyArray3, PyReadonlyArray3};
 use pyo3::prelude::*;
 use serde::Deserialize;
@@ -119,7 +120,11 @@ impl Scan {
         let (projections, geometry) = (fitting(&projections)?, geometry.get().0.clone());
         let provenance = serde_json::json!({ "made": "in Python" });
         let scan = scan::Scan { geometry, projections, unit: Unit { name, mm }, provenance };
-        without_lock(py, |_| scan.validate("scan"))?;
+        without_lock(py, |_| {
+            scan.validate("scan")?;
+            files::warn_of(Path::new("scan"), &survey(&scan), false);
+            Ok(())
+        })?;
         Ok(Self { scan: Arc::new(scan), path: None, truth: Truth::Unknown })
     }
 

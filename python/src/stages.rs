@@ -34,22 +34,32 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 /// Exceptions raised by Python stages during one piece of Rust work. A kernel has no result to return them in.
 #[derive(Default)]
-pub struct Raised(Mutex<Option<PyErr>>);
+pub struct Raised {
+    first: Mutex<Option<PyErr>>,
+    /// The last exception in whose words an error was reported.
+    quoted: Mutex<Option<PyErr>>,
+}
 
 impl Raised {
     /// Keeps the first exception.
     pub fn note(&self, error: PyErr) {
-        locked(&self.0).get_or_insert(error);
+        locked(&self.first).get_or_insert(error);
     }
 
     /// Whether there is an exception.
     pub fn any(&self) -> bool {
-        locked(&self.0).is_some()
+        locked(&self.first).is_some()
     }
 
     /// Returns and clears the exception.
     pub fn take(&self) -> Option<PyErr> {
-        locked(&self.0).take()
+        locked(&self.first).take()
+    }
+
+    /// The exception that `text` quotes.
+    pub fn cause(&self, py: Python<'_>, text: &str) -> Option<PyErr> {
+        let quoted = locked(&self.quoted).take();
+        quoted.filter(|e| text.contains(&words(py, e)))
     }
 }
 
@@ -97,7 +107,7 @@ impl StageObject {
         }
         Python::attach(|py| {
             // The lock is free while the exception is put into words, which may run Python.
-            let raised = locked(&self.raised.0).as_ref().map(|e| e.clone_ref(py));
+            let raised = locked(&self.raised.first).as_ref().map(|e| e.clone_ref(py));
             raised.map_or(Ok(()), |e| Err(Error::unsupported(self.name, words(py, &e))))
         })
     }
@@ -198,18 +208,26 @@ impl Written {
     /// The stage that `new` makes of a new object.
     fn stage<T>(&self, kind: Kind, new: fn(Python<'_>, StageObject) -> PyResult<Result<T>>) -> Result<T> {
         let of = StageObject::new(self.name, self.object(kind)?);
-        Python::attach(|py| new(py, of).unwrap_or_else(|e| Err(Error::unsupported(self.name, words(py, &e)))))
+        Python::attach(|py| new(py, of).unwrap_or_else(|e| Err(Error::unsupported(self.name, quoted(py, e)))))
     }
 
     /// The error for settings that a class refuses.
     fn refused(&self, py: Python<'_>, e: PyErr) -> Error {
-        let why = format!("{}, which {} refuses: {}", self.settings, self.name, words(py, &e));
+        let why = format!("{}, which {} refuses: {}", self.settings, self.name, quoted(py, e));
         Error::invalid("spec", "", why, "settings that the class takes")
     }
 }
 
+/// An exception as text for an error of the current thread's work, whose cause it becomes.
+fn quoted(py: Python<'_>, e: PyErr) -> String {
+    let text = words(py, &e);
+    let old = CURRENT.with_borrow(|raised| locked(&raised.quoted).replace(e));
+    drop(old);
+    text
+}
+
 /// An exception as text.
-pub fn words(py: Python<'_>, e: &PyErr) -> String {
+fn words(py: Python<'_>, e: &PyErr) -> String {
     let kind = e.get_type(py).name().map(|n| n.to_string()).unwrap_or_default();
     format!("{kind}: {}", e.value(py))
 }

@@ -1,7 +1,7 @@
 //! Volumes: `conefield.Volume` is written in Python, as it holds a NumPy array that users may change.
 
 use crate::arguments;
-use crate::arrays::{fitting, given};
+use crate::arrays::{check_memory, fitting, given};
 use crate::errors::OrRaise;
 use crate::work::without_lock;
 use conefield::hounsfield::{How, Levels};
@@ -68,6 +68,8 @@ pub fn hounsfield<'py>(
     unit: Option<(String, f64)>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let volume = taken(volume)?;
+    // The converted volume is another one.
+    check_memory(8 * volume.data.len() as u64).or_raise(py)?;
     let unit = unit.map(|(name, mm)| Unit { name, mm });
     let (converted, note) = without_lock(py, |_| {
         let how: How = arguments::parsed("how", how, |text| text.parse())?;

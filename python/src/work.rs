@@ -6,6 +6,7 @@ use crate::stages::{Raised, within};
 use conefield_core::Result;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::method::{Observer, Record};
+use conefield_core::parallel::{Stop, stoppable};
 use conefield_core::parts::Part;
 use ndarray::Array3;
 use numpy::IntoPyArray;
@@ -53,19 +54,30 @@ impl Watch {
     }
 }
 
-/// Runs `work` without the GIL. An exception of a callback, a stage or a signal handler takes precedence over the error
-/// caused by stopping.
+/// Runs `work` without the GIL. It ends where it asks the watch, at the end of a loop's items under way, or where a stage is
+/// checked. An exception of a callback, a stage or a signal handler takes precedence over the error caused by stopping.
 pub fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce(&Watch) -> Result<T> + Send) -> PyResult<T> {
     log::start();
     let (looked, stopped) = (Mutex::new(Instant::now()), Mutex::new(None));
-    let watch = Watch { looked, stopped, raised: Arc::default() };
-    let done = py.detach(|| within(&watch.raised, || catch_unwind(AssertUnwindSafe(|| work(&watch)))));
-    let stopped = watch.stopped.into_inner().unwrap_or_else(PoisonError::into_inner);
+    let watch = Arc::new(Watch { looked, stopped, raised: Arc::default() });
+    let stop = || -> Stop {
+        let watch = watch.clone();
+        Arc::new(move || watch.cancelled())
+    };
+    let work = || stoppable(stop(), || work(&watch));
+    let done = py.detach(|| within(&watch.raised, || catch_unwind(AssertUnwindSafe(work))));
+    let stopped = watch.stopped.lock().unwrap_or_else(PoisonError::into_inner).take();
     if let Some(e) = stopped.or_else(|| watch.raised.take()) {
         return Err(e);
     }
     match done {
-        Ok(done) => done.map_err(|e| raised(py, &e)),
+        Ok(done) => done.map_err(|e| {
+            let error = raised(py, &e);
+            if let Some(cause) = watch.raised.cause(py, &e.to_string()) {
+                error.set_cause(py, Some(cause));
+            }
+            error
+        }),
         Err(panic) => {
             let text = panic.downcast_ref::<String>().map(String::as_str);
             Err(broken(py, text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("a panic without a message")))

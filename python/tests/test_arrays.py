@@ -102,6 +102,21 @@ def test_scans_are_read_only_and_come_back(scan, tmp_path):
         np.testing.assert_array_equal(part.truth.data, scan.truth.data)
 
 
+def test_an_array_gets_the_warnings_of_its_file(scan, tmp_path, caplog):
+    # Counts in place of line integrals, and a volume smaller than the object.
+    geometry = scan.geometry.with_volume((9, 9, 9), scan.geometry.spacing, (0.0, 0.0, 0.0))
+    for projections, words in [(np.exp(-scan.projections), "looks like intensities"), (scan.projections, "beside the volume")]:
+        caplog.clear()
+        made = conefield.scan(projections, geometry)
+        told = [record.getMessage() for record in caplog.records]
+        assert any(words in text and text.startswith("scan: ") for text in told), told
+        conefield.write_scan(tmp_path / words, made)
+        caplog.clear()
+        conefield.read_scan(tmp_path / words)
+        read = [record.getMessage().removeprefix(str(tmp_path / words)) for record in caplog.records]
+        assert [text.removeprefix("scan") for text in told] == read
+
+
 def test_a_scan_keeps_its_truth(scan, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     conefield.write_scan("s", scan)
@@ -172,6 +187,12 @@ def test_simulation_in_any_geometry(geometry):
     predicted = conefield.project(truth, fine, projector="siddon")
     # Voxels with sharp edges, compared with their interpolation.
     assert (predicted - scan.projections).std() < 0.05 * scan.projections.max()
+    # An array of other voxels fills the volume; a volume keeps its own.
+    coarse = np.random.default_rng(0).random((5, 4, 3), dtype=np.float32)
+    sides = [n * s / m for n, s, m in zip(shape, fine.spacing, coarse.shape)]
+    sized = conefield.simulate(conefield.Volume(coarse, sides, fine.center), fine).projections
+    np.testing.assert_array_equal(conefield.simulate(coarse, fine).projections, sized)
+    assert (conefield.simulate(conefield.Volume(coarse), fine).projections != sized).any()
     noisy = conefield.simulate(truth, fine, noise="poisson:1e5", seed=1).projections
     assert 0 < np.abs(noisy - scan.projections).max() < 0.1
 
@@ -220,6 +241,7 @@ def _two_views():
         (lambda: conefield.read_volume("phantom:hand"), "hand"),
         (lambda: conefield.simulate("phantom:head:8", noise="salt"), "poisson"),
         (lambda: conefield.simulate("phantom:head:8", views=0), "views"),
+        (lambda: conefield.simulate("phantom:head:8", views=3, angles="a.txt"), "views: found both, expected views or angles FILE"),
     ],
 )
 def test_what_cannot_be_is_refused(make, words):

@@ -1,6 +1,9 @@
 """Calibration of a scan with a wrong detector position."""
 
 import json
+import subprocess
+import sys
+import textwrap
 
 import numpy as np
 import pytest
@@ -48,6 +51,28 @@ def test_steady_views_are_not_shifted(shifted):
     found = conefield.calibrate(shifted[0], pixels=32, jitter=True)
     assert found.jitter["verdict"] == "kept" and len(found.jitter["shifts"]) == len(shifted[0])
     assert "shifts of single views" in str(found)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of address space")
+def test_what_does_not_fit_into_memory_is_refused():
+    program = """
+        import conefield, numpy as np, resource
+        geometry = conefield.circular(dso=500, dsd=800, angles=1000, detector=128, pixel=1, volume=8)
+        scan = conefield.scan(np.ones((1000, 128, 128), np.float32), geometry)
+        volume = conefield.Volume(np.broadcast_to(np.float32(1), (400, 400, 500)))
+        # Threads take addresses, too.
+        conefield.simulate("phantom:head:8", views=2, detector=(8, 8))
+        used = 1024 * next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmSize"))
+        # Seven eighths of it count: more than one volume and less than two.
+        resource.setrlimit(resource.RLIMIT_AS, (used + (480 << 20),) * 2)
+        for work in (lambda: conefield.calibrate(scan, pixels=128, jitter=True), lambda: volume.hounsfield("as-is", None)):
+            try:
+                work()
+            except conefield.UnsupportedError as error:
+                print(error)
+        """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.count("memory: needs") == 2, done.stdout + done.stderr
 
 
 def test_bad_settings_name_what_is_expected(shifted):

@@ -66,7 +66,13 @@ def test_an_array_of_other_voxels_fills_the_volume_as_a_file_without_sizes_does(
     np.save(tmp_path / "coarse.npy", coarse)
     command("project", tmp_path / "coarse.npy", "--like", folder, "-o", tmp_path / "p")
     theirs = conefield.read_scan(tmp_path / "p").projections
-    np.testing.assert_array_equal(conefield.project(coarse, scan), theirs)
+    for volume in (coarse, tmp_path / "coarse.npy"):
+        np.testing.assert_array_equal(conefield.project(volume, scan), theirs)
+    # One with sizes keeps them.
+    conefield.Volume(coarse, 0.5).write(tmp_path / "coarse.nii")
+    command("project", tmp_path / "coarse.nii", "--like", folder, "-o", tmp_path / "q")
+    theirs = conefield.read_scan(tmp_path / "q").projections
+    np.testing.assert_array_equal(conefield.project(tmp_path / "coarse.nii", scan), theirs)
 
 
 def test_a_seed_of_numpy_is_a_seed(folder):

@@ -78,6 +78,8 @@ def test_errors_name_the_wrong_setting(scan):
 def test_a_result_describes_itself(scan):
     result = conefield.reconstruct(scan, "fista-tv", reference=scan.truth, hold_out="every:5", stop__passes=2)
     assert result.record["held_out_views"] == [2, 7, 12] and result.record["held_out"] > 0
+    # The whole scan, and its parts.
+    assert result.record["memory"]["scan"] == 2 * scan.projections.nbytes
     assert result.scores["psnr"] > 15 and result.scores["ssim_3d"] is not None
     assert [r["step"] for r in result.record["records"]] == [1, 2]
     assert result.field is None and np.asarray(result) is result.volume.data
@@ -227,6 +229,67 @@ def test_ctrl_c_ends_a_run_cleanly():
     assert child.returncode == 0, err
     assert out.splitlines()[-2:] == ["interrupted", "volume True"], out + err
     assert time.monotonic() - begin < 20
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize(
+    "work",
+    [
+        "conefield.simulate(np.ones((256, 256, 256)), views=1000, detector=(400, 400))",
+        "conefield.calibrate(scan, pixels=128)",
+        "conefield.calibrate(scan, pixels=128, jitter=True, parameters=['tilt'])",
+        "conefield.check_stage('field', 'mlp', width=512)",
+        "conefield.check_stage('encoder', 'slow')",
+        "conefield.evaluate(np.ones((512, 512, 400)), np.ones((512, 512, 400)))",
+        "conefield.study('study.toml', 'study')",
+    ],
+    ids=lambda work: work[10:24],
+)
+def test_ctrl_c_ends_all_work_soon(work, tmp_path):
+    program = """
+        import conefield, numpy as np, signal, time
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        near = np.exp(-np.linspace(-3, 3, 128) ** 2).astype(np.float32)
+        geometry = conefield.circular(dso=500, dsd=800, angles=60, detector=128, pixel=1, volume=64)
+        scan = conefield.scan(np.broadcast_to(np.outer(near, near), (60, 128, 128)), geometry)
+
+        @conefield.encoder("slow")
+        class Slow:
+            def forward(self, x):
+                time.sleep(0.1)
+                return x.copy()
+
+            def backward(self, x, dy):
+                return dy.copy(), {}
+
+        print("begin", flush=True)
+        try:
+            WORK
+        except KeyboardInterrupt:
+            # The process still works.
+            views = conefield.simulate("phantom:head:8", views=2, detector=(8, 8))
+            print("interrupted", views.projections.max() > 0, flush=True)
+        """
+    (tmp_path / "study.toml").write_text(
+        """
+        name = "long"
+        volumes = ["phantom:head:16"]
+        views = [8]
+        simulate = { detector = "16x16" }
+        specs = [{ spec = "sirt", set = ["stop.passes=10000000"] }]
+        """
+    )
+    program = textwrap.dedent(program).replace("WORK", work)
+    child = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    assert child.stdout.readline() == "begin\n", child.stderr.read()
+    time.sleep(2)
+    begin = time.monotonic()
+    child.send_signal(signal.SIGINT)
+    out, err = child.communicate(timeout=60)
+    assert (child.returncode, out) == (0, "interrupted True\n"), out + err
+    assert time.monotonic() - begin < 15
 
 
 def test_the_log_is_pythons(scan, caplog):

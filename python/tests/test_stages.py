@@ -1,5 +1,7 @@
 """Stages written in Python."""
 
+import traceback
+
 import numpy as np
 import pytest
 
@@ -93,8 +95,12 @@ def test_what_it_raises_comes_out(scan):
         conefield.reconstruct(scan, spec, steps=1000)
     assert any("test_stages" in str(entry.path) for entry in raised.traceback)
     for settings, words in [({"bands": 0}, "bands below 1"), ({"band": 2}, "band"), ({"bands": []}, "test-waves")]:
-        with pytest.raises(conefield.InvalidError, match=words):
+        with pytest.raises(conefield.InvalidError, match=words) as raised:
             conefield.plan({"extends": "fast", "encoder": {"type": "test-waves", **settings}})
+        cause = raised.value.__cause__
+        assert type(cause) in (ValueError, TypeError) and str(cause) in str(raised.value)
+        # The class itself refuses bands.
+        assert "bands" not in settings or traceback.extract_tb(cause.__traceback__)[-1].name == "__init__"
     # No state of the failure remains.
     assert conefield.reconstruct(scan, "fdk").volume.data.std() > 0
 
@@ -201,6 +207,9 @@ def test_what_is_no_stage_is_refused():
     ]:
         with pytest.raises(conefield.InvalidError, match=words):
             kind("test-none")(cls)
+    for decorator in (conefield.encoder, conefield.regularizer):
+        with pytest.raises(conefield.InvalidError, match=r'name: found <class .*Waves.>, expected .*as in @conefield.*\("name"\)'):
+            decorator(Waves)
     with pytest.raises(conefield.InvalidError, match="conefield itself"):
         conefield.encoder("hash-grid")(Waves)
 

@@ -39,7 +39,7 @@ def test_a_study_is_carried_out_and_continued(tmp_path):
     (tmp_path / "study.toml").write_text(STUDY)
     table = conefield.study(tmp_path / "study.toml", tmp_path / "out")
     assert table == json.loads((tmp_path / "out" / "table.json").read_text())
-    with pytest.raises(conefield.Error, match="earlier study"):
+    with pytest.raises(conefield.Error, match="earlier study, .*resume=True to continue or force=True to replace it"):
         conefield.study(tmp_path / "study.toml", tmp_path / "out")
     runs = sorted((tmp_path / "out").rglob("record.json"))
     written = [r.stat().st_mtime_ns for r in runs]

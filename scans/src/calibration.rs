@@ -24,6 +24,7 @@ mod opposite;
 mod parameters;
 mod search;
 
+pub use criterion::bytes;
 pub use direction::{Directions, directions};
 pub use jitter::{Jitter, jitter};
 pub use parameters::{Correction, Parameter};
@@ -179,7 +180,8 @@ pub fn calibrate(scan: &Scan, settings: &Settings, backend: &dyn Backend, watch:
     let widths = widths(scan, settings.width);
     let finest = widths[widths.len() - 1];
     let first = Level::new(scan, widths[0], FOLDS, &at)?;
-    let opposite = on_a_circle(&scan.geometry.views).then(|| Opposite::of(scan.binned(criterion::bin(scan, finest))));
+    let opposite = on_a_circle(&scan.geometry.views)
+        .then(|| Opposite::of(scan.binned(criterion::bin(scan.geometry.detector, finest))));
     let shared = opposite.as_ref().is_none_or(Opposite::enough);
     let reason = |p: &Parameter| match p {
         _ if !shared => Some(ARC_REASON),

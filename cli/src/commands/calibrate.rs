@@ -68,11 +68,11 @@ impl CalibrateArgs {
         }
         let backend = self.backend.open()?;
         let size = conefield_io::scan_size(&self.scan)?;
-        Memory::of_data_set(&size).check()?;
-        let DataSet { train: scan, test, volume } = conefield_scans::read_data_set(&self.scan, Parts::ALL)?;
-        scan.validate(&self.scan.display().to_string())?;
         let settings =
             Settings { parameters: self.parameters.clone(), width: self.pixels.into(), curves: self.png.is_some() };
+        Memory::of_calibration(&size, &settings, self.jitter, backend.as_ref())?.check()?;
+        let DataSet { train: scan, test, volume } = conefield_scans::read_data_set(&self.scan, Parts::ALL)?;
+        scan.validate(&self.scan.display().to_string())?;
         signals::listen();
         let watch = Shown::new();
         let found = calibrate(&scan, &settings, backend.as_ref(), &watch)?;

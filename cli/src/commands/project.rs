@@ -109,7 +109,7 @@ impl ProjectArgs {
         let n = scan.geometry.views.len();
         match conefield::input::chosen(self.views.as_ref(), n)? {
             all if all.is_empty() || all.len() == n => Ok((scan, (0..n).collect())),
-            some => Ok((scan.split(&some)?.1, some)),
+            some => Ok((scan.select(&some), some)),
         }
     }
 

@@ -57,6 +57,9 @@ pub struct StudyArgs {
     /// Print one JSON object: the content of table.json.
     #[arg(long)]
     json: bool,
+    /// The study is part of another program: the end of standard input stops it like a signal.
+    #[arg(long, hide = true)]
+    as_part: bool,
 }
 
 /// Time between two attempts to take a lock held by another process.
@@ -73,6 +76,9 @@ enum Hold {
 
 impl StudyArgs {
     pub fn run(self, general: &General) -> Result<()> {
+        if self.as_part {
+            signals::follow_input();
+        }
         // Errors in the input are reported before anything is created.
         let study = Study::read(&self.study)?;
         let inputs = study.methods.iter().fold(Inputs::of(study.inputs()), |i, m| i.and_spec(&m.loaded));

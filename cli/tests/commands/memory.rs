@@ -128,6 +128,19 @@ fn what_does_not_fit_is_refused_with_figures_before_anything_is_made() {
     );
 }
 
+#[test]
+fn calibration_counts_its_copies_of_the_views() {
+    let d = scan_of(1200, 64, 32);
+    let views = 1200.0 * 64.0 * 64.0 * 4.0 / MIB as f64;
+    let [plain, jitter] = ["", "--jitter"].map(|option| {
+        let said = d.refused(1, &format!("calibrate scan {option} --memory 30MiB"));
+        let needs = said.split("memory: needs ").nth(1).unwrap().split(" MiB").next().unwrap();
+        needs.parse::<f64>().unwrap_or_else(|_| panic!("{said}"))
+    });
+    println!("{plain} MiB, {jitter} MiB with shifts of single views, for {views} MiB of views");
+    assert!(plain > 3.0 * views && jitter > plain + 4.0 * views);
+}
+
 /// A folder with the run of a small field.
 fn field() -> Folder {
     let d = scan_of(4, 32, 32);

@@ -101,8 +101,8 @@ pub fn calibrate(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64) -> Result
 fn field(bench: &Bench<'_>, plan: &mut dyn Plan, seconds: f64, later: bool) -> Result<Costs> {
     let n = bench.job.scan.geometry.views.len();
     let every = n.div_ceil(VIEWS);
-    let others: Vec<usize> = (0..n).filter(|v| v % every != 0).collect();
-    let scan = bench.job.scan.split(&others)?.0;
+    let some: Vec<usize> = (0..n).step_by(every).collect();
+    let scan = bench.job.scan.select(&some);
     let mut laps = Laps::new(bench.cancelled);
     let limits = Limits { at_most: Some(seconds), ..Limits::default() };
     let start = later.then(|| uniform(&scan));

@@ -91,7 +91,7 @@ impl Consistency {
     /// Prepares `scan` with about `width` pixels along the longer side of the detector. Uses the planes that are
     /// complete in the geometry corrected by `known`.
     pub fn new(scan: &Scan, width: usize, known: &Correction) -> Result<Self> {
-        let binned = Scan { unit: Unit::default(), ..spread(scan.binned(bin(scan, width)))? };
+        let binned = Scan { unit: Unit::default(), ..spread(scan.binned(bin(scan.geometry.detector, width))) };
         let p = &binned.projections;
         let top = p.iter().copied().fold(0.0f32, f32::max);
         if top <= 0.0 {

@@ -1,14 +1,15 @@
 //! The criterion: the error of held-out views, predicted from a quick reconstruction of the others.
 
 use crate::calibration::parameters::{Correction, Parameter};
+use crate::calibration::{FINER, Settings};
 use crate::diagnosis::setup;
 use conefield_core::backend::Backend;
 use conefield_core::finite::range;
 use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, norm};
-use conefield_core::method::{Context, Job, Method, Quiet, Reconstruction};
+use conefield_core::method::{Context, Job, Method, Plan, Quiet, Reconstruction};
 use conefield_core::parallel;
 use conefield_core::place::ViewRays;
-use conefield_core::scan::{Scan, Unit};
+use conefield_core::scan::{Scan, ScanHeader, Unit};
 use conefield_core::{Error, Result};
 use conefield_projectors::voxel::Joseph;
 use conefield_solvers::iterative::Stop;
@@ -16,6 +17,10 @@ use conefield_solvers::iterative::order::Subsets;
 use conefield_solvers::iterative::sart::Sart;
 use ndarray::{Array3, ArrayView2, s};
 
+/// Copies of a level's views during the search: two folds of every level, those of the corrected geometry, and the
+/// predictions for changes of all parameters. And such copies of the pixels that pairs of views compare.
+const SEARCHED: u64 = 10;
+const PAIRED: u64 = 17;
 /// One in this many views is held out.
 const EVERY: usize = 4;
 /// Subsets of the views and passes of the quick reconstruction.
@@ -67,13 +72,13 @@ impl Level {
     /// The level of `scan` with about `width` pixels along the longer side of the detector and `folds` folds. Each fold
     /// holds out another quarter of the views. The voxels cover the object in the geometry corrected by `known`.
     pub fn new(scan: &Scan, width: usize, folds: usize, known: &Correction) -> Result<Self> {
-        let bin = bin(scan, width);
-        Self::of(spread(scan.binned(bin))?, bin, width, folds, known)
+        let bin = bin(scan.geometry.detector, width);
+        Self::of(spread(scan.binned(bin)), bin, width, folds, known)
     }
 
     /// The level of all views of `scan`, each of them held out once.
     pub fn whole(scan: &Scan, width: usize) -> Result<Self> {
-        let bin = bin(scan, width);
+        let bin = bin(scan.geometry.detector, width);
         Self::of(scan.binned(bin), bin, width, EVERY, &Correction::default())
     }
 
@@ -167,8 +172,7 @@ impl Level {
 }
 
 /// The side of a level's pixels, in pixels of the scan.
-pub(crate) fn bin(scan: &Scan, width: usize) -> usize {
-    let [rows, columns] = scan.geometry.detector;
+pub(crate) fn bin([rows, columns]: [usize; 2], width: usize) -> usize {
     let (shorter, longer) = (rows.min(columns), rows.max(columns));
     // Some rows remain, unless there are hardly any.
     let most = if shorter < 8 { longer } else { shorter } / 4;
@@ -188,12 +192,46 @@ impl Level {
     }
 }
 
-/// A quick reconstruction, in 1/mm.
-fn reconstruct(scan: &Scan, backend: &dyn Backend, cancelled: &(dyn Fn() -> bool + Sync)) -> Result<Array3<f32>> {
+/// The quick reconstruction.
+fn plan(backend: &dyn Backend) -> Result<Box<dyn Plan>> {
     let subsets = Subsets::Count(SUBSETS);
     let sart = Sart { subsets, relaxation: 1.0, decay: 0.7, stop: Stop::after(PASSES), ..Sart::default() };
-    let mut plan = sart.plan(&Context::new(backend))?;
-    let solution = plan.run(&Job::new(scan, backend), &mut Quiet(cancelled));
+    sart.plan(&Context::new(backend))
+}
+
+/// Bytes that [`crate::calibration::calibrate`], [`crate::calibration::directions`] and, for `shifts`,
+/// [`crate::calibration::jitter()`] take besides a scan of this size, with `settings`: those of the largest arrays, for voxels
+/// as fine as the pixels.
+pub fn bytes(scan: &ScanHeader, settings: &Settings, shifts: bool, backend: &dyn Backend) -> Result<u64> {
+    let plan = plan(backend)?;
+    let views = scan.views.min(MOST_VIEWS);
+    let level = |views: usize, width: usize| {
+        let header = ScanHeader { views, ..*scan }.binned(bin(scan.detector, width));
+        let longest = header.detector.into_iter().max().unwrap_or(0) as f64;
+        let shrink = longest / scan.volume.into_iter().max().unwrap_or(1).max(1) as f64;
+        ScanHeader { volume: scan.volume.map(|n| (shrink * n as f64).ceil() as usize), ..header }
+    };
+    // Its training views, and what the solver takes.
+    let solving = |whole: ScanHeader| {
+        let train = ScanHeader { views: whole.views - whole.views / EVERY, ..whole };
+        let needs = plan.needs(&train);
+        4 * (train.pixels() + train.voxels()) + needs.backend + needs.working
+    };
+    let threads = rayon::current_num_threads() as u64;
+    let (few, all) = (level(views, settings.width), level(scan.views, settings.width));
+    let paired = settings.parameters.iter().any(|p| p.by_pairs());
+    let pairs = if paired { PAIRED * 4 * level(views, FINER * settings.width).pixels() } else { 0 };
+    // The whole views are kept for the rays that two of them share.
+    let searching = 4 * (all.pixels() + SEARCHED * few.pixels()) + threads * solving(few) + pairs;
+    // Each fold has all views, at every level; the finest ones are binned beside them, and predicted.
+    let shifting =
+        4 * (EVERY as u64 * all.pixels() * 4 / 3 + 2 * all.pixels()) + threads.min(EVERY as u64) * solving(all);
+    Ok(if shifts { searching.max(shifting) } else { searching })
+}
+
+/// A quick reconstruction, in 1/mm.
+fn reconstruct(scan: &Scan, backend: &dyn Backend, cancelled: &(dyn Fn() -> bool + Sync)) -> Result<Array3<f32>> {
+    let solution = plan(backend)?.run(&Job::new(scan, backend), &mut Quiet(cancelled));
     let solution = solution.map_err(|e| match e {
         Error::Interrupted { .. } => Error::Aborted { part: "calibration".into() },
         e => e,
@@ -205,13 +243,13 @@ fn reconstruct(scan: &Scan, backend: &dyn Backend, cancelled: &(dyn Fn() -> bool
 }
 
 /// The scan, reduced to at most [`MOST_VIEWS`] evenly spaced views.
-pub(crate) fn spread(scan: Scan) -> Result<Scan> {
+pub(crate) fn spread(scan: Scan) -> Scan {
     let n = scan.geometry.views.len();
     if n <= MOST_VIEWS {
-        return Ok(scan);
+        return scan;
     }
     let kept: Vec<usize> = (0..MOST_VIEWS).map(|i| i * n / MOST_VIEWS).collect();
-    Ok(scan.split(&kept)?.1)
+    scan.select(&kept)
 }
 
 /// Voxels as fine as the pixels, in the volume of the scan. If the object extends beyond the detector or the volume,

@@ -48,7 +48,7 @@ pub fn directions(scan: &Scan, backend: &dyn Backend, watch: &dyn Watch) -> Resu
     if !on_a_circle(&scan.geometry.views) {
         return Ok(None);
     }
-    let coarse = spread(scan.binned(bin(scan, 2 * COARSEST)))?;
+    let coarse = spread(scan.binned(bin(scan.geometry.detector, 2 * COARSEST)));
     // Only a shift along u has another sign in the other direction. Other errors of the geometry affect both alike.
     let settings = Settings { parameters: vec![Parameter::OffsetU], width: COARSEST, curves: false };
     let error = |scan: &Scan, from: f64| -> Result<f64> {

@@ -1,6 +1,7 @@
 //! Calls of a stage's kernels on random data, and comparisons.
 
 use crate::{Options, Outcome, Unmet};
+use conefield_core::parallel;
 use conefield_core::random::{mix, unit};
 use conefield_core::simd::Real;
 use conefield_core::stage::{Backward, Grads, Info, Kernel, Stage, Tile, TileMut};
@@ -146,6 +147,7 @@ impl<'a, R: Real> Loaded<'a, R> {
 
     /// Output and tape. Both hold `before` before the call.
     pub fn forward_over(&self, x: &[R], rows: usize, before: R) -> [Vec<R>; 2] {
+        parallel::look();
         let [mut y, mut tape] = self.outputs(rows, before);
         let (to, left) = (TileMut::new(y.inner(), rows), TileMut::new(tape.inner(), rows));
         self.kernel.forward(&self.params, Tile::new(x, rows), to, left);

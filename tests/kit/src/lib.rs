@@ -23,6 +23,7 @@ mod wgsl;
 
 use call::{Subject, failed, settle};
 use conefield_core::error::Error;
+use conefield_core::parallel;
 use conefield_core::stage::{Encoder, Field, GradKind, Info, Normalizer, Scope, Stage};
 use serde::ser::{Serialize, SerializeStruct, Serializer};
 use serde_json::json;
@@ -134,6 +135,7 @@ impl Report {
     }
 
     fn add(&mut self, name: &'static str, property: impl FnOnce() -> Outcome) {
+        parallel::look();
         let outcome = catch_unwind(AssertUnwindSafe(property)).unwrap_or_else(|panic| {
             let text = panic.downcast_ref::<String>().cloned();
             let text = text.or_else(|| panic.downcast_ref::<&str>().map(|s| s.to_string()));

@@ -238,7 +238,7 @@ impl Shown {
             Some(choice) => input::chosen(Some(choice), n)?,
             None => (0..VIEWS.min(n)).map(|i| i * n / VIEWS.min(n)).collect(),
         };
-        let some = if chosen.len() == n { scan.clone() } else { scan.split(&chosen)?.1 };
+        let some = if chosen.len() == n { scan.clone() } else { scan.select(&chosen) };
         let [low, high] = range(&some.projections);
         let (low, high) = (low.min(0.0), high.max(0.0));
         let window = if low < high { [low, high] } else { [low, low + 1.0] };
