@@ -384,6 +384,12 @@ mod tests {
     }
 
     #[test]
+    fn the_median_of_an_even_number_lies_between_the_middle_two() {
+        let (_, note) = converted("water=box:-3,-2,-1,3,2,1,air=0", None).unwrap();
+        assert_eq!(note, "HU: water 0.011, air 0");
+    }
+
+    #[test]
     fn a_relative_unit_needs_regions() {
         let cube = Some(Unit { name: "cube half side".into(), mm: 4.0 });
         let said = converted("60keV", cube.clone()).unwrap_err().to_string();
