@@ -136,8 +136,8 @@ impl CompareArgs {
         match failed.len() {
             0 => Ok(()),
             n => {
-                let all = methods.len();
-                let why = format!("{n} of {all} {} failed: {}", out::plural(all, "method"), failed.join(", "));
+                let all = out::counted(methods.len(), "method");
+                let why = format!("{n} of {all} failed: {}", failed.join(", "));
                 Err(Error::unsupported("compare", why))
             }
         }
@@ -258,7 +258,7 @@ impl Shared<'_> {
         let mut parts = vec![self.scan.line()];
         match self.held_out_views.len() {
             0 => {}
-            n => parts.push(format!("{n} {} held out", out::plural(n, "view"))),
+            n => parts.push(format!("{} held out", out::counted(n, "view"))),
         }
         parts.extend(self.reference.as_ref().map(|r| format!("reference {r}, peak {}", self.peak)));
         parts.extend(self.limits.steps.map(|n| format!("{} {}", out::number(n), out::plural(n, "step"))));
@@ -266,8 +266,8 @@ impl Shared<'_> {
         parts.extend(self.budget_s.map(|t| format!("budget {}", out::duration(t))));
         parts.extend(self.limits.at_most.map(|t| format!("at most {}", out::duration(t))));
         parts.extend(self.sets.iter().map(|s| format!("`{s}`")));
-        let (threads, version) = (self.threads, self.version);
-        parts.push(format!("seed {}, {threads} {}, conefield {version}", self.seed, out::plural(threads, "thread")));
+        let threads = out::counted(self.threads, "thread");
+        parts.push(format!("seed {}, {threads}, conefield {}", self.seed, self.version));
         parts.join("; ")
     }
 }

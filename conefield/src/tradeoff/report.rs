@@ -11,7 +11,7 @@ use crate::tradeoff::search::{FILES, FOLDERS, Over, Rung, Search};
 use crate::tradeoff::statistics::{mean, spearman};
 use crate::tradeoff::trial::Figures;
 use conefield_core::spec::load::to_toml;
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::text::{bytes, duration, number};
 use conefield_evaluation::report::{CurveOptions, Panel, Table, panels_png};
@@ -157,12 +157,11 @@ impl TradeoffReport {
             let base = specs::read(&candidate.spec, &candidate.sets)?;
             let scans: Vec<String> = self.search.scans.iter().map(|s| s.name()).collect();
             let said = format!(
-                "{} in {} on {}, with {} {}.",
+                "{} in {} on {}, with {}.",
                 self.reached(point),
                 duration(point.total_s),
                 scans.join(", "),
-                self.search.threads,
-                plural(self.search.threads, "thread")
+                counted(self.search.threads, "thread")
             );
             let mut sets = candidate.sets.clone();
             let steps = (point.steps.round() as u64).max(1);
@@ -206,7 +205,7 @@ impl TradeoffReport {
                 runs: point.runs.iter().map(reached).collect(),
             });
         }
-        let made = format!("conefield {version}, {threads} {}, {simd}", plural(*threads, "thread"));
+        let made = format!("conefield {version}, {}, {simd}", counted(*threads, "thread"));
         let front = Front { made, pass_s: None, scans: tuned.collect(), points };
         let text = toml::to_string(&front).map_err(|e| Error::unsupported("front.toml", e.to_string()))?;
         Ok(format!("# Written by \"conefield tradeoff\", read by \"conefield reconstruct --budget --front\".\n{text}"))
@@ -256,8 +255,8 @@ impl TradeoffReport {
             ));
         }
         notes.extend(s.hold_out.as_ref().map(|h| format!("views held out: {h}")));
-        let threads = plural(s.threads, "thread");
-        notes.push(format!("seed {}, {} {threads}, conefield {}", s.seed, s.threads, s.version));
+        let threads = counted(s.threads, "thread");
+        notes.push(format!("seed {}, {threads}, conefield {}", s.seed, s.version));
         for rung in &self.rungs {
             let short = self.count(rung.budget_s, Status::TooShort);
             let failed = self.count(rung.budget_s, Status::Failed);
@@ -265,7 +264,7 @@ impl TradeoffReport {
                 format!("{}: {} tried, {} advanced", duration(rung.budget_s), rung.tried.len(), rung.kept.len());
             for (n, what) in [(short, "had too little time"), (failed, "failed")] {
                 if n > 0 {
-                    line += &format!(", {n} {} {what}", plural(n, "trial"));
+                    line += &format!(", {} {what}", counted(n, "trial"));
                 }
             }
             notes.push(line);
