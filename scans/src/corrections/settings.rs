@@ -104,7 +104,10 @@ mod tests {
             (vec!["rings.windows=3"], vec!["windows", "window"]),
             (vec!["rings.window=4"], vec!["rings.window", "4", "odd"]),
             (vec!["rings.window=3", "rings.window=5"], vec!["window", "once"]),
-            (vec!["rings.size=3"], vec!["rings.size: found a key that is not known here, expected method, window"]),
+            (
+                vec!["rings.size=3"],
+                vec!["rings.size: found a key that is not known here, expected one of method, window"],
+            ),
             (vec!["rings=3"], vec!["corrections: rings: found 3, expected a table"]),
             (vec!["rings", "rings=3"], vec!["once"]),
             (vec!["rings..window=3"], vec!["rings..window=3"]),
