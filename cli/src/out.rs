@@ -1,7 +1,7 @@
 //! Results on standard output, readable or as JSON.
 
 pub use conefield::tradeoff::json::to_json;
-pub use conefield_core::words::plural;
+pub use conefield_core::words::{counted, plural};
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::Table;
 pub use conefield_evaluation::report::text::{bytes, duration, number, table};

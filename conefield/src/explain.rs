@@ -7,7 +7,7 @@ use conefield_core::backend::Backend;
 use conefield_core::method::{Findings, Line, Outline, Plan};
 use conefield_core::scan::Scan;
 use conefield_core::spec::load::Loaded;
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_evaluation::report::text::{bytes, number, table};
 use serde::Serialize;
 
@@ -112,12 +112,10 @@ impl Explanation {
         }
         if let Some(s) = &self.scan {
             let ([rows, columns], [x, y, z], views) = (s.detector, s.volume, s.views);
-            let samples = s
-                .findings
-                .samples
-                .map_or(String::new(), |n| format!(", {n} {} on the middle ray", plural(n, "sample")));
-            let of = plural(views, "view");
-            lines.push(format!("this scan: {views} {of} of {rows} x {columns}, volume {x} x {y} x {z}{samples}"));
+            let on_ray = |n| format!(", {} on the middle ray", counted(n, "sample"));
+            let samples = s.findings.samples.map_or(String::new(), on_ray);
+            let views = counted(views, "view");
+            lines.push(format!("this scan: {views} of {rows} x {columns}, volume {x} x {y} x {z}{samples}"));
             lines.extend(s.findings.lines.iter().map(|line| format!("  {line}")));
             lines.push(format!("memory for this scan: {}", s.memory.line()));
             let limit = memory::limit();

@@ -7,7 +7,7 @@ use conefield_core::backend::Backend;
 use conefield_core::error::ensure;
 use conefield_core::method::{Job, Limits};
 use conefield_core::scan::{Scan, Volume};
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_core::{Error, Result, checksum};
 use conefield_io::{DataSet, Parts};
 use conefield_scans::diagnosis::survey;
@@ -121,7 +121,7 @@ pub fn check_reference(place: &str, volume: &Volume, scan: &Scan) -> Result<()> 
 pub fn held_out(choice: Option<&HoldOut>, n: usize, place: &str, field: &str) -> Result<Vec<usize>> {
     let Some(choice) = choice else { return Ok(vec![]) };
     let held = choice.views(n);
-    let found = format!("{choice}, which selects none of {n} {}", plural(n, "view"));
+    let found = format!("{choice}, which selects none of {}", counted(n, "view"));
     ensure(!held.is_empty(), place, field, found, "at least one view")?;
     Ok(held)
 }

@@ -182,24 +182,24 @@ pub enum Values {
 /// Attenuation is not negative. The noise of a reconstruction stays above this; Hounsfield units of air are far below.
 const LEAST: f32 = -50.0;
 
-/// Refuses a volume whose values are not attenuation, but probably Hounsfield units.
-pub fn must_be_attenuation(volume: &Volume) -> conefield_core::Result<()> {
+/// Refuses the volume `name` if its values are not attenuation, but probably Hounsfield units.
+pub fn must_be_attenuation(name: &str, volume: &Volume) -> conefield_core::Result<()> {
     let [low, high] = range(&volume.data);
     let expected = "attenuation, which is not negative (Hounsfield units? --values hu:0.02 of simulate and convert makes \
                     attenuation, with water 0.02 per mm; clip:-1000,2000 numbers from 0 to 1)";
-    ensure(low >= LEAST, "volume", "values", format!("{low} to {high}"), expected)
+    ensure(low >= LEAST, name, "values", format!("{low} to {high}"), expected)
 }
 
 impl Values {
-    /// Maps a volume that is to be projected to attenuation. Refuses values taken as they are that are not attenuation,
+    /// Maps the volume `name`, which is to be projected, to attenuation. Refuses values taken as they are that are not attenuation,
     /// and warns of negative ones.
-    pub fn attenuation(self, volume: Volume) -> conefield_core::Result<Volume> {
+    pub fn attenuation(self, name: &str, volume: Volume) -> conefield_core::Result<Volume> {
         let volume = self.apply(volume)?;
         if self == Self::AsIs {
-            must_be_attenuation(&volume)?;
+            must_be_attenuation(name, &volume)?;
             let [low, high] = range(&volume.data);
             if low < -0.1 * high.max(0.0) {
-                tracing::warn!("the volume has values from {low} to {high}: attenuation is not negative (--values)");
+                tracing::warn!("{name} has values from {low} to {high}: attenuation is not negative (--values)");
             }
         }
         Ok(volume)

@@ -9,7 +9,7 @@ use conefield_core::backend::Explain;
 use conefield_core::method::Limits;
 use conefield_core::place::Moved;
 use conefield_core::scan::{Scan, Unit};
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_core::{Result, checksum};
 use conefield_evaluation::hounsfield::Levels;
 use conefield_evaluation::metrics::Scores;
@@ -180,8 +180,7 @@ impl ScanRecord {
 
     /// Text for people.
     pub fn line(&self) -> String {
-        let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.volume);
-        let of = plural(views, "view");
-        format!("{}: {views} {of} of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
+        let (views, [rows, columns], [x, y, z]) = (counted(self.views, "view"), self.detector, self.volume);
+        format!("{}: {views} of {rows} x {columns} pixels, {x} x {y} x {z} voxels", self.path)
     }
 }

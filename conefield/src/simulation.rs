@@ -6,7 +6,7 @@ use conefield_core::files::read_text;
 use conefield_core::finite::range;
 use conefield_core::geometry::{Geometry, VoxelGrid};
 use conefield_core::scan::{Scan, Unit, Volume};
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_core::{Error, Result, written};
 use conefield_projectors::simulate::{Angles, DetectorNoise, HuMapping, Protocol, downsample, project, simulate_with};
 use serde_json::json;
@@ -35,9 +35,9 @@ pub struct Changes {
     pub seed: Option<u64>,
 }
 
-/// The volume centred on the rotation axis, in attenuation, with blocks of `size`³ voxels averaged.
-pub fn prepared(volume: Volume, values: Values, size: usize) -> Result<Volume> {
-    let mut volume = values.attenuation(volume)?;
+/// The volume `name` centred on the rotation axis, in attenuation, with blocks of `size`³ voxels averaged.
+pub fn prepared(name: &str, volume: Volume, values: Values, size: usize) -> Result<Volume> {
+    let mut volume = values.attenuation(name, volume)?;
     // A scan's volume is centred on the rotation axis.
     volume.grid.center = [0.0; 3];
     if size > 1 {
@@ -141,7 +141,7 @@ pub fn check_memory(volume: &Volume, g: &Geometry) -> Result<()> {
         let fits = |m: Memory| m.total <= available;
         let views = (1..=g.views.len()).rev().find(|&n| fits(need(n, 1)));
         let detector = (1..5).find(|k| fits(need(g.views.len(), 1 << (2 * k))));
-        let views = views.map(|n| format!("{n} {}", plural(n, "view")));
+        let views = views.map(|n| counted(n, "view"));
         let detector = detector.map(|k| format!("a detector of {}x{}", g.detector[0] >> k, g.detector[1] >> k));
         views.into_iter().chain(detector).collect()
     })

@@ -1,6 +1,6 @@
 //! The state of a run between two steps: enough to continue bit-identically.
 
-use crate::arena::{Arena, Layout, Weights};
+use crate::arena::{Arena, Block, Layout, Weights};
 use crate::error::{Error, Result};
 use crate::pipeline::Model;
 use serde::{Deserialize, Serialize};
@@ -111,14 +111,17 @@ impl Resume {
     /// Loads what [`tensors_of`] returned for `layout` under `prefix`.
     pub fn load(&self, prefix: &str, layout: &Layout, parts: &mut [&mut [f32]]) -> Result<()> {
         for (part, values) in PARTS.into_iter().zip(parts) {
-            let prefix = format!("{}{prefix}{part}.", self.prefix);
-            let own =
-                |(k, v): (&String, &(Vec<usize>, Vec<f32>))| Some((k.strip_prefix(&prefix)?.to_owned(), v.clone()));
-            let mut weights = Weights::default();
-            weights.tensors.extend(self.weights.tensors.iter().filter_map(own));
-            let report = weights.load(&self.place, layout, values, |_| true)?;
-            if let Some((tensor, why)) = report.unused.first() {
-                return Err(Error::invalid(&self.place, tensor, why, "only tensors of this pipeline"));
+            let prefix = format!("{prefix}{part}.");
+            for Block { name, shape, range } in &layout.blocks {
+                let from = self.shaped(&format!("{prefix}{name}"), shape)?;
+                if let Some(x) = from.iter().find(|x| !x.is_finite()) {
+                    return Err(Error::invalid(&self.place, name, x, "finite weights"));
+                }
+                values[range.clone()].copy_from_slice(from);
+            }
+            let mut names = self.names().filter_map(|name| name.strip_prefix(&*prefix));
+            if let Some(name) = names.find(|name| layout.find(name).is_none()) {
+                return Err(Error::invalid(&self.place, name, "not in this pipeline", "only tensors of this pipeline"));
             }
         }
         Ok(())

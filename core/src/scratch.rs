@@ -166,6 +166,16 @@ mod files {
         maps: Vec<(usize, usize)>,
     }
 
+    impl Scratch {
+        /// Gives space back to the reserve, if nothing else has taken it.
+        fn give_back(&mut self, bytes: u64) {
+            let reserved = self.reserved + bytes;
+            if allocate(&self.reserve, reserved).is_ok() {
+                self.reserved = reserved;
+            }
+        }
+    }
+
     fn scratch() -> MutexGuard<'static, Option<Scratch>> {
         SCRATCH.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -218,14 +228,19 @@ mod files {
         let scratch = scratch.as_mut()?;
         let file = tempfile::tempfile_in(&scratch.folder).ok()?;
         // The block takes its space from the reserve.
-        let left = scratch.reserved.saturating_sub(bytes as u64);
-        scratch.reserve.set_len(left).ok()?;
-        scratch.reserved = left;
-        allocate(&file, bytes as u64).ok()?;
-        // SAFETY: a new mapping at an address that the system chooses. No other process can open its file.
-        let at =
-            unsafe { mmap(ptr::null_mut(), bytes, ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, &file, 0) };
-        let at = at.ok()?;
+        let taken = scratch.reserved.min(bytes as u64);
+        scratch.reserve.set_len(scratch.reserved - taken).ok()?;
+        scratch.reserved -= taken;
+        let mapped = allocate(&file, bytes as u64).and_then(|()| {
+            let access = ProtFlags::READ | ProtFlags::WRITE;
+            // SAFETY: a new mapping at an address that the system chooses. No other process can open its file.
+            unsafe { mmap(ptr::null_mut(), bytes, access, MapFlags::SHARED, &file, 0) }
+        });
+        let Ok(at) = mapped else {
+            drop(file);
+            scratch.give_back(taken);
+            return None;
+        };
         scratch.maps.push((at as usize, bytes));
         MAPPED.fetch_add(bytes as u64, Relaxed);
         Some(at.cast())
@@ -245,10 +260,7 @@ mod files {
         // SAFETY: the caller gives up the block, which is this whole mapping.
         let _ = unsafe { munmap(at.cast(), bytes) };
         MAPPED.fetch_sub(bytes as u64, Relaxed);
-        let reserved = scratch.reserved + bytes as u64;
-        if allocate(&scratch.reserve, reserved).is_ok() {
-            scratch.reserved = reserved;
-        }
+        scratch.give_back(bytes as u64);
         true
     }
 
@@ -279,6 +291,15 @@ mod files {
             // SAFETY: the mapping is in use while the lock is held. It is shared, so its numbers stay in the file.
             let _ = unsafe { madvise(at as *mut _, bytes, Advice::LinuxDontNeed) };
         }
+    }
+
+    #[test]
+    fn a_block_without_room_leaves_the_reserve_as_it_was() {
+        let folder = tempfile::tempdir().unwrap();
+        begin(folder.path(), u64::MAX, 1 << 20).unwrap();
+        // More than any file has.
+        assert_eq!(block(isize::MAX as usize), None);
+        assert_eq!(scratch().as_ref().map(|s| s.reserved), Some(1 << 20));
     }
 }
 

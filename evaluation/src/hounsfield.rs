@@ -13,6 +13,7 @@ use conefield_scans::corrections::WATER;
 use conefield_scans::diagnosis::quantiles::median;
 use ndarray::{Array3, ArrayViewMut3};
 use serde::{Deserialize, Serialize};
+use std::fmt::{Display, Formatter};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -155,6 +156,15 @@ fn at(grid: &VoxelGrid, affine: Option<&Affine>, voxel: [usize; 3]) -> [f64; 3] 
     )
 }
 
+impl Display for Region {
+    fn fmt(&self, to: &mut Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Sphere { center: [x, y, z], radius } => write!(to, "sphere:{x},{y},{z},{radius}"),
+            Self::Box { low: [a, b, c], high: [d, e, f] } => write!(to, "box:{a},{b},{c},{d},{e},{f}"),
+        }
+    }
+}
+
 impl Region {
     fn holds(&self, p: [f64; 3]) -> bool {
         match self {
@@ -223,7 +233,7 @@ impl How {
                     let last = grid.shape.map(|n| n - 1);
                     let [a, b] = [[0; 3], last].map(|v| at(grid, affine, v));
                     let expected = format!("a region with voxels, whose centres lie from {a:.3?} to {b:.3?} mm");
-                    ensure(some, place, FIELD, format!("{region:?} without a voxel"), expected)?;
+                    ensure(some, place, FIELD, format!("{region} without a voxel"), expected)?;
                 }
             }
         }

@@ -24,7 +24,7 @@ use crate::{affine, folder, foreign};
 use conefield_core::error::ensure;
 use conefield_core::geometry::{VoxelGrid, cross, dot, norm, sub};
 use conefield_core::scan::Volume;
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_core::{Error, Result, allowance};
 use ndarray::{Array3, s};
 use slice::Slice;
@@ -68,16 +68,14 @@ fn slices(folder: &Path) -> Result<Vec<Slice>> {
     }
     let place = folder.display().to_string();
     if series.len() > 1 {
-        let list: Vec<String> = series
-            .iter()
-            .map(|(uid, s)| format!("{uid} ({}, {} {})", s[0].about, s.len(), plural(s.len(), "file")))
-            .collect();
+        let list: Vec<String> =
+            series.iter().map(|(uid, s)| format!("{uid} ({}, {})", s[0].about, counted(s.len(), "file"))).collect();
         let expected = "one series: move the others to folders of their own";
         return Err(Error::invalid(place, "SeriesInstanceUID", list.join("; "), expected));
     }
     let Some(slices) = series.into_values().next() else {
         foreign::refuse_folder(folder)?;
-        let found = format!("none among {others} {} (subfolders are not searched)", plural(others, "file"));
+        let found = format!("none among {} (subfolders are not searched)", counted(others, "file"));
         return Err(Error::invalid(place, "DICOM slices", found, "the files of one series"));
     };
     Ok(slices)

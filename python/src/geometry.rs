@@ -7,7 +7,7 @@ use conefield_core::Error;
 use conefield_core::error::ensure;
 use conefield_core::geometry::{self, Radians, Vec3, View, VoxelGrid};
 use conefield_core::orbit::{self, CircularOrbit};
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use ndarray::Array2;
 use numpy::{PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
@@ -147,8 +147,8 @@ impl Geometry {
 
     fn __repr__(&self) -> String {
         let (g, [rows, columns], [x, y, z]) = (&self.0, self.0.detector, self.0.volume.shape);
-        let (n, views) = (g.views.len(), plural(g.views.len(), "view"));
-        format!("Geometry({n} {views} of {rows} x {columns}, volume {x} x {y} x {z})")
+        let views = counted(g.views.len(), "view");
+        format!("Geometry({views} of {rows} x {columns}, volume {x} x {y} x {z})")
     }
 
     /// For pickling, as used by multiprocessing.

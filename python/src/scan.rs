@@ -11,7 +11,7 @@ use conefield::simulation::{self, Changes};
 use conefield::{files, input};
 use conefield_core::error::ensure;
 use conefield_core::scan::{self, Unit, Volume};
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_projectors::simulate::DetectorNoise;
 use conefield_scans::diagnosis::survey;
 use numpy::{PyArray3, PyReadonlyArray3};
@@ -176,8 +176,8 @@ impl Scan {
         let h = self.scan.header();
         let ([rows, columns], [x, y, z]) = (h.detector, h.volume);
         let unit = &self.scan.unit.name;
-        let views = plural(h.views, "view");
-        format!("Scan({} {views} of {rows} x {columns}, volume {x} x {y} x {z}, unit {unit:?})", h.views)
+        let views = counted(h.views, "view");
+        format!("Scan({views} of {rows} x {columns}, volume {x} x {y} x {z}, unit {unit:?})")
     }
 }
 
@@ -232,14 +232,14 @@ pub fn simulate(
         if let Some(geometry) = geometry {
             let expected = "1 with a geometry: the volume is taken as it stands";
             ensure(wanted.downsample == 1, "arguments", "downsample", wanted.downsample, expected)?;
-            let volume = values.attenuation(volume)?;
+            let volume = values.attenuation(&wanted.source, volume)?;
             let noise = noise.unwrap_or(DetectorNoise::None);
             let scan = simulation::scan_in(&volume, geometry, noise, wanted.seed.unwrap_or(0))?;
             // The volume is the truth only on the reconstructed voxels.
             let same = scan.geometry.volume == volume.grid;
             return Ok((scan, same.then_some(volume)));
         }
-        let volume = simulation::prepared(volume, values, wanted.downsample)?;
+        let volume = simulation::prepared(&wanted.source, volume, values, wanted.downsample)?;
         let changes = Changes {
             views: wanted.views,
             detector: wanted.detector,

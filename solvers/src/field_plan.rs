@@ -30,7 +30,7 @@ use conefield_core::scan::{Scan, ScanHeader};
 use conefield_core::scene::Scene;
 use conefield_core::settings::{Initializer, InitializerSpec, LossSpec};
 use conefield_core::trained::{Placement, TrainedField};
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_fields::initializers::mci::Mci;
 use conefield_fields::initializers::random::Random;
 use conefield_fields::initializers::volume::FromVolume;
@@ -306,7 +306,7 @@ impl FieldPlan {
         {
             let learning = (&self.parts.optimizer, &self.pretraining);
             learn(learning, exe.as_mut(), &mut model, (&volume, scene), steps, job, observer)?;
-            observer.note(&format!("learned {from} in {steps} {}", plural(steps, "step")));
+            observer.note(&format!("learned {from} in {}", counted(steps, "step")));
         }
         Ok((model, exe))
     }

@@ -66,6 +66,8 @@ faults! {
         Coarse: "single precision: outputs";
         /// Calls leave a trace that later calls see.
         Remembers: "threads";
+        /// Calls at the same time share a number.
+        Shares: "threads";
         /// Ranges overlap.
         Overlap: "partition";
         /// Ranges leave a gap.
@@ -127,6 +129,7 @@ impl<R: Real> Kernel<R> for Toy {
                     Fault::SpreadsNan => v += everything * R::ZERO,
                     Fault::TileSize => v += R::of(rows as f64 * 1e-6),
                     Fault::Remembers => v += R::of(f64::from(calls()) * 1e-6),
+                    Fault::Shares => v = shared(0, v),
                     Fault::Overflows => v = v * v / (v + R::of(1e-9)),
                     Fault::Coarse if size_of::<R>() == 4 => v = R::of((v.f64() * 1e3).round() * 1e-3),
                     _ => {}
@@ -283,6 +286,15 @@ fn calls() -> u32 {
     CALLS.fetch_add(1, Ordering::Relaxed)
 }
 
+/// `v` by way of a number that all threads share, one for each kind of stage.
+fn shared<R: Real>(kind: usize, v: R) -> R {
+    static SHARED: [AtomicU64; 5] = [const { AtomicU64::new(0) }; 5];
+    SHARED[kind].store(v.f64().to_bits(), Ordering::Relaxed);
+    // On one core, too, another thread has its turn in between.
+    std::thread::yield_now();
+    R::of(f64::from_bits(SHARED[kind].load(Ordering::Relaxed)))
+}
+
 /// Quiets the panics that a fault causes on purpose.
 fn quietly<T>(f: impl FnOnce() -> T) -> T {
     std::panic::set_hook(Box::new(|_| {}));
@@ -363,6 +375,8 @@ faults! {
         OverwritesVoxels: only "adjoint adds";
         /// The result depends on the number of threads.
         Threads: only "threads";
+        /// Calls at the same time share a number.
+        Shares: only "threads";
         /// Every ray gives a little.
         Leaks: "rays that miss";
         /// Small line integrals are rounded away.
@@ -386,6 +400,7 @@ impl<R: Real> VoxelOperator<R> for VoxelFault {
                 Self::Longer => *x *= R::of(1.02),
                 Self::AddsLines => *x += before.as_slice().map_or(R::ZERO, |b| b[i]),
                 Self::Threads if many => *x *= R::of(1.0 + 1e-6),
+                Self::Shares if i < 16 => *x = shared(1, *x),
                 Self::Leaks => *x += R::of(1e-12),
                 Self::Rounds => *x = R::of((x.f64() * 1e3).round() / 1e3),
                 Self::NotANumber => *x = *x * *x / *x,
@@ -446,6 +461,8 @@ faults! {
         Clears: "samples add";
         /// Samples depend on the call.
         Remembers: "repeatable";
+        /// Calls at the same time share a number.
+        Shares: only "threads";
         /// A ray that misses the box gets a sample.
         SeesAir: "rays that miss";
         /// Lengths are 1 % too long.
@@ -485,6 +502,9 @@ impl Projector for ToyRays {
         let mut delta = (far - near) / n.max(1) as f32;
         if self.fault == RayFault::Longer {
             delta *= 1.01;
+        }
+        if self.fault == RayFault::Shares {
+            delta = shared(2, delta);
         }
         for i in 0..n {
             let shift = if self.fault == RayFault::Remembers { (calls() % 7) as f32 * 1e-3 } else { 0.0 };
@@ -545,6 +565,8 @@ faults! {
         Silent: "leaves the rest alone";
         /// A block is missing in its report.
         Forgets: "applies";
+        /// The last number of a block is left as it was.
+        Skips: only "fills";
         /// One number is infinite.
         Infinite: "finite";
         /// Numbers depend on the call.
@@ -561,7 +583,8 @@ impl Initializer for WeightFault {
         for b in &layout.blocks {
             let own = b.name.starts_with("field");
             if own || (*self == Self::Silent && b.name.starts_with("normalizers")) {
-                arena.params[b.range.clone()].fill(0.25);
+                let skipped = usize::from(*self == Self::Skips);
+                arena.params[b.range.start..b.range.end - skipped].fill(0.25);
             }
             if own && *self == Self::Infinite {
                 arena.params[b.range.start] = f32::INFINITY;
@@ -603,6 +626,8 @@ faults! {
         HidesNan: "poison";
         /// The result depends on the call.
         Remembers: "repeatable";
+        /// Calls at the same time share a number.
+        Shares: only "threads";
         /// It learns and does not say that it needs a scan.
         Secret: "learns from a scan";
         /// It says that it needs a scan and learns nothing.
@@ -641,6 +666,7 @@ impl Loss for ToyLoss {
             LossFault::Overflows => (value * value.powi(4) / value.powi(4), slope),
             LossFault::HidesNan if predicted.is_nan() => (0.0, 0.0),
             LossFault::Remembers => (value * (1.0 + f64::from(calls() % 1000) * 1e-12), slope),
+            LossFault::Shares => (shared(3, value), slope),
             LossFault::Panics => panic!("as ordered"),
             _ => (value, slope),
         }
@@ -699,6 +725,8 @@ faults! {
         HidesNan: "poison";
         /// The result depends on the call.
         Remembers: "repeatable";
+        /// Calls at the same time share a number.
+        Shares: only "threads";
         /// Blocks of one point.
         NoBlocks: "blocks";
         /// It says that something went wrong.
@@ -735,6 +763,7 @@ impl Prior for ToyPrior {
             sum += match self.fault {
                 PriorFault::Overflows => 0.5 * v * v * (v.powi(12) + 1.0) / (v.powi(12) + 1.0),
                 PriorFault::ScalesPenalty => 0.5 * v * v * scale,
+                PriorFault::Shares => shared(4, 0.5 * v * v),
                 PriorFault::Remembers => 0.5 * v * v * (1.0 + f64::from(calls() % 1000) * 1e-12),
                 _ => 0.5 * v * v,
             };

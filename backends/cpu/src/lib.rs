@@ -17,7 +17,7 @@ use conefield_core::error::{Error, Result};
 use conefield_core::pipeline::{Model, Pipeline};
 use conefield_core::simd;
 use conefield_core::stage::{GradKind, Samples, TILE_ROWS, UnitRay, titled};
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use rayon::prelude::*;
 use rows::{Belong, Encoded, Kernels, Scratch};
 use step::Slots;
@@ -44,8 +44,7 @@ impl Backend for Cpu {
     }
 
     fn describe(&self) -> String {
-        let n = rayon::current_num_threads();
-        format!("cpu, {}, {n} {}", simd::level_name(), plural(n, "thread"))
+        format!("cpu, {}, {}", simd::level_name(), counted(rayon::current_num_threads(), "thread"))
     }
 
     fn compile(&self, pipeline: &Pipeline) -> Result<(Box<dyn Executable>, Explain)> {

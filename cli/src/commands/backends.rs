@@ -30,9 +30,9 @@ impl BackendsArgs {
             let wgpu = json!({ "name": "wgpu", "adapters": adapters });
             return out::json(&json!({ "backends": [cpu, wgpu] }));
         }
-        let cores = out::plural(threads, "thread");
+        let threads = out::counted(threads, "thread");
         let mut lines =
-            vec![format!("cpu     {level}, {threads} {cores}, {pass_s:.3} s per pass of the standard reconstruction")];
+            vec![format!("cpu     {level}, {threads}, {pass_s:.3} s per pass of the standard reconstruction")];
         if adapters.is_empty() {
             lines.push("wgpu    no Vulkan, Metal or DX12 adapter was found".into());
         }

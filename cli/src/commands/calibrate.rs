@@ -92,9 +92,8 @@ impl CalibrateArgs {
         }
         if let Some(output) = &self.output {
             if let Some(test) = test {
-                let n = test.geometry.views.len();
-                let views = out::plural(n, "test view");
-                tracing::warn!("{}: left out: {n} {views}, which this format cannot hold", output.display());
+                let views = out::counted(test.geometry.views.len(), "test view");
+                tracing::warn!("{}: left out: {views}, which this format cannot hold", output.display());
             }
             conefield_io::write_scan(output, &corrected, volume.as_ref())?;
         }

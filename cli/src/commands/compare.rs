@@ -139,8 +139,8 @@ impl CompareArgs {
         match failed.len() {
             0 => Ok(()),
             n => {
-                let all = methods.len();
-                let why = format!("{n} of {all} {} failed: {}", out::plural(all, "method"), failed.join(", "));
+                let all = out::counted(methods.len(), "method");
+                let why = format!("{n} of {all} failed: {}", failed.join(", "));
                 Err(Error::unsupported("compare", why))
             }
         }
@@ -266,7 +266,7 @@ impl Shared<'_> {
         let mut parts = vec![self.scan.line()];
         match self.held_out_views.len() {
             0 => {}
-            n => parts.push(format!("{n} {} held out", out::plural(n, "view"))),
+            n => parts.push(format!("{} held out", out::counted(n, "view"))),
         }
         parts.extend(self.reference.as_ref().map(|r| format!("reference {r}, peak {}", self.peak)));
         parts.extend(self.limits.steps.map(|n| format!("{} {}", out::number(n), out::plural(n, "step"))));

@@ -92,7 +92,7 @@ impl ConvertArgs {
             let mut volume = &self.values.apply(volume)?;
             // Hounsfield units, converted once more, would be nonsense that looks like a volume.
             if self.units.hu.as_ref().is_some_and(|how| *how != How::Already) {
-                parse::must_be_attenuation(volume)?;
+                parse::must_be_attenuation(&self.input.display().to_string(), volume)?;
             }
             let unit = match self.values {
                 _ if self.units.hu.is_none() => None,
@@ -151,8 +151,8 @@ impl ConvertArgs {
     fn warn_of_lost(&self, data: &DataSet) {
         let lost = |what: String| tracing::warn!("{}: {what}", self.output.display());
         if let Some(test) = data.test.as_ref().filter(|_| matches!(self.to, ScanFormat::Conefield | ScanFormat::Rtk)) {
-            let n = test.geometry.views.len();
-            lost(format!("left out: {n} {}, which r2 and naf can hold", out::plural(n, "test view")));
+            let views = out::counted(test.geometry.views.len(), "test view");
+            lost(format!("left out: {views}, which r2 and naf can hold"));
         }
         if data.volume.is_some() && self.to == ScanFormat::Rtk {
             lost("the true volume is left out: RTK's format cannot hold it".into());

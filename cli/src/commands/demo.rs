@@ -85,7 +85,7 @@ impl DemoArgs {
             .with_views(self.views.into())
             .with_noise(noise, self.seed);
         conefield_io::write_scan(folder.join(SCAN), &simulate(&truth, &protocol)?, Some(&truth))?;
-        let views = format!("{} {}", self.views, out::plural(self.views, "view"));
+        let views = out::counted(self.views, "view");
         info!("simulated {views} of {0} x {0} pixels", 2 * size);
         let path = folder.join("fast.safetensors");
         conefield_io::write_atomic(&path, &mut |w| w.write_all(specs::FAST_WEIGHTS).map_err(|e| Error::io(&path, e)))?;

@@ -175,8 +175,8 @@ fn dice_lines(d: &Dice) -> String {
     let mut all = match d.labels.len() {
         0 => format!("mean dice  {mean}"),
         n => {
-            let labels = out::plural(n, "label");
-            format!("{}\nmean dice of {n} {labels}  {mean}", out::table(&rows, &[0, 1, 2, 3]))
+            let labels = out::counted(n, "label");
+            format!("{}\nmean dice of {labels}  {mean}", out::table(&rows, &[0, 1, 2, 3]))
         }
     };
     for (where_, labels) in [("volume", &d.only_in_result), ("reference", &d.only_in_reference)] {

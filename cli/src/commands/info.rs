@@ -259,10 +259,9 @@ fn title(path: &Path, s: &Scan, survey: &Survey) -> String {
     let setup = &survey.setup;
     let g = &s.geometry;
     format!(
-        "{}: {} {}, detector {} x {}, {}; {:.1} % of the volume covered",
+        "{}: {}, detector {} x {}, {}; {:.1} % of the volume covered",
         name.unwrap_or_default(),
-        g.views.len(),
-        out::plural(g.views.len(), "view"),
+        out::counted(g.views.len(), "view"),
         g.detector[0],
         g.detector[1],
         if g.is_parallel(0) {

@@ -60,7 +60,7 @@ impl PretrainArgs {
         let mut plan = method::plan(&loaded, backend.as_ref())?;
         let voxels: Vec<u64> = self.volumes.iter().map(|v| files::voxels(v)).collect::<Result<_>>()?;
         pretraining::check_memory(&voxels, &plan.outline())?;
-        let read = |name: &String| self.values.attenuation(files::volume(name)?);
+        let read = |name: &String| self.values.attenuation(name, files::volume(name)?);
         let volumes: Vec<Volume> = self.volumes.iter().map(read).collect::<Result<_>>()?;
         let job =
             PretrainJob { volumes: &volumes, backend: backend.as_ref(), seed: self.seed, limits: self.ends.limits() };
@@ -78,12 +78,11 @@ impl PretrainArgs {
             }));
         }
         out::say(&format!(
-            "{}: {} tensors, {} parameters, after {} {} in {}{}",
+            "{}: {} tensors, {} parameters, after {} in {}{}",
             self.output.display(),
             weights.tensors.len(),
             out::number(numbers as u64),
-            last.step,
-            out::plural(last.step, "step"),
+            out::counted(last.step, "step"),
             out::duration(last.seconds),
             last.loss.map_or(String::new(), |l| format!(", loss {l:.3e}")),
         ))

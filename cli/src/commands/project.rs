@@ -69,7 +69,7 @@ impl ProjectArgs {
         memory.check()?;
 
         let volume = conefield_io::read_volume(&self.volume)?;
-        parse::must_be_attenuation(&volume)?;
+        parse::must_be_attenuation(&self.volume.display().to_string(), &volume)?;
         let (scan, chosen) = self.chosen(files::scan(&self.like)?)?;
         let mut geometry = scan.geometry.clone();
         // Of the readable formats only NumPy arrays have no affine.
@@ -127,10 +127,10 @@ impl ProjectArgs {
         let worst = chosen.iter().zip(residual.views.iter().copied()).max_by(|a, b| a.1.total_cmp(&b.1));
         let worst = worst.map_or(String::new(), |(v, rms)| format!(", {rms:.5} in view {v}, the worst"));
         out::say(&format!(
-            "{}: {n} {} of {rows} x {columns} in {}\nmeasured minus predicted: root mean square {:.5}, {:.5} of the \
+            "{}: {} of {rows} x {columns} in {}\nmeasured minus predicted: root mean square {:.5}, {:.5} of the \
              largest line integral{worst}",
             self.output.display(),
-            out::plural(n, "view"),
+            out::counted(n, "view"),
             out::duration(project_s),
             residual.rms,
             residual.relative,

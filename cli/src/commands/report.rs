@@ -114,13 +114,12 @@ impl ReportArgs {
                 "warnings": page.warnings.iter().map(|w| &w.found).collect::<Vec<_>>(),
             }));
         }
-        let count = |n: usize, what: &str| format!("{n} {}", out::plural(n, what));
         let mut lines = vec![format!(
             "{}: {}, {}, {} in {}",
             self.output.display(),
-            count(page.runs.len(), "run"),
-            count(page.volumes.len(), "volume"),
-            count(views.len(), "view"),
+            out::counted(page.runs.len(), "run"),
+            out::counted(page.volumes.len(), "volume"),
+            out::counted(views.len(), "view"),
             out::bytes(bytes),
         )];
         if coarser > 1 {

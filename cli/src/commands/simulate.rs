@@ -104,7 +104,8 @@ impl SimulateArgs {
         Inputs::of([&self.volume, &self.protocol]).and(angles).spare_folder(&self.output)?;
         let before = files::voxels(&self.volume)?;
         Memory::of_volumes(&[before]).check()?;
-        let volume = simulation::prepared(files::volume(&self.volume)?, self.values, self.downsample.into())?;
+        let volume = files::volume(&self.volume)?;
+        let volume = simulation::prepared(&self.volume, volume, self.values, self.downsample.into())?;
         let set_up = self.set_up.protocol(self.detector, &volume.grid);
         let changes = Changes {
             views: self.views.map(|n| n as usize),
@@ -137,10 +138,9 @@ impl SimulateArgs {
         }
         let ([rows, columns], [x, y, z]) = (g.detector, g.volume.shape);
         out::say(&format!(
-            "{}: {} {} of {rows} x {columns}, of {x} x {y} x {z} voxels, noise {}",
+            "{}: {} of {rows} x {columns}, of {x} x {y} x {z} voxels, noise {}",
             self.output.display(),
-            g.views.len(),
-            out::plural(g.views.len(), "view"),
+            out::counted(g.views.len(), "view"),
             protocol.noise,
         ))
     }

@@ -154,9 +154,8 @@ impl StudyArgs {
             out::json(&json!({ "done": done, "failed": failed, "table": null }))?;
         } else {
             out::say(&format!(
-                "{done} of {} {} of this share done; the last share to finish writes the table",
-                cells.len(),
-                out::plural(cells.len(), "run")
+                "{done} of {} of this share done; the last share to finish writes the table",
+                out::counted(cells.len(), "run")
             ))?;
         }
         refuse_failures(&failed, cells.len())
@@ -180,8 +179,8 @@ impl StudyArgs {
         };
         refuse_existing(file, self.force)?;
         conefield_io::write_text_atomic(file, &jobs.script()?)?;
-        let (jobs, all) = (out::plural(count, "job"), out::plural(runs, "run"));
-        out::say(&format!("{0}: {count} {jobs} for {runs} {all}; sbatch {0} submits the script", file.display()))
+        let (jobs, all) = (out::counted(count, "job"), out::counted(runs, "run"));
+        out::say(&format!("{0}: {jobs} for {all}; sbatch {0} submits the script", file.display()))
     }
 }
 
@@ -190,7 +189,7 @@ fn refuse_failures(failed: &[String], all: usize) -> Result<()> {
     match failed.len() {
         0 => Ok(()),
         n => {
-            let why = format!("{n} of {all} {} failed, the first: {}", out::plural(all, "run"), failed[0]);
+            let why = format!("{n} of {} failed, the first: {}", out::counted(all, "run"), failed[0]);
             Err(Error::unsupported("study", why))
         }
     }

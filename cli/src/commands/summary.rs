@@ -14,10 +14,9 @@ pub fn summary(r: &RunRecord, output: &Path) -> String {
     let speed = r.samples_per_s.map(|s| format!(" ({:.2} M samples/s)", s / 1e6)).unwrap_or_default();
     let used = views - r.held_out_views.len();
     let mut lines = vec![format!(
-        "{x} x {y} x {z} voxels from {used} {}: {} {} in {}{speed}, export {}",
-        out::plural(used, "view"),
-        r.steps,
-        out::plural(r.steps, "step"),
+        "{x} x {y} x {z} voxels from {}: {} in {}{speed}, export {}",
+        out::counted(used, "view"),
+        out::counted(r.steps, "step"),
         out::duration(r.train_s),
         out::duration(r.written.export_s),
     )];
@@ -41,8 +40,8 @@ pub fn summary(r: &RunRecord, output: &Path) -> String {
             r.best_step.map_or(String::new(), |n| format!(", the smallest: the state after step {n} is the result"));
         let views = r.held_out_views.len();
         lines.push(format!(
-            "held-out error  {h:.5} of the largest line integral ({views} {}){best}",
-            out::plural(views, "view")
+            "held-out error  {h:.5} of the largest line integral ({}){best}",
+            out::counted(views, "view")
         ));
     }
     if let Some(s) = &r.written.scores {

@@ -61,7 +61,7 @@ pub fn cases() -> Vec<Case> {
         "axes that are not at right angles", changed(nifti, "a.nii", at(284, 0.75f32.to_le_bytes())),
             INFO, ["x and y of the voxels are at 45.00 degrees"].ends(End::Warned);
         "Hounsfield units in place of attenuation", changed(nifti, "a.nii", at(352, (-1000f32).to_le_bytes())),
-            "simulate a.nii -o scan", ["-1000 to", "Hounsfield units", "hu:0.02"];
+            "simulate a.nii -o scan", ["a.nii: values: found -1000 to", "Hounsfield units", "hu:0.02"];
         "a slope that is NaN", changed(nifti, "a.nii", at(112, f32::NAN.to_le_bytes())),
             INFO, ["scl_slope"].ends(End::Warned);
         "gzip, cut in the middle", changed(nifti_gz, "a.nii.gz", cut(60)), INFO_GZ, ["a.nii.gz", "gzip"];

@@ -100,7 +100,7 @@ fn hounsfield_units_without_a_unit_or_a_calibration_are_refused() {
     d.done("convert other/a.nii.gz a.nii");
     d.refused_with(1, "reconstruct scan --spec fdk -o run --hu 60keV", &["unit: found \"cube half side\"", "regions"]);
     let empty = "reconstruct scan --spec fdk -o run --hu water=box:90,90,90,99,99,99,air=0";
-    d.refuses("run", &[(empty, "without a voxel")]);
+    d.refuses("run", &[(empty, "found box:90,90,90,99,99,99 without a voxel")]);
     let convert = |hu: &str| format!("convert scan/truth.nii.gz b.nii --hu {hu}");
     d.refuses(
         "b.nii",

@@ -180,6 +180,7 @@ const ENCODER_FAULTS: &[Fault] = faults! {
         ["", "extremes", "training diverged"];
     fault "fails after a hundred calls", before "float *to =", FAILS_AT_LAST,
         ["", "no fault", "forward failed: no more numbers"];
+    fault "ends the process", before "float *to =", "exit(0); ", ["", ENDED, ENDED];
     fault "calls abort", before "float *to =", "abort(); ", ["", "crashed the checking process (signal 6)", ABORTED];
 };
 
@@ -355,6 +356,9 @@ const BASIS_FAULTS: &[Fault] = faults! {
     fault "a basis that fails later", before EXPAND, FAILS_LATER, ["", "no fault", "expand failed: no more numbers"];
 };
 
+/// Of a plugin that calls `exit(0)`.
+const ENDED: &str = "a plugin ended the process";
+
 /// No process survives this fault.
 const ABORTED: &str = "(the process is gone)";
 
@@ -489,6 +493,19 @@ fn numbers_that_are_not_finite_at_an_edge_are_found_and_the_run_names_the_stage(
     let ran = said(&d, &format!("--plugin {library} reconstruct scan -o run {sets}"), &[]);
     let named = "the first stage whose output is not finite: encoder (";
     assert!(ran.contains("training diverged") && ran.contains(named), "{ran}");
+}
+
+#[test]
+fn more_parameters_than_memory_holds_are_refused_before_memory_is_taken() {
+    let d = Folder::after(&[SCAN]);
+    sound(&d, "encoder");
+    let kind = Kind { more: instead(".shape = {3, (size_t)bands}", ".shape = {1, (size_t)1 << 38}"), ..KINDS[0] };
+    let library = text(&edited(&d, &kind, instead(".params = n", ".params = (size_t)1 << 38"), &d.at("plugin")));
+    let run = "reconstruct scan -o run --spec fast --set encoder.type=faulty";
+    for line in [format!("plugins check {library}"), format!("--plugin {library} {run}")] {
+        let found = said(&d, &format!("--memory 4GiB {line}"), &[]);
+        assert!(found.contains("parameters: found 2097152 MiB more"), "{line}: {found:?}");
+    }
 }
 
 /// A message up to its required part: the rest may depend on the number of threads.

@@ -87,7 +87,7 @@ fn four(x: f64) -> String {
 
 /// The columns of a table of runs: scores if there is a reference, else the error of held-out views, else the loss, which
 /// is the least informative; then time and memory.
-pub struct Columns(Vec<&'static Column>);
+pub struct Columns(pub(super) Vec<&'static Column>);
 
 impl Columns {
     /// The columns for runs with a reference, or with held-out views.

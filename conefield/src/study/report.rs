@@ -10,7 +10,7 @@ use crate::tradeoff::json::to_json;
 use crate::tradeoff::statistics::mean;
 use crate::tradeoff::trial::TrialInput;
 use conefield_core::Result;
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_evaluation::report::Table;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -82,13 +82,12 @@ impl CaseRecord {
     }
 
     fn line(&self) -> String {
-        let (views, [rows, columns], [x, y, z]) = (self.views, self.detector, self.shape);
+        let (views, [rows, columns], [x, y, z]) = (counted(self.views, "view"), self.detector, self.shape);
         let from = self.volume.as_ref().or(self.scan.as_ref()).map_or("", |s| s);
         let reference =
             self.reference.as_ref().map_or(String::new(), |r| format!("; reference {r}, peak {}", self.peak));
         let noise = self.noise.as_ref().map_or(String::new(), |n| format!("; noise {n}"));
-        let of = plural(views, "view");
-        format!("{from}: {views} {of} of {rows} x {columns} pixels, {x} x {y} x {z} voxels{noise}{reference}")
+        format!("{from}: {views} of {rows} x {columns} pixels, {x} x {y} x {z} voxels{noise}{reference}")
     }
 }
 
@@ -233,16 +232,11 @@ impl<'a> StudyReport<'a> {
 
     fn table(&self, case: &str) -> Table {
         let lines: Vec<&Line> = self.summary.iter().filter(|l| l.case == case).collect();
-        // Omits figures that no method has; the loss is only informative if there is no better figure.
         let any = |key: &str| lines.iter().any(|l| l.figures.contains_key(key));
-        let (scores, held_out) = (any("psnr"), any("held_out"));
-        let columns: Vec<&Column> = COLUMNS
-            .iter()
-            .filter(|c| match c.key {
-                "loss" => !scores && !held_out,
-                key => any(key),
-            })
-            .collect();
+        let scores = any("psnr");
+        // Omits figures that no method has.
+        let mut columns = Columns::of(scores, any("held_out")).0;
+        columns.retain(|c| any(c.key));
         let against = self.baseline;
         let compared = columns.iter().filter(|c| match c.key {
             "psnr" | "ssim_2d" | "total_s" => true,

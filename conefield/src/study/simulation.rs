@@ -99,7 +99,7 @@ impl Simulation {
     /// The volume to scan.
     fn prepared(&self) -> Result<Volume> {
         Memory::of_volumes(&[files::voxels(&self.volume)?]).check()?;
-        simulation::prepared(files::volume(&self.volume)?, self.values, self.downsample)
+        simulation::prepared(&self.volume, files::volume(&self.volume)?, self.values, self.downsample)
     }
 
     fn protocol(&self, grid: &VoxelGrid, seed: u64) -> Result<Protocol> {

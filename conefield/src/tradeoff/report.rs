@@ -11,7 +11,7 @@ use crate::tradeoff::search::{FILES, FOLDERS, Over, Rung, Search};
 use crate::tradeoff::statistics::{mean, spearman};
 use crate::tradeoff::trial::Figures;
 use conefield_core::spec::load::to_toml;
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_core::{Error, Result};
 use conefield_evaluation::report::text::{bytes, duration, number};
 use conefield_evaluation::report::{CurveOptions, Panel, Table, panels_png};
@@ -263,7 +263,7 @@ impl TradeoffReport {
                 format!("{}: {} tried, {} advanced", duration(rung.budget_s), rung.tried.len(), rung.kept.len());
             for (n, what) in [(short, "had too little time"), (failed, "failed")] {
                 if n > 0 {
-                    line += &format!(", {n} {} {what}", plural(n, "trial"));
+                    line += &format!(", {} {what}", counted(n, "trial"));
                 }
             }
             notes.push(line);

@@ -76,15 +76,19 @@ impl<'a> Context<'a> {
         let target = schema["$ref"].as_str().and_then(|r| self.root.pointer(r.trim_start_matches('#')));
         target.unwrap_or(schema)
     }
+
+    /// The kind of the stage that a setting is, if it is one. A table with a `type` where any value may stand is a stage
+    /// of the kind that it belongs to.
+    pub(super) fn nested(&self, schema: &Value, typed: bool) -> Option<Kind> {
+        let open = || self.kind.filter(|_| typed && is_open(schema));
+        schema[NESTED].as_str().and_then(Kind::named).or_else(open)
+    }
 }
 
 /// Checks a value against the schema of its setting.
 fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<()> {
     let schema = cx.resolve(schema);
-    if let Some(kind) = schema[NESTED].as_str().and_then(Kind::named) {
-        return stage(node, kind, path);
-    }
-    if let (Some(kind), true, true) = (cx.kind, is_open(schema), node.get("type").is_some()) {
+    if let Some(kind) = cx.nested(schema, node.get("type").is_some()) {
         return stage(node, kind, path);
     }
     one_of::check(node, schema, cx, path)?;
@@ -96,9 +100,14 @@ fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<
             return Ok(());
         }
         // If only one choice has this value's shape, its own message says more.
-        let mut alike = choices.iter().filter(|s| shape_fits(node, s) && s["const"].is_null() && s["enum"].is_null());
-        return match (alike.next(), alike.next()) {
-            (Some(one), None) => setting(node, one, cx, path),
+        let alike = |s: &Value| shape_fits(node, s) && s["const"].is_null() && s["enum"].is_null();
+        let mut alike: Vec<&Value> = choices.into_iter().filter(|s| alike(s)).collect();
+        if alike.len() > 1 {
+            // Tables differ in their keys.
+            alike.retain(|s| node.entries().iter().any(|e| !s["properties"][&e.key].is_null()));
+        }
+        return match alike[..] {
+            [one] => setting(node, one, cx, path),
             _ => Err(misnamed(node, path, &constants(schema, cx)).unwrap_or_else(wrong)),
         };
     }
@@ -116,9 +125,10 @@ fn setting(node: &Node, schema: &Value, cx: &Context<'_>, path: &str) -> Result<
     match &node.kind {
         Is::Number(n) => {
             let x = n.as_f64().unwrap_or(f64::NAN);
-            let low = schema["minimum"].as_f64().is_none_or(|m| x >= m);
-            let high = schema["maximum"].as_f64().is_none_or(|m| x <= m);
-            if low && high { Ok(()) } else { Err(wrong()) }
+            let fits = |key: &str, fits: fn(&f64, &f64) -> bool| schema[key].as_f64().is_none_or(|m| fits(&x, &m));
+            let within = fits("minimum", f64::ge) && fits("maximum", f64::le);
+            let inside = fits("exclusiveMinimum", f64::gt) && fits("exclusiveMaximum", f64::lt);
+            if within && inside { Ok(()) } else { Err(wrong()) }
         }
         Is::Array(items) => {
             let n = items.len() as u64;
@@ -274,4 +284,36 @@ fn misnamed(node: &Node, path: &str, allowed: &[Value]) -> Option<Error> {
 
 pub(super) fn join(path: &str, key: &str) -> String {
     if path.is_empty() { key.into() } else { format!("{path}.{key}") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn an_error_names_the_limits_of_a_number_and_the_one_table_that_is_meant() {
+        let table = |key: &str| {
+            let number = json!({ "type": "number" });
+            json!({ "type": "object", "properties": { key: number }, "additionalProperties": false })
+        };
+        let schema = json!({ "properties": {
+            "share": { "type": "number", "exclusiveMinimum": 0, "maximum": 1 },
+            "count": { "type": "integer", "minimum": 0, "exclusiveMaximum": 8 },
+            "weight": { "oneOf": [table("fixed"), table("noise")] },
+        } });
+        for (text, want) in [
+            ("share = 1\ncount = 0\nweight.noise = 2", ""),
+            ("share = 0", "share: found 0, expected a number above 0 and of at most 1"),
+            ("share = 1.5", "share: found 1.5, expected a number above 0 and of at most 1"),
+            ("count = 8", "count: found 8, expected a whole number of at least 0 and below 8"),
+            ("weight.noise = 'much'", "weight.noise: found the text \"much\", expected a number"),
+            ("weight.often = 1", "weight: found a table of often, expected a table of fixed or a table of noise"),
+        ] {
+            let node = parse("s", text, 0).unwrap();
+            let said = object(&node, &schema, &Context::new(&schema, None), "").map_err(|e| e.to_string());
+            let said = said.err().unwrap_or_default();
+            assert!(said.ends_with(want) && said.is_empty() == want.is_empty(), "{text}: {said}");
+        }
+    }
 }

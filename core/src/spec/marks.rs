@@ -1,49 +1,66 @@
-//! Settings that the JSON Schema of their stage marks, whatever their name: files to read, sizes of tables.
+//! What a spec names, by the JSON Schemas of its stages: their types, and the settings that a schema marks, whatever their
+//! name: files to read, sizes of tables.
 
-use crate::registry::stage_types;
+use super::check::Context;
+use crate::registry::{Kind, find};
 use serde_json::Value;
+use std::collections::BTreeSet;
 
 /// A setting: its path, as for `--set`, and its value.
 pub type Setting = (String, Value);
 
-/// Every setting in `tree` whose schema is `marked`: of all tables with a registered `type`, at any depth.
+/// Every setting of the spec `tree` whose schema is `marked`.
 pub fn marked(tree: &Value, marked: &dyn Fn(&Value) -> bool) -> Vec<Setting> {
-    let mut search = Search { marked, found: vec![] };
-    search.stages(tree, "");
-    search.found
+    Search::of(tree, marked).found
+}
+
+/// Kind and name of every type in the spec `tree`.
+pub fn types(tree: &Value) -> BTreeSet<(Kind, String)> {
+    Search::of(tree, &|_| false).types
 }
 
 struct Search<'a> {
     marked: &'a dyn Fn(&Value) -> bool,
     found: Vec<Setting>,
+    types: BTreeSet<(Kind, String)>,
 }
 
-impl Search<'_> {
-    fn stages(&mut self, value: &Value, path: &str) {
-        if let Some(name) = value.get("type").and_then(Value::as_str) {
-            for stage in stage_types().into_iter().filter(|t| t.name == name) {
-                let schema = stage.schema();
-                self.by_schema(value, &schema, &schema, path);
-            }
-        }
-        each(value, path, |_, v, path| self.stages(v, path));
+impl<'a> Search<'a> {
+    fn of(tree: &Value, marked: &'a dyn Fn(&Value) -> bool) -> Self {
+        let mut search = Self { marked, found: vec![], types: BTreeSet::new() };
+        search.stage(tree, Kind::Method, "");
+        search
     }
 
-    /// `root` resolves references of `schema`.
-    fn by_schema(&mut self, value: &Value, schema: &Value, root: &Value, path: &str) {
-        if let Some(target) = schema["$ref"].as_str().and_then(|r| root.pointer(r.trim_start_matches('#'))) {
-            self.by_schema(value, target, root, path);
+    fn stage(&mut self, value: &Value, kind: Kind, path: &str) {
+        let Some(name) = value.get("type").unwrap_or(value).as_str() else { return };
+        self.types.insert((kind, name.into()));
+        if let Some(stage) = find(kind, name) {
+            let schema = stage.schema();
+            self.within(value, &schema, &Context::new(&schema, Some(kind)), path);
         }
-        for choice in ["anyOf", "oneOf", "allOf"].into_iter().filter_map(|key| schema[key].as_array()).flatten() {
-            self.by_schema(value, choice, root, path);
+    }
+
+    fn setting(&mut self, value: &Value, schema: &Value, cx: &Context<'_>, path: &str) {
+        match cx.nested(schema, value.get("type").is_some()) {
+            Some(kind) if schema["$ref"].is_null() => self.stage(value, kind, path),
+            _ => self.within(value, schema, cx, path),
         }
+    }
+
+    fn within(&mut self, value: &Value, schema: &Value, cx: &Context<'_>, path: &str) {
+        let target = Some(cx.resolve(schema)).filter(|target| !std::ptr::eq(*target, schema));
+        let choices = ["anyOf", "oneOf", "allOf"].into_iter().filter_map(|key| schema[key].as_array()).flatten();
+        target.into_iter().chain(choices).for_each(|schema| self.setting(value, schema, cx, path));
         let setting = (path.to_owned(), value.clone());
         if !value.is_null() && (self.marked)(schema) && !self.found.contains(&setting) {
             self.found.push(setting);
         }
         each(value, path, |key, v, path| {
             let inner = key.map_or(&schema["items"], |key| &schema["properties"][key]);
-            self.by_schema(v, inner, root, path);
+            if !inner.is_null() {
+                self.setting(v, inner, cx, path);
+            }
         });
     }
 }
@@ -63,11 +80,11 @@ mod tests {
     use super::*;
     use crate::input_file::FORMAT;
     use crate::registry::{Make, StageType, add};
-    use crate::settings::LossSpec;
+    use crate::settings::{EncoderSpec, LossSpec};
     use serde_json::json;
 
     #[test]
-    fn settings_are_found_under_any_key_by_the_schema_of_their_stage() {
+    fn settings_and_types_are_found_by_the_schemas_of_stages() {
         let file = json!({ "type": ["string", "null"], "format": FORMAT });
         let schema = json!({
             "properties": {
@@ -78,16 +95,24 @@ mod tests {
             },
             "$defs": { "Deep": { "properties": { "file": file } } },
         });
-        let make = Make::new::<dyn LossSpec>(Box::new(|_| Err("this type is never built".into())));
-        add(vec![StageType::loaded("a test", "reads-files".into(), "test".into(), schema, make)]).unwrap();
+        // A loss has the name of the encoder that reads files, and reads none.
+        let make = Make::new::<dyn EncoderSpec>(Box::new(|_| Err("this type is never built".into())));
+        let other = Make::new::<dyn LossSpec>(Box::new(|_| Err("this type is never built".into())));
+        let loaded = |schema, make| StageType::loaded("a test", "reads-files".into(), "test".into(), schema, make);
+        add(vec![loaded(schema, make), loaded(json!({}), other)]).unwrap();
         let stage = json!({
             "type": "reads-files", "atlas": "a.nii", "maps": ["b.npy", "c.npy"], "deep": { "file": "d.mha" }, "note": "e",
         });
-        let tree = json!({ "methods": [{ "loss": stage }, { "type": "unknown", "atlas": "f" }] });
+        let field = json!({ "type": "test-field", "encoder": { "type": "test-stack", "below": stage } });
+        let tree = json!({ "type": "test-chain", "methods": [field, { "type": "unknown", "atlas": "f" }] });
         let mut found = marked(&tree, &|schema| schema["format"] == FORMAT);
         found.sort_unstable_by(|a, b| a.0.cmp(&b.0));
         let want = [("atlas", "a.nii"), ("deep.file", "d.mha"), ("maps.0", "b.npy"), ("maps.1", "c.npy")];
-        let want = want.map(|(path, file)| (format!("methods.0.loss.{path}"), Value::from(file)));
+        let want = want.map(|(path, file)| (format!("methods.0.encoder.below.{path}"), Value::from(file)));
         assert_eq!(found, want);
+        let named = types(&tree);
+        let has = |kind, name: &str| named.contains(&(kind, name.into()));
+        assert!(has(Kind::Method, "test-field") && has(Kind::Encoder, "reads-files"), "{named:?}");
+        assert!(!has(Kind::Loss, "reads-files"), "{named:?}");
     }
 }

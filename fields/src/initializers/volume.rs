@@ -4,7 +4,7 @@
 use conefield_core::input_file::InputFile;
 use conefield_core::prelude::*;
 use conefield_core::settings::KnownVolume;
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 
 /// Settings of `volume`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -54,6 +54,6 @@ impl Initializer for FromVolume {
     }
 
     fn describe(&self) -> String {
-        format!("volume: {} learned in {} {}", self.path, self.steps, plural(self.steps, "step"))
+        format!("volume: {} learned in {}", self.path, counted(self.steps, "step"))
     }
 }

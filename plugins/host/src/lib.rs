@@ -10,6 +10,7 @@
 //! into the search locations, are loaded.
 
 mod examine;
+mod exit;
 pub mod library;
 pub mod search;
 pub mod spec;

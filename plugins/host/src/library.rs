@@ -5,6 +5,7 @@
 #![allow(unsafe_code)]
 
 use crate::examine;
+use crate::exit::inside;
 use conefield_core::error::{Error, Result, ensure};
 use conefield_core::registry::Kind;
 use conefield_plugin_abi::*;
@@ -203,7 +204,7 @@ fn table_of(path: &Path, place: &str) -> Result<*const ConefieldPlugin> {
         return Err(Error::invalid(place, "plugin", found, "a conefield plugin"));
     };
     // SAFETY: as above.
-    let table = unsafe { entry() };
+    let table = inside(|| unsafe { entry() });
     std::mem::forget(library);
     tables.insert(path.into(), table as usize);
     Ok(table)
@@ -283,8 +284,9 @@ impl Type {
         let mut stage = ptr::null_mut();
         let mut error = Text::new();
         // SAFETY: all arguments live during the call.
-        let status =
-            unsafe { (self.create)(self.context, ConefieldStr::of(&settings), width, &mut stage, error.room()) };
+        let status = inside(|| unsafe {
+            (self.create)(self.context, ConefieldStr::of(&settings), width, &mut stage, error.room())
+        });
         if status != CONEFIELD_OK {
             return Err(self.refusal("create", status, &error.text()));
         }

@@ -3,8 +3,8 @@
 use crate::library::Library;
 use crate::spec;
 use conefield_core::error::{Error, Result};
+use conefield_core::spec::marks::types;
 use serde_json::Value;
-use std::collections::BTreeSet;
 use std::env;
 use std::path::{Path, PathBuf};
 
@@ -112,21 +112,8 @@ impl Plugins {
 
     /// The libraries whose types are used by the spec `tree`.
     pub fn used(&self, tree: &Value) -> Vec<&Library> {
-        let mut names = BTreeSet::new();
-        collect_types(tree, &mut names);
-        self.loaded().filter(|l| l.types.iter().any(|t| names.contains(t.name.as_str()))).collect()
-    }
-}
-
-/// The values of every key `type`.
-fn collect_types<'a>(tree: &'a Value, names: &mut BTreeSet<&'a str>) {
-    match tree {
-        Value::Object(map) => {
-            names.extend(map.get("type").and_then(Value::as_str));
-            map.values().for_each(|v| collect_types(v, names));
-        }
-        Value::Array(all) => all.iter().for_each(|v| collect_types(v, names)),
-        _ => {}
+        let types = types(tree);
+        self.loaded().filter(|l| l.types.iter().any(|t| types.contains(&(t.kind, t.name.clone())))).collect()
     }
 }
 

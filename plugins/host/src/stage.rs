@@ -12,6 +12,7 @@ pub mod projector;
 pub mod regularizer;
 
 // The modules of the kinds take these imports by `use super::*`.
+use crate::exit::inside;
 use crate::library::{Handle, Text, Type, text, whole_text};
 use crate::spec::settings;
 use crate::trial::{GUARD, Guarded, Marked, below_zero, drawn, settled, timed};
@@ -84,7 +85,7 @@ impl<F: Copy + 'static> Foreign<F> {
     /// Calls `f` with the stage and a buffer for the reason. Errors name `call`.
     fn run(&self, call: &str, f: impl FnOnce(*mut c_void, *mut ConefieldText) -> ConefieldStatus) -> Result<()> {
         let mut error = Text::new();
-        match f(self.handle.stage, error.room()) {
+        match inside(|| f(self.handle.stage, error.room())) {
             CONEFIELD_OK => Ok(()),
             status => Err(self.ty().failed(call, status, &error.text())),
         }
@@ -144,7 +145,7 @@ impl<F: Copy + 'static> Foreign<F> {
         f: impl FnOnce(*mut c_void, *mut *mut c_void, *mut ConefieldText) -> ConefieldStatus,
     ) -> Result<Option<Handle>> {
         let (mut made, mut error) = (ptr::null_mut(), Text::new());
-        let status = f(self.handle.stage, &mut made, error.room());
+        let status = inside(|| f(self.handle.stage, &mut made, error.room()));
         if status != CONEFIELD_OK {
             return Err(self.ty().refusal(call, status, &error.text()));
         }

@@ -1,7 +1,7 @@
 //! Parses the corrections of a command line.
 
 use crate::corrections::Corrections;
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, written};
 use toml::{Table, Value};
 
 /// The place in errors.
@@ -33,9 +33,13 @@ impl Corrections {
                 return Err(Error::invalid(PLACE, path, found, "each setting once"));
             }
         }
-        let read: Self = all.try_into().map_err(|e: toml::de::Error| {
-            let expected = "corrections and settings as docs/guide/corrections.md has them";
-            Error::invalid(PLACE, "settings", e.message(), expected)
+        let text = toml::to_string(&all).map_err(|e| Error::invalid(PLACE, "settings", e, "TOML"))?;
+        let read: Self = written::read(PLACE, &text).map_err(|mut e| {
+            // Lines and columns of this text say nothing.
+            if let Error::Invalid { place, .. } = &mut e {
+                *place = PLACE.into();
+            }
+            e
         })?;
         read.validate()?;
         Ok(read)
@@ -100,7 +104,11 @@ mod tests {
             (vec!["rings.windows=3"], vec!["windows", "window"]),
             (vec!["rings.window=4"], vec!["rings.window", "4", "odd"]),
             (vec!["rings.window=3", "rings.window=5"], vec!["window", "once"]),
-            (vec!["rings=3"], vec!["settings"]),
+            (
+                vec!["rings.size=3"],
+                vec!["rings.size: found a key that is not known here, expected one of method, window"],
+            ),
+            (vec!["rings=3"], vec!["corrections: rings: found 3, expected a table"]),
             (vec!["rings", "rings=3"], vec!["once"]),
             (vec!["rings..window=3"], vec!["rings..window=3"]),
             (vec!["a.b.c.d.e=1"], vec!["a.b.c.d.e=1"]),

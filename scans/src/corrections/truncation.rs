@@ -7,7 +7,7 @@ use conefield_core::Result;
 use conefield_core::error::ensure;
 use conefield_core::parallel;
 use conefield_core::scan::Scan;
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use ndarray::{Array3, ArrayView2, Axis, s};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_2;
@@ -85,9 +85,7 @@ impl Correct for Truncation {
             (0..3).for_each(|k| view.detector[k] += aside * view.u[k]);
         }
         let sides = if left && right { "on either side" } else { "on the far side" };
-        Ok(format!(
-            "the object reaches the sides of {cut} of {views} {}: {more} columns are added {sides}",
-            plural(views, "view")
-        ))
+        let views = counted(views, "view");
+        Ok(format!("the object reaches the sides of {cut} of {views}: {more} columns are added {sides}"))
     }
 }

@@ -43,7 +43,7 @@ use conefield_core::scene::{Scene, SceneSettings};
 use conefield_core::settings::{LossSpec, PriorSpec};
 use conefield_core::spec::stage as stages;
 use conefield_core::trained::{Placement, TrainedField};
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use control::{Control, DensityControl, Pulls};
 use device::training::DeviceTraining;
 use schemars::JsonSchema;
@@ -198,9 +198,8 @@ impl Method for Gaussians {
         // The field has kernels of its own in place of a fragment.
         let field = StageLine::new("field", "gaussians", parts.pipeline.field.as_ref());
         let stages = vec![StageLine { wgsl: true, ..field }];
-        let views = plural(training.views, "view");
-        let what =
-            format!("{} from the start, {} {views} per step, Adam {}", start.count, training.views, optimizer.lr);
+        let views = counted(training.views, "view");
+        let what = format!("{} from the start, {views} per step, Adam {}", start.count, optimizer.lr);
         let method = Line::new("method", "gaussians", &what);
         parts.kept += self.density_control.map_or(0, |_| DensityControl::bytes(self.most));
         Ok(Box::new(GaussianPlan {

@@ -2,7 +2,7 @@
 
 use conefield_core::error::{Result, ensure};
 use conefield_core::random::stream;
-use conefield_core::words::plural;
+use conefield_core::words::{counted, plural};
 use rand::seq::SliceRandom;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -80,7 +80,7 @@ pub fn summary(subsets: &[Vec<usize>]) -> String {
     let sizes = || subsets.iter().map(Vec::len);
     let (least, most) = (sizes().min().unwrap_or(0), sizes().max().unwrap_or(0));
     let views = if least == most { format!("{most}") } else { format!("{least} or {most}") };
-    format!("{} {} of {views} {}", subsets.len(), plural(subsets.len(), "subset"), plural(most, "view"))
+    format!("{} of {views} {}", counted(subsets.len(), "subset"), plural(most, "view"))
 }
 
 impl Order {

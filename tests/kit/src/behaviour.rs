@@ -1,7 +1,8 @@
 //! Behaviour of a stage with its inputs: sizes, buffers, threads, extreme numbers.
 
 use crate::call::{
-    Before, Guarded, Loaded, Subject, differing, error, none, require, rows_of, settle, skipped, within,
+    Before, CALLERS, Guarded, Loaded, Subject, beside_others, differing, error, none, require, rows_of, settle,
+    skipped, within,
 };
 use crate::{Options, Outcome};
 use conefield_core::arena::{Block, Layout, Weights};
@@ -222,20 +223,13 @@ pub fn guards(of: &Subject<'_>) -> Outcome {
     Ok("on either side of every buffer".into())
 }
 
-/// Concurrent calls from several threads are bit-identical to a single call.
+/// Concurrent calls from several threads, each with rows of its own, are bit-identical to single calls.
 pub fn threads(of: &Subject<'_>) -> Outcome {
     let s = of.single();
-    let n = 100;
-    let (x, dy) = s.data(n);
-    let all = || s.pass(&x, &dy, n).concat();
-    let want = all();
-    let found: Vec<Vec<f32>> = std::thread::scope(|scope| {
-        let started: Vec<_> = (0..4).map(|_| scope.spawn(|| (0..3).map(|_| all()).collect::<Vec<_>>())).collect();
-        started.into_iter().flat_map(|t| t.join().unwrap_or_default()).collect()
-    });
-    let missing = (found.len() != 12).then(|| "a thread panicked".to_string());
-    let complaint = missing.or_else(|| found.iter().find_map(|f| differing("number", f, &want)));
-    settle(complaint, "4 threads, 3 calls each")
+    let (n, all) = (100, 100 * CALLERS);
+    let (x, dy) = s.data(all);
+    let run = |i| s.pass(&rows_of(&x, all, i * n, n), &rows_of(&dy, all, i * n, n), n).concat();
+    settle(beside_others(run, |a, b| differing("number", a, b)), &format!("{CALLERS} threads with {n} rows each"))
 }
 
 /// Finite inputs at the limits of their range give finite outputs, and backward does not panic.

@@ -7,7 +7,8 @@ use conefield_core::simd::Real;
 use conefield_core::stage::{Backward, Grads, Info, Kernel, Stage, Tile, TileMut};
 use rayon::ThreadPoolBuilder;
 use std::ops::Range;
-use std::sync::OnceLock;
+use std::sync::{Barrier, OnceLock};
+use std::time::{Duration, Instant};
 
 /// A sequence of random numbers.
 pub struct Draw(u64, u64);
@@ -273,6 +274,33 @@ pub fn on_threads<T: Send>(
             return Some(format!("no pool of {n} threads"));
         };
         differ(&format!("{n} threads"), &pool.install(&run), &want)
+    })
+}
+
+/// Threads of [`beside_others`].
+pub const CALLERS: usize = 4;
+/// Least calls of each thread, and the time for more: on a busy core, a thread has its turn for some milliseconds.
+const CALLS: usize = 3;
+const TIME: Duration = Duration::from_millis(50);
+
+/// The first difference between results of `run` on several threads at once and alone. Each thread has its own number, so
+/// that what they share shows.
+pub fn beside_others<T: Send + Sync>(
+    run: impl Fn(usize) -> T + Sync,
+    differ: impl Fn(&T, &T) -> Option<String> + Sync,
+) -> Option<String> {
+    let alone: Vec<T> = (0..CALLERS).map(&run).collect();
+    // Threads take as long to start as some calls.
+    let start = Barrier::new(CALLERS);
+    let caller = |(i, want): (usize, &T)| {
+        start.wait();
+        let begin = Instant::now();
+        (0..).take_while(|n| *n < CALLS || begin.elapsed() < TIME).find_map(|_| differ(&run(i), want))
+    };
+    std::thread::scope(|scope| {
+        let callers: Vec<_> = (0..).zip(&alone).map(|of| scope.spawn(move || caller(of))).collect();
+        let ends = callers.into_iter().map(|t| t.join().unwrap_or_else(|_| Some("a thread panicked".into())));
+        ends.reduce(Option::or).flatten()
     })
 }
 

@@ -1,6 +1,6 @@
 //! Properties of a loss: a correct derivative, a minimum where both values agree, behaviour for extreme numbers.
 
-use crate::call::{Draw, no_fault, require, settle, skipped, within};
+use crate::call::{Draw, beside_others, no_fault, require, settle, skipped, within};
 use crate::gradients::slope;
 use crate::{Outcome, Report};
 use conefield_core::loss::{Loss, NoiseModel};
@@ -22,6 +22,7 @@ pub fn check_loss(loss: &dyn Loss) -> Report {
         let changed = pairs().into_iter().find(|&[p, m]| bits(loss.at(p, m)) != bits(loss.at(p, m)));
         settle(changed.map(|[p, m]| format!("{}: another value", words(p, m))), "the same bits twice")
     });
+    report.holds("threads", "several threads", || threads(loss));
     report.add("learns from a scan", || learns(loss));
     report.add("no fault", || no_fault(loss.fault()));
     report
@@ -113,6 +114,15 @@ fn extremes(loss: &dyn Loss) -> Outcome {
 fn poison(loss: &dyn Loss) -> Outcome {
     let hidden = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY].into_iter().find(|&p| loss.at(p, 0.5).0.is_finite());
     settle(hidden.map(|p| format!("predicted {p}: loss {}", loss.at(p, 0.5).0)), "NaN and infinities stay visible")
+}
+
+fn threads(loss: &dyn Loss) -> Option<String> {
+    let all = pairs();
+    // Each thread begins with other values.
+    let run = |i: usize| -> Vec<[u64; 2]> {
+        all.iter().cycle().skip(50 * i).take(all.len()).map(|&[p, m]| bits(loss.at(p, m))).collect()
+    };
+    beside_others(run, |a, b| (a != b).then(|| "another value beside other threads".into()))
 }
 
 /// An adaptive loss gives a loss with all other properties and of the same order.

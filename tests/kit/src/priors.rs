@@ -1,6 +1,6 @@
 //! Properties of a prior of a field: a correct gradient, additive sums, behaviour for extreme numbers.
 
-use crate::call::{Draw, Guarded, error, no_fault, require, settle, within};
+use crate::call::{Draw, Guarded, beside_others, error, no_fault, require, settle, within};
 use crate::gradients::slope;
 use crate::{Outcome, Report};
 use conefield_core::prior::Prior;
@@ -28,11 +28,12 @@ pub fn check_prior(prior: &dyn Prior) -> Report {
     report.add("extremes", || extremes(prior));
     report.add("poison", || poison(prior));
     report.add("repeatable", || {
-        let values = drawn(prior);
-        let [a, b] = [(); 2].map(|()| run(prior, &values, 1.0));
-        let bits = |(value, slopes): &(f64, Vec<f64>)| (value.to_bits(), slopes.iter().map(|s| s.to_bits()).collect());
-        let same: bool = bits(&a) == (bits(&b) as (u64, Vec<u64>));
-        settle((!same).then(|| "other numbers the second time".into()), "the same bits twice")
+        let [a, b] = [(); 2].map(|()| bits(prior, 1));
+        settle((a != b).then(|| "other numbers the second time".into()), "the same bits twice")
+    });
+    report.holds("threads", "several threads", || {
+        let run = |i: usize| bits(prior, 1 + i as u64);
+        beside_others(run, |a, b| (a != b).then(|| "other numbers beside other threads".into()))
     });
     report.add("no fault", || no_fault(prior.fault()));
     report
@@ -55,6 +56,13 @@ fn run(prior: &dyn Prior, values: &[f64], scale: f64) -> (f64, Vec<f64>) {
     let mut gradient = Guarded::new(values.len(), 0.0);
     let value = prior.block(values, scale, gradient.inner());
     (value, gradient.into_inner())
+}
+
+/// Bits of the penalty and of its gradient for the values of this number.
+fn bits(prior: &dyn Prior, number: u64) -> (u64, Vec<u64>) {
+    let values: Vec<f64> = Draw::new(4, number).many(&(0.0..1.0), prior.blocks().points());
+    let (value, slopes) = run(prior, &values, 1.0);
+    (value.to_bits(), slopes.into_iter().map(f64::to_bits).collect())
 }
 
 fn gradient(prior: &dyn Prior) -> Outcome {

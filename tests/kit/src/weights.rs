@@ -10,24 +10,31 @@ use conefield_core::settings::Initializer;
 pub fn check_initializer(initializer: &dyn Initializer) -> Report {
     let mut report = Report::of(initializer.describe());
     let layout = layout();
+    let run = |seed| run(initializer, &layout, seed);
     report.add("applies", || {
-        let (n, (_, found)) = (layout.blocks.len(), run(initializer, &layout)?);
+        let (n, (_, found)) = (layout.blocks.len(), run(5)?);
         let reported = found.loaded.len() + found.fresh.len();
         require(reported == n, || format!("it reports {reported} of {n} blocks"))?;
         Ok(format!("{} of {n} blocks filled", found.loaded.len()))
     });
+    report.add("fills", || {
+        let (runs, blocks) = ([run(5)?, run(6)?], &layout.blocks);
+        // By chance, a number may be as it was in one run.
+        let left = |&i: &usize| runs.iter().all(|([before, after], _)| before[i] == after[i]);
+        let mut filled = blocks.iter().filter(|b| runs[0].1.loaded.contains(&b.name));
+        let hole = filled.find_map(|b| Some((b, b.range.clone().find(left)? - b.range.start)));
+        let complaint = hole.map(|(b, i)| format!("{} is filled, but for number {i} of {}", b.name, b.range.len()));
+        settle(complaint, "every number of these blocks")
+    });
     report.add("finite", || {
-        let bad = run(initializer, &layout)?.0.iter().position(|v| !v.is_finite());
+        let bad = run(5)?.0[1].iter().position(|v| !v.is_finite());
         settle(bad.map(|i| format!("parameter {i}")), "every parameter")
     });
-    report.add("repeatable", || {
-        let ((a, _), (b, _)) = (run(initializer, &layout)?, run(initializer, &layout)?);
-        settle(differing("parameter", &a, &b), "the same bits twice")
-    });
+    report.add("repeatable", || settle(differing("parameter", &run(5)?.0[1], &run(5)?.0[1]), "the same bits twice"));
     report.add("leaves the rest alone", || {
-        let ((p, found), before) = (run(initializer, &layout)?, start(&layout));
+        let ([before, after], found) = run(5)?;
         let mut rest = layout.blocks.iter().filter(|b| !found.loaded.contains(&b.name));
-        let complaint = rest.find_map(|b| differing(&b.name, &p[b.range.clone()], &before[b.range.clone()]));
+        let complaint = rest.find_map(|b| differing(&b.name, &after[b.range.clone()], &before[b.range.clone()]));
         settle(complaint, "blocks that it does not report keep their bits")
     });
     report
@@ -52,13 +59,11 @@ fn layout() -> Layout {
     Layout { blocks }
 }
 
-fn start(layout: &Layout) -> Vec<f32> {
-    Draw::new(5, 5).many(&(-0.1..0.1), layout.len())
-}
-
-fn run(initializer: &dyn Initializer, layout: &Layout) -> Result<(Vec<f32>, InitReport)> {
+/// Parameters before and after the initializer, and what it reports.
+fn run(initializer: &dyn Initializer, layout: &Layout, seed: u64) -> Result<([Vec<f32>; 2], InitReport)> {
+    let before: Vec<f32> = Draw::new(seed, 5).many(&(-0.1..0.1), layout.len());
     let mut arena = Arena::new(layout.len());
-    arena.params.copy_from_slice(&start(layout));
+    arena.params.copy_from_slice(&before);
     let report = initializer.apply(layout, &mut arena)?;
-    Ok((arena.params.to_vec(), report))
+    Ok(([before, arena.params.to_vec()], report))
 }

@@ -7,7 +7,7 @@ use conefield::tradeoff::json::read_json;
 use conefield::{method, specs};
 use conefield_backend_cpu::Cpu;
 use conefield_core::error::ensure;
-use conefield_core::words::plural;
+use conefield_core::words::counted;
 use conefield_core::{Result, written};
 use conefield_evaluation::report::page::{Notice, Page, PageRun, PageSpread};
 use conefield_evaluation::report::text::stem;
@@ -104,8 +104,8 @@ pub fn page_runs(found: &[RunOnDisk], warnings: &mut Vec<Notice>) -> Vec<PageRun
             warnings.extend((!run.is_complete()).then(|| notice(format!("the run is {}", run.status()))));
             if let Some(n) = run.record.as_ref().and_then(|r| r["rollbacks"].as_u64()).filter(|n| *n > 0) {
                 warnings.push(notice(format!(
-                    "training diverged and was rolled back {n} {}; each rollback halved the learning rate",
-                    plural(n, "time")
+                    "training diverged and was rolled back {}; each rollback halved the learning rate",
+                    counted(n, "time")
                 )));
             }
             PageRun {

@@ -1,6 +1,7 @@
 //! Encoders, normalizers and fields.
 
 use super::*;
+use conefield_core::allowance;
 use conefield_core::registry::Kind;
 use conefield_core::stage::TILE_ROWS;
 use std::ops::Range;
@@ -359,6 +360,8 @@ const MANY: usize = 1 << 20;
 /// Tries an encoder, normalizer or field of type `ty`.
 fn try_map(ty: &Type, stage: &dyn Stage) -> Result<()> {
     let info = stage.info();
+    // The trial's parameters and their gradients; a run needs more.
+    allowance::numbers(&ty.words(), "parameters", info.params.saturating_mul(2))?;
     let mut params = Guarded::zeroed(info.params);
     if info.params <= MANY {
         stage.init(1, params.inner());
