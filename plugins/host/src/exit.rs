@@ -28,8 +28,8 @@ pub(crate) fn inside<T>(call: impl FnOnce() -> T) -> T {
     static WATCH: Once = Once::new();
     // SAFETY: the function lives as long as the process.
     WATCH.call_once(|| _ = unsafe { atexit(at_exit) });
-    INSIDE.set(true);
+    let before = INSIDE.replace(true);
     let result = call();
-    INSIDE.set(false);
+    INSIDE.set(before);
     result
 }
