@@ -364,7 +364,7 @@ mod tests {
             ("micrometer", "parsec", &["axes.unit", "parsec"]),
             ("\"s0\"", "\"../b\"", &["datasets[0].path", "../b"]),
             ("\"s0\"", "\"s1\"", &["datasets[0].path", "s1"]),
-            ("[4000, ", "[0, ", &["spacing", "positive"]),
+            ("[4000, ", "[0, ", &["spacing", "sides"]),
             ("\"scale\": [4000, ", "\"scale\": [", &[".zattrs:4:"]),
             ("\"type\": \"scale\"", "\"type\": \"shear\"", &[".zattrs", "shear"]),
             (
