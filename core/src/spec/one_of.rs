@@ -2,7 +2,7 @@
 //! two of them is refused.
 
 use super::check::{Context, join};
-use super::schema::{NESTED, ONE_OF, of_type};
+use super::schema::{ONE_OF, of_type};
 use crate::error::{Error, Result};
 use crate::registry::{Kind, find};
 use crate::written::{Entry, Is, Node, listed};
@@ -21,7 +21,7 @@ fn stage(node: &mut Node, kind: Kind) {
 
 fn setting(node: &mut Node, schema: &Value, cx: &Context<'_>) {
     let schema = cx.resolve(schema);
-    if let Some(kind) = schema[NESTED].as_str().and_then(Kind::named) {
+    if let Some(kind) = cx.nested(schema, false) {
         return stage(node, kind);
     }
     let entries = match &mut node.kind {
