@@ -4,7 +4,9 @@
 //! `S`; [`run`] selects the best instruction set of the machine at run time.
 
 use fearless_simd::Bytes;
-pub use fearless_simd::{ExtractToken, Level, Select, Simd, SimdBase, SimdFloat, SimdFloatElement, SimdMask};
+pub use fearless_simd::{
+    ExtractToken, Level, Select, Simd, SimdBase, SimdFloat, SimdFloatElement, SimdInt, SimdMask, f32x4, i32x4,
+};
 use std::fmt::{Debug, Display};
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Sub, SubAssign};
@@ -444,6 +446,19 @@ fn one_by_one<S: Simd, R: Real, const K: usize>(s: S, line: &[R], at: V<S, R>) -
         *taken = V::<S, R>::from_slice(s, &numbers[..V::<S, R>::LEN]);
     }
     all
+}
+
+/// `line[at]` and `line[at + 1]` of every lane, which must be in range. Reads both at once.
+#[inline(always)]
+pub fn pairs<S: Simd>(s: S, line: &[f32], at: &[usize; WIDEST]) -> [S::f32s; 2] {
+    let mut read = [0.0; WIDEST];
+    // A loop: a closure might not be inlined into the code for an instruction set.
+    for (pair, &at) in read[..S::f32s::LEN].iter_mut().zip(at) {
+        let [a, b] = [line[at], line[at + 1]].map(|x| u64::from(x.to_bits()));
+        *pair = f64::from_bits(if cfg!(target_endian = "little") { a | b << 32 } else { b | a << 32 });
+    }
+    let [low, high] = [0, S::f64s::LEN].map(|from| S::f64s::from_slice(s, &read[from..from + S::f64s::LEN]));
+    low.bitcast::<S::f32s>().deinterleave(high.bitcast::<S::f32s>()).into()
 }
 
 /// Work on numbers of one type, compiled for several instruction sets. `call` must be `#[inline(always)]`.

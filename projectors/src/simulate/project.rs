@@ -9,6 +9,7 @@ use conefield_core::finite::stray;
 use conefield_core::geometry::Geometry;
 use conefield_core::parallel;
 use conefield_core::scan::Volume;
+use conefield_core::simd::{Op, Simd, SimdBase, SimdFloat, SimdInt, WIDEST, f32x4, i32x4, load, pairs, run};
 use ndarray::Array3;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -16,6 +17,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 const BLOCK: usize = 8;
 /// Rows that one task processes together: neighbours along z read the same cache lines.
 const BAND: usize = 16;
+/// The numbers of lanes.
+const LANES: [f32; WIDEST] = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
 
 /// Line integrals `[view, row, column]` of `volume` (positioned by its own grid) for every pixel of `geometry`.
 ///
@@ -55,11 +58,7 @@ pub(super) fn project_with(
     let finished = AtomicUsize::new(0);
     parallel::over(pixels.chunks_mut(rows * columns), |view, pixels| {
         parallel::over(pixels.chunks_mut(BAND * columns), |band, pixels| {
-            for column in 0..columns {
-                for (r, row) in pixels.chunks_mut(columns).enumerate() {
-                    row[column] = sampler.integral(geometry, view, band * BAND + r, column);
-                }
-            }
+            run(Band { sampler: &sampler, geometry, view, first: band * BAND, pixels });
         });
         progress((finished.fetch_add(1, Ordering::Relaxed) + 1) as f64 / views as f64);
     });
@@ -72,7 +71,9 @@ struct Sampler {
     data: Vec<f32>,
     /// Strides in `data` along x and y (along z it is 1).
     stride: [usize; 2],
-    /// Largest lower corner of a cell along each axis.
+    /// Lines along z per plane across x.
+    lines: i32,
+    /// Largest coordinate of a sample along each axis.
     last: [f32; 3],
     /// Whether a block of cells, or a neighbouring cell, has a nonzero value.
     occupied: Vec<bool>,
@@ -127,7 +128,8 @@ impl Sampler {
         Ok(Self {
             data,
             stride,
-            last: grid.shape.map(|n| n as f32),
+            lines: padded[1] as i32,
+            last: grid.shape.map(|n| n as f32 + 0.999),
             occupied,
             blocks: [blocks[1], blocks[2]],
             bounds: grid.bounds(),
@@ -136,7 +138,8 @@ impl Sampler {
         })
     }
 
-    fn integral(&self, geometry: &Geometry, view: usize, row: usize, column: usize) -> f32 {
+    #[inline(always)]
+    fn integral<S: Simd>(&self, s: S, geometry: &Geometry, [view, row, column]: [usize; 3]) -> f32 {
         let ray = geometry.ray(view, row, column);
         let Some([near, far]) = ray.clip(self.bounds) else { return 0.0 };
         let count = ((far - near) / self.step).ceil().max(1.0);
@@ -145,29 +148,35 @@ impl Sampler {
         let first = ray.at(near + 0.5 * step);
         let start: [f32; 3] = std::array::from_fn(|k| ((first[k] - self.bounds[0][k]) / self.spacing[k] + 0.5) as f32);
         let ahead: [f32; 3] = std::array::from_fn(|k| (ray.direction[k] * step / self.spacing[k]) as f32);
-        (self.sum(start, ahead, count as usize) * step) as f32
+        (self.sum(s, start, ahead, count as usize) * step) as f32
     }
 
     /// Sum of `count` samples at `start + n·ahead`.
-    fn sum(&self, start: [f32; 3], ahead: [f32; 3], count: usize) -> f64 {
-        let slow = ahead.map(|a| if a == 0.0 { f32::INFINITY } else { 1.0 / a.abs() });
+    #[inline(always)]
+    fn sum<S: Simd>(&self, s: S, start: [f32; 3], ahead: [f32; 3], count: usize) -> f64 {
+        // Along x, y, z, and once more along z.
+        let four = |v: [f32; 3]| f32x4::from_slice(s, &[v[0], v[1], v[2], v[2]]);
+        let slow = four(ahead.map(|a| if a == 0.0 { f32::INFINITY } else { 1.0 / a.abs() }));
+        let upper = four(ahead.map(|a| if a > 0.0 { 1.0 } else { 0.0 }));
+        let (first, apart, last) = (four(start), four(ahead), four(self.last));
         let mut sum = 0.0;
         let mut n = 0;
         while n < count {
             // The block of sample `n`, and the number of samples before the ray leaves it.
-            let mut block = [0usize; 3];
-            let mut stay = f32::INFINITY;
-            for k in 0..3 {
-                let x = self.along(start, ahead, n, k);
-                block[k] = x as usize / BLOCK;
-                let wall = (block[k] + usize::from(ahead[k] > 0.0)) * BLOCK;
-                stay = stay.min((wall as f32 - x).abs() * slow[k]);
-            }
-            let stay = (stay.ceil().max(1.0) as usize).min(count - n);
-            if self.occupied[(block[0] * self.blocks[0] + block[1]) * self.blocks[1] + block[2]] {
+            let at = (first + apart * (n as i32 as f32)).max(f32x4::splat(s, 0.0)).min(last);
+            let block = (at * (1.0 / BLOCK as f32)).floor();
+            let walls = ((block + upper) * BLOCK as f32 - at).abs() * slow;
+            let stay = walls.as_slice().iter().fold(f32::INFINITY, |a, &b| if b < a { b } else { a });
+            let block = block.to_int::<i32x4<S>>();
+            let [i, j, k, _] = *block.as_slice() else { unreachable!("four lanes") };
+            let [i, j, k] = [i, j, k].map(|n| n as usize);
+            let stay = (stay.ceil().max(1.0) as i32 as usize).min(count - n);
+            if self.occupied[(i * self.blocks[0] + j) * self.blocks[1] + k] {
                 let mut part = 0.0;
-                for n in n..n + stay {
-                    part += self.sample(std::array::from_fn(|k| self.along(start, ahead, n, k)));
+                for from in (0..stay).step_by(S::f32s::LEN) {
+                    // One after another: the sum does not depend on the length of the vectors.
+                    let samples = self.samples(s, start, ahead, n + from);
+                    samples.as_slice().iter().take(stay - from).for_each(|x| part += x);
                 }
                 sum += f64::from(part);
             }
@@ -176,28 +185,57 @@ impl Sampler {
         sum
     }
 
-    /// Coordinate of sample `n`, clamped to the padded volume.
+    /// The trilinear interpolation at sample `n` and those after it, one per lane. Samples are clamped to the padded
+    /// volume.
     #[inline(always)]
-    fn along(&self, start: [f32; 3], ahead: [f32; 3], n: usize, k: usize) -> f32 {
-        (start[k] + n as f32 * ahead[k]).max(0.0).min(self.last[k] + 0.999)
+    fn samples<S: Simd>(&self, s: S, start: [f32; 3], ahead: [f32; 3], n: usize) -> S::f32s {
+        let number = |x: f32| S::f32s::splat(s, x);
+        let n = load::<S, f32>(s, &LANES, 0) + number(n as f32);
+        let (mut cells, mut f) = ([S::i32s::splat(s, 0); 3], [number(0.0); 3]);
+        for k in 0..3 {
+            let at = (number(start[k]) + n * number(ahead[k])).max(number(0.0)).min(number(self.last[k]));
+            cells[k] = at.to_int();
+            f[k] = at - cells[k].to_float::<S::f32s>();
+        }
+        let [lines, z] = [cells[0] * self.lines + cells[1], cells[2]];
+        let mut at = [0; WIDEST];
+        for ((at, &line), &z) in at.iter_mut().zip(lines.as_slice()).zip(z.as_slice()) {
+            *at = line as usize * self.stride[1] + z as usize;
+        }
+        // The interpolation along z, then y, then x.
+        let mut on_x = [f[0]; 2];
+        for (x, on_x) in on_x.iter_mut().enumerate() {
+            let mut on_y = [f[0]; 2];
+            for (y, on_y) in on_y.iter_mut().enumerate() {
+                let [a, b] = pairs(s, &self.data[x * self.stride[0] + y * self.stride[1]..], &at);
+                *on_y = a + f[2] * (b - a);
+            }
+            *on_x = on_y[0] + f[1] * (on_y[1] - on_y[0]);
+        }
+        on_x[0] + f[0] * (on_x[1] - on_x[0])
     }
+}
 
-    /// The trilinear interpolation at a point of the padded volume.
+/// The line integrals of some rows of a view.
+struct Band<'a> {
+    sampler: &'a Sampler,
+    geometry: &'a Geometry,
+    view: usize,
+    /// Its first row.
+    first: usize,
+    pixels: &'a mut [f32],
+}
+
+impl Op for Band<'_> {
+    type Number = f32;
+    type Out = ();
     #[inline(always)]
-    fn sample(&self, at: [f32; 3]) -> f32 {
-        // Via i32: the conversion is a single instruction.
-        let cell = at.map(|x| x as i32);
-        let f: [f32; 3] = std::array::from_fn(|k| at[k] - cell[k] as f32);
-        let at = cell[0] as usize * self.stride[0] + cell[1] as usize * self.stride[1] + cell[2] as usize;
-        let along_z = |at: usize| match self.data.get(at..at + 2) {
-            Some(&[a, b]) => a + f[2] * (b - a),
-            _ => 0.0,
-        };
-        let along_y = |at: usize| {
-            let (a, b) = (along_z(at), along_z(at + self.stride[1]));
-            a + f[1] * (b - a)
-        };
-        let (a, b) = (along_y(at), along_y(at + self.stride[0]));
-        a + f[0] * (b - a)
+    fn call<S: Simd>(self, s: S) {
+        let columns = self.geometry.detector[1];
+        for column in 0..columns {
+            for (r, row) in self.pixels.chunks_mut(columns).enumerate() {
+                row[column] = self.sampler.integral(s, self.geometry, [self.view, self.first + r, column]);
+            }
+        }
     }
 }
