@@ -10,6 +10,7 @@ use super::layout::main_axis;
 use super::walk::VoxelRay;
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
 use conefield_core::parallel;
+use conefield_core::scan::ScanHeader;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
 use std::ops::Range;
@@ -220,6 +221,27 @@ impl<R: Real> Op for BundlesForward<'_, R> {
     }
 }
 
+/// Most bundles of a row of pixels: neighbours differ in heading at few places.
+fn most(columns: usize) -> usize {
+    columns.div_ceil(BUNDLE) + HEADINGS.len() / 2
+}
+
+/// Rows of pixels whose bundles [`adjoint`] holds at once.
+fn held<R>(columns: usize) -> usize {
+    (HELD / (columns.div_ceil(BUNDLE) * size_of::<Bundle<R>>()).max(1)).max(1)
+}
+
+/// Bytes that [`adjoint`] needs in single precision for `views` views; [`forward`] needs less.
+pub fn scratch(header: &ScanHeader, views: usize) -> u64 {
+    let [rows, columns] = header.detector;
+    let [nx, ny, nz] = header.volume;
+    let lines = views.saturating_mul(rows).min(held::<f32>(columns));
+    let bundles = lines * most(columns) * size_of::<Bundle<f32>>();
+    let plane = (nx * ny).max(nx * nz).max(ny * nz);
+    let tiles = rayon::current_num_threads().min(nx.max(ny).max(nz).div_ceil(TILE)) * TILE * plane * size_of::<f32>();
+    (bundles + tiles) as u64
+}
+
 /// Adds the adjoint of [`forward`] to `volume`.
 pub fn adjoint<R: Real>(
     geometry: &Geometry,
@@ -228,20 +250,19 @@ pub fn adjoint<R: Real>(
     volume: &mut ArrayViewMut3<'_, R>,
 ) {
     let [rows, columns] = geometry.detector;
-    let bytes = columns.div_ceil(BUNDLE) * size_of::<Bundle<R>>();
     let of_line = |line: usize| {
         let (image, row) = (line / rows, line % rows);
-        let mut all = vec![];
+        let mut all = Vec::with_capacity(most(columns));
         for column in (0..columns).step_by(BUNDLE) {
             Bundle::of(geometry, [views[image], row, column], image, &mut all);
         }
         all
     };
-    let (lines, held) = (views.len() * rows, (HELD / bytes.max(1)).max(1));
+    let (lines, held) = (views.len() * rows, held::<R>(columns));
     for from in (0..lines).step_by(held) {
         let some = from..(from + held).min(lines);
-        let bundles: Vec<Bundle<R>> = parallel::map(some, |_, line| of_line(line)).into_iter().flatten().collect();
-        for main in (0..3).filter(|&main| bundles.iter().any(|b| b.main == main)) {
+        let bundles: Vec<Vec<Bundle<R>>> = parallel::map(some, |_, line| of_line(line));
+        for main in (0..3).filter(|&main| bundles.iter().flatten().any(|b| b.main == main)) {
             let [a, b] = across(main);
             let mut turned = volume.view_mut().permuted_axes([main, a, b]);
             parallel::over(turned.axis_chunks_iter_mut(Axis(0), TILE), |n, mut planes| {
@@ -259,7 +280,8 @@ struct Adjoint<'a, R> {
     main: usize,
     planes: Range<usize>,
     shape: [usize; 3],
-    bundles: &'a [Bundle<R>],
+    /// Those of each line.
+    bundles: &'a [Vec<Bundle<R>>],
     projections: ArrayView3<'a, R>,
 }
 
@@ -271,7 +293,7 @@ impl<R: Real> Op for Adjoint<'_, R> {
         let [lines, places] = across(self.main).map(|k| self.shape[k]);
         let mut voxels = vec![R::ZERO; self.planes.len() * lines * places];
         let mut found = Beside::new();
-        for bundle in self.bundles.iter().filter(|b| b.main == self.main) {
+        for bundle in self.bundles.iter().flatten().filter(|b| b.main == self.main) {
             let planes = self.planes.start.max(bundle.planes.start)..self.planes.end.min(bundle.planes.end);
             if planes.is_empty() {
                 continue;
