@@ -15,7 +15,7 @@ mod repeated;
 pub(crate) mod setup;
 mod shadow;
 mod survey;
-mod truncation;
+pub(crate) mod truncation;
 mod warnings;
 
 pub use arc::ScanArc;

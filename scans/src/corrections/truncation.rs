@@ -3,20 +3,15 @@
 use crate::corrections::Correct;
 use crate::diagnosis::line_integrals::check_line_integrals;
 use crate::diagnosis::setup::setup;
+use crate::diagnosis::truncation::truncation;
 use conefield_core::Result;
 use conefield_core::error::ensure;
 use conefield_core::parallel;
 use conefield_core::scan::Scan;
 use conefield_core::words::counted;
-use ndarray::{Array3, ArrayView2, Axis, s};
+use ndarray::{Array3, Axis, s};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_2;
-use std::ops::Range;
-
-/// The strip examined at each side is the detector's width divided by this number.
-const SIDE: usize = 64;
-/// Share of the largest line integral below which a side shows air.
-const AIR: f32 = 0.05;
 
 /// Extends rows that end in the object beyond the detector's sides, by point reflection about the last value, faded to
 /// 0 (Ohnesorge et al., Med. Phys. 27(1), 2000). The detector becomes wider; one that is shifted on purpose, on a full
@@ -44,19 +39,10 @@ impl Correct for Truncation {
 
     fn correct(&self, scan: &mut Scan) -> Result<String> {
         let (views, rows, columns) = scan.projections.dim();
-        let side = columns.div_ceil(SIDE);
-        let most = check_line_integrals(scan.projections.view()).typical_range[1].max(0.0);
-        let [left, right] = setup(&scan.geometry).open_sides();
-        // Averaging some pixels reduces their noise.
-        let tall = rows.div_ceil(SIDE);
-        let reaches = |view: ArrayView2<'_, f32>, columns: Range<usize>| {
-            let strip = view.slice_move(s![.., columns]);
-            strip.axis_chunks_iter(Axis(0), tall).filter_map(|block| block.mean()).fold(0.0, f32::max) > AIR * most
-        };
-        let cut = scan.projections.outer_iter();
-        let cut = cut.filter(|v| left && reaches(*v, 0..side) || right && reaches(*v, columns - side..columns));
-        let cut = cut.count();
-        if cut == 0 {
+        let (check, setup) = (check_line_integrals(scan.projections.view()), setup(&scan.geometry));
+        let [left, right] = setup.open_sides();
+        let cut = (truncation(scan.projections.view(), &setup, &check).views * views as f64).round();
+        if cut == 0.0 {
             return Ok("the object reaches the sides of no view: nothing is added".into());
         }
         let more = ((self.share * columns as f64).ceil() as usize).min(columns.saturating_sub(1));
