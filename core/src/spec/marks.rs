@@ -42,6 +42,9 @@ impl<'a> Search<'a> {
     }
 
     fn setting(&mut self, value: &Value, schema: &Value, cx: &Context<'_>, path: &str) {
+        if !schema.is_object() {
+            return;
+        }
         match cx.nested(schema, value.get("type").is_some()) {
             Some(kind) if schema["$ref"].is_null() => self.stage(value, kind, path),
             _ => self.within(value, schema, cx, path),
@@ -56,22 +59,25 @@ impl<'a> Search<'a> {
         if !value.is_null() && (self.marked)(schema) && !self.found.contains(&setting) {
             self.found.push(setting);
         }
-        each(value, path, |key, v, path| {
-            let inner = key.map_or(&schema["items"], |key| &schema["properties"][key]);
-            if !inner.is_null() {
-                self.setting(v, inner, cx, path);
+        let below = |name: &str| if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") };
+        match value {
+            Value::Array(all) => {
+                for (i, v) in all.iter().enumerate() {
+                    let inner = schema["prefixItems"].get(i).unwrap_or(&schema["items"]);
+                    self.setting(v, inner, cx, &below(&i.to_string()));
+                }
             }
-        });
-    }
-}
-
-/// Calls `f` with every entry of a table (with its key) or list, and its path.
-fn each(value: &Value, path: &str, mut f: impl FnMut(Option<&str>, &Value, &str)) {
-    let below = |name: &str| if path.is_empty() { name.to_owned() } else { format!("{path}.{name}") };
-    match value {
-        Value::Array(all) => all.iter().enumerate().for_each(|(i, v)| f(None, v, &below(&i.to_string()))),
-        Value::Object(map) => map.iter().for_each(|(key, v)| f(Some(key), v, &below(key))),
-        _ => {}
+            Value::Object(map) => {
+                for (key, v) in map {
+                    let path = below(key);
+                    // A pattern may be meant for any key.
+                    let patterns = schema["patternProperties"].as_object().into_iter().flat_map(|all| all.values());
+                    let named = schema["properties"].get(key).unwrap_or(&schema["additionalProperties"]);
+                    patterns.chain([named]).for_each(|inner| self.setting(v, inner, cx, &path));
+                }
+            }
+            _ => {}
+        }
     }
 }
 
@@ -91,6 +97,9 @@ mod tests {
                 "atlas": file,
                 "maps": { "type": "array", "items": file },
                 "deep": { "anyOf": [{ "$ref": "#/$defs/Deep" }, { "type": "null" }] },
+                "pair": { "type": "array", "prefixItems": [{ "type": "string" }, file] },
+                "named": { "type": "object", "additionalProperties": file },
+                "numbered": { "type": "object", "patternProperties": { "^[0-9]+$": file }, "additionalProperties": false },
                 "note": { "type": "string" },
             },
             "$defs": { "Deep": { "properties": { "file": file } } },
@@ -102,12 +111,21 @@ mod tests {
         add(vec![loaded(schema, make), loaded(json!({}), other)]).unwrap();
         let stage = json!({
             "type": "reads-files", "atlas": "a.nii", "maps": ["b.npy", "c.npy"], "deep": { "file": "d.mha" }, "note": "e",
+            "pair": ["g", "h.npy"], "named": { "left": "i.npy" }, "numbered": { "7": "j.npy" },
         });
         let field = json!({ "type": "test-field", "encoder": { "type": "test-stack", "below": stage } });
         let tree = json!({ "type": "test-chain", "methods": [field, { "type": "unknown", "atlas": "f" }] });
         let mut found = marked(&tree, &|schema| schema["format"] == FORMAT);
         found.sort_unstable_by(|a, b| a.0.cmp(&b.0));
-        let want = [("atlas", "a.nii"), ("deep.file", "d.mha"), ("maps.0", "b.npy"), ("maps.1", "c.npy")];
+        let want = [
+            ("atlas", "a.nii"),
+            ("deep.file", "d.mha"),
+            ("maps.0", "b.npy"),
+            ("maps.1", "c.npy"),
+            ("named.left", "i.npy"),
+            ("numbered.7", "j.npy"),
+            ("pair.1", "h.npy"),
+        ];
         let want = want.map(|(path, file)| (format!("methods.0.encoder.below.{path}"), Value::from(file)));
         assert_eq!(found, want);
         let named = types(&tree);
