@@ -7,6 +7,7 @@ use signal_hook::iterator::Signals;
 use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use tracing::warn;
 
 /// The first signal received, or 0.
 static CAUGHT: AtomicU8 = AtomicU8::new(0);
@@ -25,6 +26,7 @@ pub fn watch() -> Result<()> {
                 conefield_io::discard_unfinished();
                 std::process::exit(128 + signal);
             }
+            warn!("stops after the current step; a second signal stops at once");
         }
     });
     Ok(())

@@ -132,7 +132,8 @@ pub struct DriftRecord {
 
 /// Receives the progress of a run and may stop it.
 pub trait Observer {
-    /// Called after every step with the finished share in [0, 1] and the method's estimate of the seconds left.
+    /// Called after every step, and within long ones, with the number of finished steps, the finished share in [0, 1]
+    /// and the method's estimate of the seconds left.
     fn progress(&mut self, step: u64, share: f64, seconds_left: f64);
     /// Receives a record.
     fn record(&mut self, record: &Record);

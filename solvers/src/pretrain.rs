@@ -89,7 +89,7 @@ pub fn pretrain(
         exe.update(&mut model, &adam)?;
         (loss, since) = (loss + found, since + 1);
         let share = clock.done(step);
-        observer.progress(step, share, clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9));
+        observer.progress(step, share, clock.left(share));
         if step.is_multiple_of(report_every) || share >= 1.0 {
             let samples_per_s = Some((step * settings.points as u64) as f64 / clock.seconds());
             let record = Record {

@@ -94,6 +94,11 @@ impl Clock {
         (self.spent + self.running.map_or(Duration::ZERO, |s| s.elapsed())).as_secs_f64()
     }
 
+    /// An estimate of the seconds left when `share` of the run is done.
+    pub fn left(&self, share: f64) -> f64 {
+        self.seconds() * (1.0 - share).max(0.0) / share.max(1e-9)
+    }
+
     /// Share of the run completed after `steps` steps, for schedules; ignores `at_most`, which may cut the run short.
     pub fn share(&self, steps: u64) -> f64 {
         let by_steps = self.share_of_steps(steps);

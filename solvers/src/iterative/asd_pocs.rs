@@ -82,10 +82,10 @@ impl Iteration for AsdPocsIterate {
         self.sweep.prepare(problem)
     }
 
-    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
+    fn pass(&mut self, problem: &Problem<'_>, pass: u64, within: &mut dyn FnMut(f64)) -> Result<Pass> {
         let (grid, place) = (&problem.scan.geometry.volume, problem.place);
         copy(place, &self.sweep.x, &mut self.before)?;
-        let residual = self.sweep.sweep(problem, pass)?;
+        let residual = self.sweep.sweep(problem, pass, within)?;
         let data = distance(place, &self.sweep.x, &self.before)?;
         if pass == 0 {
             self.length = ALPHA * data / self.descents.max(1) as f64;

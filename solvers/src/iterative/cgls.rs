@@ -70,7 +70,7 @@ impl Iteration for CglsIterate {
         Ok(())
     }
 
-    fn pass(&mut self, problem: &Problem<'_>, _: u64) -> Result<Pass> {
+    fn pass(&mut self, problem: &Problem<'_>, _: u64, within: &mut dyn FnMut(f64)) -> Result<Pass> {
         let (views, place) = (problem.views(), problem.place);
         let Self { x, residual, direction, ahead, gradient, gamma } = self;
         problem.forward(&views, direction, ahead)?;
@@ -81,6 +81,7 @@ impl Iteration for CglsIterate {
         let alpha = f64::from((*gamma / square) as f32);
         place.map(&ADD, [alpha, 1.0], x, &[direction])?;
         place.map(&ADD, [-alpha, 1.0], residual, &[ahead])?;
+        within(0.5);
         problem.back(&views, residual, gradient)?;
         let next = norm2(place, gradient)?;
         let beta = next / *gamma;

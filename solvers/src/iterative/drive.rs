@@ -44,8 +44,9 @@ pub trait Iteration {
         Ok(())
     }
 
-    /// Makes one pass over all views. `pass` counts from 0.
-    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass>;
+    /// Makes one pass over all views. `pass` counts from 0. A long one calls `within` now and then, with the finished
+    /// share of the pass.
+    fn pass(&mut self, problem: &Problem<'_>, pass: u64, within: &mut dyn FnMut(f64)) -> Result<Pass>;
 
     /// The unknowns: voxels in 1/mm, unless [`Iteration::volume`] and [`Iteration::take`] convert them.
     fn x(&mut self) -> &mut Array;
@@ -193,7 +194,12 @@ impl<'a> Run<'a> {
         if let Some(before) = &mut self.before {
             copy(place, method.x(), before)?;
         }
-        let mut pass = method.pass(self.problem, self.step)?;
+        let (clock, step) = (&self.clock, self.step);
+        let mut pass = method.pass(self.problem, step, &mut |part| {
+            let [from, to] = [step, step + 1].map(|step| clock.done(step).min(1.0));
+            let share = from + part * (to - from);
+            observer.progress(step, share, clock.left(share));
+        })?;
         if let Some(before) = &self.before {
             pass.change = Some(change(place, method.x(), before)?);
         }
@@ -207,8 +213,7 @@ impl<'a> Run<'a> {
         let share = self.clock.done(self.step);
         let over = share >= 1.0 || self.kept.settled || !self.clock.allows(begun.elapsed().as_secs_f64());
         self.over = self.problem.place.agree(over);
-        let left = self.clock.seconds() * (1.0 - share).max(0.0) / share.max(1e-9);
-        let (share, left) = if self.over { (1.0, 0.0) } else { (share, left) };
+        let (share, left) = if self.over { (1.0, 0.0) } else { (share, self.clock.left(share)) };
         observer.progress(self.step, share, left);
         Ok(())
     }

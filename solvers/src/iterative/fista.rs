@@ -492,7 +492,7 @@ impl FistaIterate {
 }
 
 impl Iteration for FistaIterate {
-    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
+    fn pass(&mut self, problem: &Problem<'_>, pass: u64, within: &mut dyn FnMut(f64)) -> Result<Pass> {
         let place = problem.place;
         copy(place, &self.arrays.x, &mut self.arrays.before)?;
         // A changed penalty must not count as progress or regress.
@@ -504,10 +504,11 @@ impl Iteration for FistaIterate {
         let (mut residual, mut misfit) = (0.0, 0.0);
         // A checkpoint says how many there are, and may be wrong.
         let subsets = split(self.views, (self.subsets as usize).clamp(1, self.views));
-        for s in self.order.of(subsets.len(), problem.seed, pass) {
+        for (i, s) in self.order.of(subsets.len(), problem.seed, pass).into_iter().enumerate() {
             let [r, m] = self.update(problem, &subsets[s])?;
             residual += r;
             misfit += m;
+            within((i + 1) as f64 / subsets.len() as f64);
         }
         let Arrays { penalty, x, before, towards, .. } = &mut self.arrays;
         let change = change(place, x, before)?;

@@ -89,10 +89,11 @@ impl LsqrIterate {
     }
 
     /// Makes a step; returns its length.
-    fn step(&mut self, problem: &Problem<'_>) -> Result<f64> {
+    fn step(&mut self, problem: &Problem<'_>, within: &mut dyn FnMut(f64)) -> Result<f64> {
         let (views, place) = (problem.views(), problem.place);
         let Self { x, left, right, direction, pixels, .. } = self;
         problem.forward(&views, right, pixels)?;
+        within(0.5);
         place.map(&ADD, [1.0 / self.scale, -self.alpha / self.beta], left, &[pixels])?;
         let beta = norm2(place, left)?.sqrt();
         // One rotation for λ, and one for the element below the diagonal.
@@ -136,10 +137,10 @@ impl Iteration for LsqrIterate {
         Ok(())
     }
 
-    fn pass(&mut self, problem: &Problem<'_>, _: u64) -> Result<Pass> {
+    fn pass(&mut self, problem: &Problem<'_>, _: u64, within: &mut dyn FnMut(f64)) -> Result<Pass> {
         let place = problem.place;
         // An α of 0: the volume solves the problem.
-        let length = if self.alpha > 0.0 { self.step(problem)? } else { 0.0 };
+        let length = if self.alpha > 0.0 { self.step(problem, within)? } else { 0.0 };
         let change = Some(length / norm2(place, &self.x)?.max(1e-300).sqrt());
         let all = self.phi.powi(2) + self.taken;
         let Some(towards) = &self.towards else { return Ok(Pass { residual: all, change, prior: None }) };

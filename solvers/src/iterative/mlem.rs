@@ -119,10 +119,12 @@ impl Iteration for MlemIterate {
         }
     }
 
-    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
+    fn pass(&mut self, problem: &Problem<'_>, pass: u64, within: &mut dyn FnMut(f64)) -> Result<Pass> {
         let mut residual = 0.0;
-        for s in self.order.of(self.subsets.len(), problem.seed, pass) {
+        let count = self.subsets.len();
+        for (i, s) in self.order.of(count, problem.seed, pass).into_iter().enumerate() {
             residual += self.update(problem, s)?;
+            within((i + 1) as f64 / count as f64);
         }
         Ok(Pass { residual, ..Pass::default() })
     }

@@ -95,13 +95,13 @@ impl Sweep {
     }
 
     /// Makes pass `pass`, counted from 0; returns `‖p − A·x‖²`.
-    pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64) -> Result<f64> {
+    pub(super) fn sweep(&mut self, problem: &Problem<'_>, pass: u64, within: &mut dyn FnMut(f64)) -> Result<f64> {
         let Updates { relaxation, decay, order, .. } = self.updates;
         let relaxation = f64::from((relaxation * decay.powi(pass.min(1 << 20) as i32)) as f32);
         // A region may admit less.
         let floor = f64::from(problem.regions.widest(self.bounds(problem)).low);
         let mut square = 0.0;
-        for s in order.of(self.subsets.len(), problem.seed, pass) {
+        for (i, s) in order.of(self.subsets.len(), problem.seed, pass).into_iter().enumerate() {
             let views = &self.subsets[s];
             square += problem.residual(views, &self.x, Some(&self.rows), &mut self.pixels)?;
             problem.back(views, &self.pixels, &mut self.work)?;
@@ -110,6 +110,7 @@ impl Sweep {
             }
             problem.place.map(&RELAX, [relaxation, floor], &mut self.x, &[&self.columns, &self.work])?;
             self.confine(problem)?;
+            within((i + 1) as f64 / self.subsets.len() as f64);
         }
         Ok(square)
     }
@@ -159,8 +160,8 @@ impl Iteration for Sweep {
         Ok(())
     }
 
-    fn pass(&mut self, problem: &Problem<'_>, pass: u64) -> Result<Pass> {
-        Ok(Pass { residual: self.sweep(problem, pass)?, ..Pass::default() })
+    fn pass(&mut self, problem: &Problem<'_>, pass: u64, within: &mut dyn FnMut(f64)) -> Result<Pass> {
+        Ok(Pass { residual: self.sweep(problem, pass, within)?, ..Pass::default() })
     }
 
     fn x(&mut self) -> &mut Array {

@@ -55,7 +55,7 @@ pub fn train(run: &mut Run<'_>, task: &mut dyn Task, callbacks: &mut Callbacks) 
         }
         step(run, task, callbacks)?;
         let share = run.clock.done(run.step).min(1.0);
-        let left = run.clock.seconds() * (1.0 - share) / share.max(1e-9);
+        let left = run.clock.left(share);
         run.observer.progress(run.step, share, left);
     }
     run.clock.pause();

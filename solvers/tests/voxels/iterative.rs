@@ -74,6 +74,10 @@ fn residuals_fall() {
         println!("{kind}: {losses:.5?}");
         assert_eq!(losses.len() as u64, n, "{kind}");
         assert!(losses[losses.len() - 1] < 0.3 * losses[0], "{kind}: {losses:?}");
+        // A pass reports its progress before its end.
+        let shares = &heard.shares;
+        assert!(shares.is_sorted() && shares.last() == Some(&1.0), "{kind}: {shares:?}");
+        assert!(shares[0] > 0.0 && shares[0] < 0.9 / n as f64 || kind == "sirt", "{kind}: {shares:?}");
         // One has its step size and the other its line search from the whole problem: no pass increases the residual.
         if ["sirt", "cgls", "lsqr"].contains(&kind) {
             assert!(losses.windows(2).all(|w| w[1] <= w[0]), "{kind}: {losses:?}");

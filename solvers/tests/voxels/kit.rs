@@ -93,6 +93,8 @@ pub fn volume(solution: Solution) -> Volume {
 #[derive(Default)]
 pub struct Heard {
     pub records: Vec<Record>,
+    /// Finished shares of the run.
+    pub shares: Vec<f64>,
     /// Messages and warnings.
     pub notes: Vec<String>,
     pub warnings: Vec<String>,
@@ -117,6 +119,7 @@ impl Heard {
 impl Observer for Heard {
     fn progress(&mut self, _: u64, share: f64, seconds_left: f64) {
         assert!((0.0..=1.0).contains(&share) && seconds_left >= 0.0, "{share} and {seconds_left}");
+        self.shares.push(share);
     }
     fn record(&mut self, record: &Record) {
         self.records.push(record.clone());
