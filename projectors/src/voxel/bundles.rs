@@ -10,7 +10,6 @@ use super::layout::main_axis;
 use super::walk::VoxelRay;
 use conefield_core::geometry::{Geometry, Vec3, VoxelGrid};
 use conefield_core::parallel;
-use conefield_core::scan::ScanHeader;
 use conefield_core::simd::{Op, Real, Simd, SimdBase, SimdFloat, V, load, run, store};
 use ndarray::{ArrayView3, ArrayViewMut2, ArrayViewMut3, Axis};
 use std::ops::Range;
@@ -221,27 +220,6 @@ impl<R: Real> Op for BundlesForward<'_, R> {
     }
 }
 
-/// Most bundles of a row of pixels: neighbours differ in heading at few places.
-fn most(columns: usize) -> usize {
-    columns.div_ceil(BUNDLE) + HEADINGS.len() / 2
-}
-
-/// Rows of pixels whose bundles [`adjoint`] holds at once.
-fn held<R>(columns: usize) -> usize {
-    (HELD / (columns.div_ceil(BUNDLE) * size_of::<Bundle<R>>()).max(1)).max(1)
-}
-
-/// Bytes that [`adjoint`] needs in single precision for `views` views; [`forward`] needs less.
-pub fn scratch(header: &ScanHeader, views: usize) -> u64 {
-    let [rows, columns] = header.detector;
-    let [nx, ny, nz] = header.volume;
-    let lines = views.saturating_mul(rows).min(held::<f32>(columns));
-    let bundles = lines * most(columns) * size_of::<Bundle<f32>>();
-    let plane = (nx * ny).max(nx * nz).max(ny * nz);
-    let tiles = rayon::current_num_threads().min(nx.max(ny).max(nz).div_ceil(TILE)) * TILE * plane * size_of::<f32>();
-    (bundles + tiles) as u64
-}
-
 /// Adds the adjoint of [`forward`] to `volume`.
 pub fn adjoint<R: Real>(
     geometry: &Geometry,
@@ -250,15 +228,16 @@ pub fn adjoint<R: Real>(
     volume: &mut ArrayViewMut3<'_, R>,
 ) {
     let [rows, columns] = geometry.detector;
+    let bytes = columns.div_ceil(BUNDLE) * size_of::<Bundle<R>>();
     let of_line = |line: usize| {
         let (image, row) = (line / rows, line % rows);
-        let mut all = Vec::with_capacity(most(columns));
+        let mut all = vec![];
         for column in (0..columns).step_by(BUNDLE) {
             Bundle::of(geometry, [views[image], row, column], image, &mut all);
         }
         all
     };
-    let (lines, held) = (views.len() * rows, held::<R>(columns));
+    let (lines, held) = (views.len() * rows, (HELD / bytes.max(1)).max(1));
     for from in (0..lines).step_by(held) {
         let some = from..(from + held).min(lines);
         let bundles: Vec<Vec<Bundle<R>>> = parallel::map(some, |_, line| of_line(line));

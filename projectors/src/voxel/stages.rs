@@ -97,8 +97,8 @@ impl VoxelProjector for Joseph {
         Some(Fragment::new(&[include_str!("walk.wgsl"), include_str!("joseph.wgsl")]))
     }
     fn scratch(&self, header: &ScanHeader, views: usize) -> u64 {
-        // A header does not say which views are tilted.
-        columns::scratch(header, views).max(bundles::scratch(header, views))
+        // A header does not say whether a view looks along z. Bundles of such views may take some ten MiB more.
+        columns::scratch(header, views)
     }
     fn describe(&self) -> String {
         "joseph: bilinear from plane to plane".into()
