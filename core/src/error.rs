@@ -37,7 +37,7 @@ pub enum Error {
         why: String,
     },
     /// The run was interrupted by the user.
-    #[error("interrupted after step {step}; where it keeps checkpoints, the same command with --resume continues")]
+    #[error("interrupted after step {step}")]
     Interrupted {
         /// The last finished step.
         step: u64,

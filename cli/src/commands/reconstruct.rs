@@ -211,7 +211,12 @@ impl ReconstructArgs {
         }
         let mut progress = self.progress(&folder, metrics, identity)?;
         progress.history = run.history.clone();
-        let solved = run.solve(None, resume, &mut progress)?;
+        let solved = run.solve(None, resume, &mut progress).map_err(|e| match e {
+            Error::Interrupted { step } if folder.file(CHECKPOINT).exists() => {
+                Error::Stopped { part: format!("the run, after step {step}") }
+            }
+            e => e,
+        })?;
         if ranks::count() > 1 {
             tracing::info!("{} processes; this one sent {} to the others", ranks::count(), bytes(ranks::sent()));
         }

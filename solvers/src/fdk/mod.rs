@@ -16,7 +16,7 @@ use crate::surround::{self, Corrected};
 use axis::{Axis as OrbitAxis, upright};
 use conefield_core::Error;
 use conefield_core::error::{Result, ensure};
-use conefield_core::geometry::{Geometry, View, VoxelGrid, dot, norm, sub};
+use conefield_core::geometry::{Geometry, Vec3, View, VoxelGrid, norm, sub};
 use conefield_core::method::{
     Context, Findings, Job, Line, Method, Needs, Observer, Outline, Plan, Reconstruction, Record, Solution,
 };
@@ -24,6 +24,7 @@ use conefield_core::parallel;
 use conefield_core::place::{Array, CLIP, FilteredViews, Host, Place, RowWeights, zeros_with_spare};
 use conefield_core::scan::{Scan, ScanHeader, Volume};
 use conefield_core::scene::SurroundRule;
+use conefield_core::simd::{Op, Simd, run};
 use conefield_core::space::Space;
 use conefield_core::voxel::VoxelView;
 use conefield_projectors::voxel::Joseph;
@@ -249,6 +250,39 @@ impl Backprojection<'_> {
     }
 }
 
+/// Multiplies pixels by the weight of their column and the cosine between their ray and the detector's normal.
+struct Weighting<'a> {
+    view: &'a View,
+    normal: Vec3,
+    detector: [usize; 2],
+    /// The row of the detector that `strip` begins with.
+    first: usize,
+    /// The weight of each column.
+    counts: &'a [f64],
+    strip: &'a mut [f32],
+}
+
+impl Op for Weighting<'_> {
+    type Number = f32;
+    type Out = ();
+    const WIDE: bool = false;
+
+    #[inline(always)]
+    fn call<S: Simd>(self, _: S) {
+        let ([a, b, c], [sx, sy, sz], [ux, uy, uz]) = (self.normal, self.view.source, self.view.u);
+        let middle = (self.detector[1] as f64 - 1.0) / 2.0;
+        for (r, line) in self.strip.chunks_mut(self.counts.len()).enumerate() {
+            let [x, y, z] = self.view.pixel(self.detector, (self.first + r) as f64, middle);
+            for (column, (value, count)) in line.iter_mut().zip(self.counts).enumerate() {
+                let du = f64::from(column as i32) - middle;
+                let (dx, dy, dz) = (x + du * ux - sx, y + du * uy - sy, z + du * uz - sz);
+                let weighted = count * (a * dx + b * dy + c * dz) / (dx * dx + dy * dy + dz * dz).sqrt();
+                *value *= weighted as f32;
+            }
+        }
+    }
+}
+
 impl FilteredViews for Backprojection<'_> {
     fn filter(&self, view: usize, pixels: &mut [f32]) {
         let (g, v) = (self.upright, &self.upright.views[view]);
@@ -257,12 +291,7 @@ impl FilteredViews for Backprojection<'_> {
         let ramp = Ramp::new(columns, self.pitch(view), self.settings.window, self.settings.cutoff);
         let counts: Vec<f64> = self.counts(view).collect();
         parallel::over(pixels.chunks_mut(16 * columns), |n, strip| {
-            for (r, line) in strip.chunks_mut(columns).enumerate() {
-                for (c, x) in line.iter_mut().enumerate() {
-                    let d = sub(v.pixel(g.detector, (16 * n + r) as f64, c as f64), v.source);
-                    *x *= (counts[c] * dot(normal, d) / norm(d)) as f32;
-                }
-            }
+            run(Weighting { view: v, normal, detector: g.detector, first: 16 * n, counts: &counts, strip });
             ramp.filter(strip, columns);
         });
     }
