@@ -3,12 +3,12 @@
 
 use crate::affine::Affine;
 use crate::memory;
-use crate::number;
+use crate::{number, packing};
 use conefield_core::finite::stray;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::parts::Voxels;
+use conefield_core::parts::{Voxels, copy};
 use conefield_core::scan::Volume;
-use conefield_core::{Error, Result};
+use conefield_core::{Error, Result, allowance};
 use ndarray::{Array3, ArrayViewMut3, ShapeBuilder, aview1};
 use std::io::Write;
 use std::path::Path;
@@ -24,9 +24,12 @@ pub(crate) enum FileOrder {
 /// not finite.
 pub(crate) fn read(place: &str, grid: VoxelGrid, affine: Option<Affine>, values: Vec<f32>) -> Result<Volume> {
     let [nx, ny, nz] = grid.shape;
-    let data = Array3::from_shape_vec((nx, ny, nz).f(), values)
+    let stored = Array3::from_shape_vec((nx, ny, nz).f(), values)
         .map_err(|e| Error::invalid(place, "data", e, "as many values as voxels"))?;
-    let data = memory::in_order(place, "data", data)?;
+    allowance::numbers(place, "data", stored.len())?;
+    let mut data = Array3::zeros(grid.shape);
+    copy(data.view_mut(), stored.view());
+    drop(stored);
     let data = memory::all_finite(place, data, &|(x, y, z)| format!("voxel [{x}, {y}, {z}]"))?;
     Ok(Volume { data, grid, affine })
 }
@@ -34,8 +37,8 @@ pub(crate) fn read(place: &str, grid: VoxelGrid, affine: Option<Affine>, values:
 /// Voxels in memory at once while a file is written.
 const SLAB: usize = 1 << 22;
 
-/// Bytes of a slab.
-pub const SLAB_BYTES: u64 = 4 * SLAB as u64;
+/// Bytes of a slab, and of what compresses it.
+pub const SLAB_BYTES: u64 = 4 * SLAB as u64 + packing::BYTES;
 
 /// Bytes of compressed data that the writer of MetaImage keeps in memory; more goes to a file.
 pub const PACKED_BYTES: u64 = 32 << 20;

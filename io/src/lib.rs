@@ -42,6 +42,7 @@ mod npz;
 mod nrrd;
 mod number;
 mod orbit;
+mod packing;
 mod pickle;
 mod r2;
 mod rays;

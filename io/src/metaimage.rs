@@ -7,6 +7,7 @@ use crate::folder::{file_name, folder_of};
 use crate::header::{Header, finite};
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
+use crate::packing::Packing;
 use crate::text::{self, shortened, without_mark};
 use crate::{write_atomic, write_text_atomic};
 use conefield_core::error::ensure;
@@ -14,7 +15,6 @@ use conefield_core::geometry::{VoxelGrid, norm};
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
-use flate2::{Compression, write::ZlibEncoder};
 use std::io::{Seek, Write};
 use std::path::Path;
 
@@ -253,7 +253,7 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
     let io = |e| Error::io(path, e);
     // The compressed size precedes the data, so the data is compressed to a buffer first: in memory while it is small.
     let mut packed = tempfile::spooled_tempfile_in(PACKED_BYTES as usize, folder_of(path));
-    let mut encoder = ZlibEncoder::new(&mut packed as &mut dyn Write, Compression::fast());
+    let mut encoder = Packing::zlib(&mut packed).map_err(io)?;
     file_order::write(&mut encoder, path, voxels, FileOrder::XFastest)?;
     encoder.finish().map_err(io)?;
     let size = packed.stream_position().map_err(io)?;

@@ -7,13 +7,13 @@ use crate::affine::{self, Affine};
 use crate::file_order::{self, FileOrder};
 use crate::input::Input;
 use crate::number::{ByteOrder, Number};
+use crate::packing::Packing;
 use crate::text;
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
 use conefield_core::parts::Voxels;
 use conefield_core::scan::Volume;
 use conefield_core::{Error, Result};
-use flate2::{Compression, GzBuilder};
 use nifti::{Endianness, NiftiHeader};
 use std::io::Write;
 use std::path::Path;
@@ -261,9 +261,9 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
 
 /// Writes `voxels` like [`write`], in gzip.
 pub(crate) fn write_packed(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> Result<()> {
-    let mut packed = GzBuilder::new().write(w, Compression::fast());
+    let mut packed = Packing::gzip(w).map_err(|e| Error::io(path, e))?;
     write(&mut packed, path, voxels)?;
-    packed.finish().and_then(|w| w.flush()).map_err(|e| Error::io(path, e))
+    packed.finish().map_err(|e| Error::io(path, e))
 }
 
 #[cfg(test)]

@@ -9,9 +9,9 @@ pub(crate) use read::{DATA_FILE, is_header, read, read_header, shape};
 
 use crate::affine;
 use crate::file_order::{self, FileOrder};
+use crate::packing::Packing;
 use conefield_core::parts::Voxels;
 use conefield_core::{Error, Result};
-use flate2::{Compression, GzBuilder};
 use std::io::Write;
 use std::path::Path;
 
@@ -35,7 +35,7 @@ pub(crate) fn write(w: &mut dyn Write, path: &Path, voxels: &mut dyn Voxels) -> 
         vector(3),
     );
     w.write_all(text.as_bytes()).map_err(io)?;
-    let mut packed = GzBuilder::new().write(w, Compression::fast());
+    let mut packed = Packing::gzip(w).map_err(io)?;
     file_order::write(&mut packed, path, voxels, FileOrder::XFastest)?;
-    packed.finish().and_then(|w| w.flush()).map_err(io)
+    packed.finish().map_err(io)
 }

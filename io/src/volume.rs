@@ -9,7 +9,7 @@ use crate::{dicom, foreign, metaimage, nifti, npy, nrrd, pickle, scan, tiff, wri
 use conefield_core::allowance;
 use conefield_core::error::ensure;
 use conefield_core::geometry::VoxelGrid;
-use conefield_core::parts::{Part, Voxels};
+use conefield_core::parts::{Part, Voxels, copy};
 use conefield_core::scan::{Affine, Volume};
 use conefield_core::{Error, Result};
 use ndarray::{Array3, ArrayViewMut3, Ix3, s};
@@ -237,7 +237,7 @@ impl Voxels for Layers<'_> {
         self.voxels.hounsfield()
     }
 
-    fn fill(&mut self, part: &Part, mut out: ArrayViewMut3<'_, f32>) -> Result<()> {
+    fn fill(&mut self, part: &Part, out: ArrayViewMut3<'_, f32>) -> Result<()> {
         let [nx, ny, nz] = self.grid().shape;
         let [x, y, z] = part.clone();
         if self.many >= nz || z.len() == nz {
@@ -251,7 +251,7 @@ impl Voxels for Layers<'_> {
             self.held = Array3::zeros([nx, ny, last - z.start]);
             self.voxels.fill(&[0..nx, 0..ny, z.start..last], self.held.view_mut())?;
         }
-        out.assign(&self.held.slice(s![x, y, z.start - self.first..z.end - self.first]));
+        copy(out, self.held.slice(s![x, y, z.start - self.first..z.end - self.first]));
         Ok(())
     }
 }
