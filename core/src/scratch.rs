@@ -142,14 +142,14 @@ mod files {
     use std::io::Read;
     use std::path::PathBuf;
     use std::ptr;
-    use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
+    use std::sync::{Mutex, MutexGuard, PoisonError};
     use std::time::{Duration, Instant};
 
     /// Time between two looks of the thread at the resident memory.
     const PAUSE: Duration = Duration::from_millis(2);
 
-    /// Least microseconds between two looks, whoever looks.
-    const REST: u64 = 500;
+    /// Least time between two looks, whoever looks.
+    const REST: Duration = Duration::from_micros(500);
 
     /// Resident bytes beyond which mapped pages are taken out of the process.
     static MOST: AtomicU64 = AtomicU64::new(u64::MAX);
@@ -275,14 +275,15 @@ mod files {
     }
 
     /// Takes mapped pages out of the process if it holds more than [`MOST`] bytes, unless they are the smaller part.
-    /// Cheap enough for every part of a loop: it looks at most once in [`REST`].
+    /// Cheap enough for every part of a loop: it looks at most once in [`REST`]. Other threads wait meanwhile: they would
+    /// bring pages in faster than they go.
     pub fn trim() {
-        static BEGUN: LazyLock<Instant> = LazyLock::new(Instant::now);
-        static LAST: AtomicU64 = AtomicU64::new(0);
-        let (now, last) = (BEGUN.elapsed().as_micros() as u64, LAST.load(Relaxed));
-        if now < last + REST || LAST.compare_exchange(last, now, Relaxed, Relaxed).is_err() {
+        static LAST: Mutex<Option<Instant>> = Mutex::new(None);
+        let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
+        if last.is_some_and(|last| last.elapsed() < REST) {
             return;
         }
+        *last = Some(Instant::now());
         let most = MOST.load(Relaxed);
         if resident().is_none_or(|(all, mapped)| all <= most || mapped < most / 8) {
             return;
