@@ -1,5 +1,6 @@
 //! Scans (projections with geometry) and volumes (voxels with grid).
 
+use crate::allowance;
 use crate::error::{Error, Result, ensure};
 use crate::finite::{first_not, stray};
 use crate::geometry::{Geometry, Vec3, View, VoxelGrid};
@@ -7,23 +8,30 @@ use crate::parallel;
 use ndarray::{Array3, ArrayView2, ArrayView3, s};
 use serde::{Deserialize, Serialize};
 
-/// A step through `len` pixels of views with this many columns that visits at least `some` of them, in all columns: a step
-/// with a factor of the columns would leave out some of them in every row.
-pub fn stride(len: usize, some: usize, columns: usize) -> usize {
+/// About a million values of `projections` (`[view, row, column]`), which suffice for quantiles. They are of all columns: a
+/// step with a factor of the columns would leave out some of them in every row.
+pub fn sample(projections: ArrayView3<'_, f32>) -> Vec<f32> {
     let divisor = |mut a: usize, mut b: usize| {
         while b > 0 {
             (a, b) = (b, a % b);
         }
         a
     };
-    let least = (len / some.max(1)).max(1);
-    (least..).find(|step| divisor(*step, columns) <= 1).unwrap_or(1)
+    let least = (projections.len() / 1_000_000).max(1);
+    let step = (least..).find(|step| divisor(*step, projections.dim().2) <= 1).unwrap_or(1);
+    let values = projections.iter().copied().step_by(step).enumerate();
+    // A value of an array on the disk brings in the pages around it.
+    let looking = values.inspect(|(i, _)| {
+        if i.is_multiple_of(1 << 10) {
+            allowance::trim()
+        }
+    });
+    looking.map(|(_, value)| value).collect()
 }
 
-/// The 99.5th percentile of about a million line integrals, hardly moved by single hot pixels.
+/// The 99.5th percentile of [`sample`], hardly moved by single hot pixels.
 pub fn high(projections: ArrayView3<'_, f32>) -> f32 {
-    let step = stride(projections.len(), 1_000_000, projections.dim().2);
-    highest(&mut projections.iter().copied().step_by(step).collect::<Vec<f32>>())
+    highest(&mut sample(projections))
 }
 
 /// The 99.5th percentile of `all`, which it reorders; 0 for none.

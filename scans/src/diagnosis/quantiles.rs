@@ -1,15 +1,11 @@
 //! Medians and quantiles of values.
 
-use conefield_core::scan::stride;
+use conefield_core::scan::sample;
 use ndarray::{ArrayView2, ArrayView3};
-
-/// Values of a scan that suffice for its quantiles.
-const SAMPLE: usize = 1_000_000;
 
 /// About a million values of `projections` (`[view, row, column]`), ascending.
 pub(crate) fn sorted_sample(projections: ArrayView3<'_, f32>) -> Vec<f32> {
-    let step = stride(projections.len(), SAMPLE, projections.dim().2);
-    let mut sample: Vec<f32> = projections.iter().copied().step_by(step).collect();
+    let mut sample = sample(projections);
     sample.sort_unstable_by(f32::total_cmp);
     sample
 }
