@@ -314,6 +314,7 @@ mod tests {
     use crate::testing::{file, gzip, says, zlib};
     use crate::{is_volume, read_volume, write_volume};
     use ndarray::Array3;
+    use std::io::Read;
 
     fn refused(parts: &[&[u8]], words: &[&str]) {
         says(read_volume(&file("bad.mha", parts).1), &[&["bad.mha"], words].concat());
@@ -520,7 +521,11 @@ mod tests {
              ElementType = MET_FLOAT\nElementDataFile = LOCAL\n"
         );
         assert_eq!(String::from_utf8_lossy(&bytes[..text.len()]), text);
-        assert_eq!(bytes.len(), text.len() + packed);
+        let stream = &bytes[text.len()..];
+        assert_eq!(stream.len(), packed);
+        let mut voxels = vec![];
+        flate2::read::ZlibDecoder::new(stream).read_to_end(&mut voxels).unwrap();
+        assert_eq!(voxels, [0; 8]);
         assert!(f.0.path().read_dir().unwrap().count() == 1, "something is left beside the file");
     }
 }

@@ -94,7 +94,7 @@ fn deflated(bytes: &[u8]) -> io::Result<Vec<u8>> {
     loop {
         let from = compress.total_in() as usize;
         compress.compress_vec(&bytes[from..], &mut packed, FlushCompress::Sync)?;
-        // Room that is left says that nothing is left.
+        // If room is left, all bytes are compressed.
         if packed.len() < packed.capacity() {
             return Ok(packed);
         }
